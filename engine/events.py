@@ -1,0 +1,139 @@
+"""Typed progress events, written as JSON lines and shown by whoever listens.
+
+The engine emits; a progress bar, ``events.jsonl`` and later the web page listen. This module imports
+neither torch nor numba, so that a front end can use it.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, ClassVar
+
+
+@dataclass(frozen=True)
+class Event:
+    """Base of all events; ``kind`` names the event in ``events.jsonl``."""
+
+    kind: ClassVar[str] = "event"
+
+    def as_dict(self) -> dict[str, object]:
+        """The event as JSON-ready values, its kind included."""
+        return {"kind": self.kind, **asdict(self)}
+
+
+@dataclass(frozen=True)
+class StageStarted(Event):
+    """A stage of the pipeline begins (``load``, ``initialise``, ``train``, ``evaluate``, ``export``)."""
+
+    kind: ClassVar[str] = "stage_started"
+    stage: str
+    total_steps: int = 0
+
+
+@dataclass(frozen=True)
+class StageProgress(Event):
+    """Step ``step`` of a stage that counts its steps is done."""
+
+    kind: ClassVar[str] = "stage_progress"
+    stage: str
+    step: int
+    total_steps: int
+
+
+@dataclass(frozen=True)
+class StageFinished(Event):
+    """A stage ended after ``seconds``."""
+
+    kind: ClassVar[str] = "stage_finished"
+    stage: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class TrainingProgress(Event):
+    """State of the training after ``iteration``; ``psnr`` is the running value over training rays, in dB."""
+
+    kind: ClassVar[str] = "training_progress"
+    iteration: int
+    total_iterations: int
+    loss: float
+    psnr: float
+    gaussians: int
+    rays_per_second: float
+    hits_per_ray: float
+    seconds: float
+    seconds_left: float
+
+
+@dataclass(frozen=True)
+class HeldOutMeasured(Event):
+    """Mean PSNR over the held-out views at ``iteration``, in dB."""
+
+    kind: ClassVar[str] = "held_out_measured"
+    iteration: int
+    psnr: float
+    gaussians: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class CheckpointWritten(Event):
+    """A checkpoint of ``iteration`` is safe on disk at ``path``."""
+
+    kind: ClassVar[str] = "checkpoint_written"
+    iteration: int
+    path: str
+
+
+@dataclass(frozen=True)
+class Warned(Event):
+    """Something the user should know, in one sentence; the work goes on."""
+
+    kind: ClassVar[str] = "warning"
+    message: str
+
+
+@dataclass(frozen=True)
+class RunFinished(Event):
+    """The whole job is done; ``outputs`` are paths relative to the output folder."""
+
+    kind: ClassVar[str] = "run_finished"
+    outputs: tuple[str, ...]
+    seconds: float
+
+
+Listener = Callable[[Event], None]
+
+
+def ignore(_event: Event) -> None:
+    """A listener that listens to nothing."""
+
+
+def broadcast(listeners: Iterable[Listener]) -> Listener:
+    """One listener that passes every event on to ``listeners``, in order."""
+    targets = tuple(listeners)
+
+    def send(event: Event) -> None:
+        for listener in targets:
+            listener(event)
+
+    return send
+
+
+class JsonLinesListener:
+    """Appends each event, stamped with Unix time in seconds, as one line to a file."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file: IO[str] = path.open("a", encoding="utf-8")
+
+    def __call__(self, event: Event) -> None:
+        """Write ``event`` and flush, so that a reader beside the run sees whole lines."""
+        self._file.write(json.dumps({"time": round(time.time(), 3), **event.as_dict()}) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file; the listener must not be called afterwards."""
+        self._file.close()

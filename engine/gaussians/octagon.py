@@ -1,0 +1,96 @@
+"""The octagon of a flat Gaussian (paper Eq. 6), its opacity-adapted radius, and the way back."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from engine.gaussians.frames import quaternions
+from engine.gaussians.model import FlatGaussians
+
+SIDES = 8
+CHI2_3_99 = 11.344866730144373
+"""Quantile 0.99 of the chi-square distribution with 3 degrees of freedom: the paper's Q."""
+CHI2_2_99 = 9.210340371976184
+"""Quantile 0.99 with 2 degrees of freedom, which a flat Gaussian really has: its rim lies at alpha = 0.01."""
+APOTHEM = float(np.cos(np.pi / SIDES))
+"""Inner radius of a regular octagon whose corners lie on the unit circle."""
+FAN = np.array([[0, k, k + 1] for k in range(1, SIDES - 1)], dtype=np.int64)
+"""The six triangles of one octagon, as corner numbers."""
+
+
+def octagon_radii(opacities: Float[np.ndarray, " n"], q: float = CHI2_2_99) -> Float[np.ndarray, " n"]:
+    """Radius of each octagon's corners in standard deviations, sqrt(max(0, Q - 2 ln(1/a))).
+
+    At that radius alpha falls to exp(-Q/2), whatever the opacity a. A Gaussian fainter than that has
+    radius 0 and no octagon.
+    """
+    with np.errstate(divide="ignore"):
+        return np.sqrt(np.maximum(0.0, q + 2.0 * np.log(opacities.astype(np.float64)))).astype(opacities.dtype)
+
+
+def corner_directions() -> Float[np.ndarray, "8 2"]:
+    """Unit corner positions (cos, sin)(2 pi k / 8) in the (r2, r3) plane."""
+    angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+
+def octagon_corners_world(
+    gaussians: FlatGaussians, radii: Float[np.ndarray, " n"]
+) -> Float32[np.ndarray, "n 8 3"]:
+    """Corners P_k = m + radius (s2 cos(2 pi k/8) r2 + s3 sin(2 pi k/8) r3), world frame (paper Eq. 6)."""
+    rotations = gaussians.rotations.astype(np.float64)
+    legs = rotations[:, :, 1:] * gaussians.scales.astype(np.float64)[:, None, :] * radii[:, None, None]
+    corners = gaussians.means_world[:, None, :].astype(np.float64) + np.einsum("kc,nic->nki", corner_directions(), legs)
+    return corners.astype(np.float32)
+
+
+def octagon_triangles(count: int) -> Int[np.ndarray, "m 3"]:
+    """Vertex indices of the fan triangles (0,1,2)...(0,6,7) of ``count`` octagons laid out one after another."""
+    return (np.arange(count)[:, None, None] * SIDES + FAN).reshape(-1, 3)
+
+
+def frames_from_octagons(
+    corners_world: Float[np.ndarray, "n 8 3"], radii: Float[np.ndarray, " n"]
+) -> tuple[
+    Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"], Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]
+]:
+    """The paper's way back (section 3.3): centre from corners 2 and 6, axes from corners 0 and 2.
+
+    r2 and s2 come from corner 0, r3 by Gram-Schmidt from corner 2, r1 = r2 x r3. ``radii`` are those the
+    octagons were made with. Shear is dropped: an octagon that an edit has sheared comes back orthogonal.
+
+    Returns:
+        Means (world), unit quaternions (wxyz), log scales, and a mask of the octagons that could be read;
+        a crumpled one (no area) is False and holds zeros.
+    """
+    p = corners_world.astype(np.float64)
+    radius = radii.astype(np.float64)
+    means = (p[:, 2] + p[:, 6]) / 2.0
+    leg2, leg3 = p[:, 0] - means, p[:, 2] - means
+    means_ok, quats, scales, good = _frames_from_legs(leg2, leg3)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scales = scales / radius[:, None]
+    good = good & means_ok & (radius > 0)
+    log_scales = np.where(good[:, None], np.log(np.where(good[:, None], scales, 1.0)), 0.0)
+    dtype = corners_world.dtype
+    return means.astype(dtype), quats.astype(dtype), log_scales.astype(dtype), good
+
+
+def _frames_from_legs(
+    leg2: Float[np.ndarray, "n 3"], leg3: Float[np.ndarray, "n 3"]
+) -> tuple[
+    Bool[np.ndarray, " n"], Float[np.ndarray, "n 4"], Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]
+]:
+    """Quaternions and leg lengths of in-plane legs, the second one made orthogonal to the first."""
+    length2 = np.linalg.norm(leg2, axis=-1)
+    safe2 = np.where(length2 > 0, length2, 1.0)
+    r2 = leg2 / safe2[:, None]
+    along = np.sum(leg3 * r2, axis=-1)
+    rest = leg3 - along[:, None] * r2
+    length3 = np.linalg.norm(rest, axis=-1)
+    safe3 = np.where(length3 > 0, length3, 1.0)
+    r3 = rest / safe3[:, None]
+    good = (length2 > 0) & (length3 > 1e-9 * np.maximum(length2, np.linalg.norm(leg3, axis=-1)))
+    rotations = np.stack([np.cross(r2, r3), r2, r3], axis=-1)
+    rotations[~good] = np.eye(3)
+    finite = np.isfinite(leg2).all(axis=-1) & np.isfinite(leg3).all(axis=-1)
+    return finite, quaternions(rotations), np.stack([length2, length3], axis=-1), good & finite
