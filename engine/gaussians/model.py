@@ -50,7 +50,8 @@ class FlatGaussians:
     @property
     def opacities(self) -> Float32[np.ndarray, " n"]:
         """Opacities in (0, 1)."""
-        return (1.0 / (1.0 + np.exp(-self.opacity_logits.astype(np.float64)))).astype(np.float32)
+        decay = np.exp(-np.abs(self.opacity_logits.astype(np.float64)))  # never overflows
+        return (np.where(self.opacity_logits >= 0, 1.0, decay) / (1.0 + decay)).astype(np.float32)
 
     @property
     def rotations(self) -> Float32[np.ndarray, "n 3 3"]:
@@ -64,7 +65,9 @@ class FlatGaussians:
 
     def select(self, index: np.ndarray) -> "FlatGaussians":
         """The Gaussians at ``index`` (integers or a mask), copied."""
-        return FlatGaussians(**{field.name: getattr(self, field.name)[index].copy() for field in fields(self)})
+        return FlatGaussians(
+            **{field.name: getattr(self, field.name)[index].copy() for field in fields(self)}
+        )
 
     def copy(self) -> "FlatGaussians":
         """An independent copy."""
@@ -78,5 +81,8 @@ class FlatGaussians:
 def concatenate(parts: list[FlatGaussians]) -> FlatGaussians:
     """All Gaussians of ``parts``, in order; the parts share one spherical-harmonic degree."""
     return FlatGaussians(
-        **{field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(FlatGaussians)}
+        **{
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(FlatGaussians)
+        }
     )

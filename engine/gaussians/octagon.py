@@ -24,7 +24,9 @@ def octagon_radii(opacities: Float[np.ndarray, " n"], q: float = CHI2_2_99) -> F
     radius 0 and no octagon.
     """
     with np.errstate(divide="ignore"):
-        return np.sqrt(np.maximum(0.0, q + 2.0 * np.log(opacities.astype(np.float64)))).astype(opacities.dtype)
+        return np.sqrt(np.maximum(0.0, q + 2.0 * np.log(opacities.astype(np.float64)))).astype(
+            opacities.dtype
+        )
 
 
 def corner_directions() -> Float[np.ndarray, "8 2"]:
@@ -39,12 +41,14 @@ def octagon_corners_world(
     """Corners P_k = m + radius (s2 cos(2 pi k/8) r2 + s3 sin(2 pi k/8) r3), world frame (paper Eq. 6)."""
     rotations = gaussians.rotations.astype(np.float64)
     legs = rotations[:, :, 1:] * gaussians.scales.astype(np.float64)[:, None, :] * radii[:, None, None]
-    corners = gaussians.means_world[:, None, :].astype(np.float64) + np.einsum("kc,nic->nki", corner_directions(), legs)
+    corners = gaussians.means_world[:, None, :].astype(np.float64) + np.einsum(
+        "kc,nic->nki", corner_directions(), legs
+    )
     return corners.astype(np.float32)
 
 
 def octagon_triangles(count: int) -> Int[np.ndarray, "m 3"]:
-    """Vertex indices of the fan triangles (0,1,2)...(0,6,7) of ``count`` octagons laid out one after another."""
+    """Vertex indices of the fan triangles (0,1,2)...(0,6,7) of ``count`` octagons, one after another."""
     return (np.arange(count)[:, None, None] * SIDES + FAN).reshape(-1, 3)
 
 
@@ -59,38 +63,50 @@ def frames_from_octagons(
     octagons were made with. Shear is dropped: an octagon that an edit has sheared comes back orthogonal.
 
     Returns:
-        Means (world), unit quaternions (wxyz), log scales, and a mask of the octagons that could be read;
-        a crumpled one (no area) is False and holds zeros.
+        Means (world), unit quaternions (wxyz), log scales, and a mask of the octagons that could be read. A
+        crumpled one, whose area vanishes in the rounding of its corners, is False and has the identity
+        rotation and log scales 0.
     """
     p = corners_world.astype(np.float64)
     radius = radii.astype(np.float64)
-    means = (p[:, 2] + p[:, 6]) / 2.0
-    leg2, leg3 = p[:, 0] - means, p[:, 2] - means
-    means_ok, quats, scales, good = _frames_from_legs(leg2, leg3)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scales = scales / radius[:, None]
-    good = good & means_ok & (radius > 0)
-    log_scales = np.where(good[:, None], np.log(np.where(good[:, None], scales, 1.0)), 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        means = (p[:, 2] + p[:, 6]) / 2.0
+        legs = np.stack([p[:, 0] - means, p[:, 2] - means], axis=1)
+    rounding = coordinate_rounding(corners_world)
+    quats, lengths, good = frames_from_legs(legs, rounding)
+    good &= radius > 0
+    quats[~good] = (1.0, 0.0, 0.0, 0.0)
+    log_scales = np.log(np.where(good[:, None], lengths / np.where(good, radius, 1.0)[:, None], 1.0))
     dtype = corners_world.dtype
     return means.astype(dtype), quats.astype(dtype), log_scales.astype(dtype), good
 
 
-def _frames_from_legs(
-    leg2: Float[np.ndarray, "n 3"], leg3: Float[np.ndarray, "n 3"]
-) -> tuple[
-    Bool[np.ndarray, " n"], Float[np.ndarray, "n 4"], Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]
-]:
-    """Quaternions and leg lengths of in-plane legs, the second one made orthogonal to the first."""
+def coordinate_rounding(points_world: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
+    """Length by which the difference of two of a row's points may be off, as coordinates are rounded."""
+    largest = np.abs(points_world.astype(np.float64)).max(axis=(1, 2))
+    return 2.0 * float(np.finfo(points_world.dtype).eps) * largest
+
+
+def frames_from_legs(
+    legs_world: Float[np.ndarray, "n 2 3"], rounding: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Quaternions and lengths of in-plane legs, the second leg made orthogonal to the first (Gram-Schmidt).
+
+    The mask is False, the rotation the identity and the lengths 1 where a leg is not finite or not longer
+    than ``rounding``.
+    """
+    finite = np.isfinite(legs_world).all(axis=(1, 2)) & np.isfinite(rounding)
+    leg2, leg3 = np.where(finite[:, None, None], legs_world, 0.0).transpose(1, 0, 2)
     length2 = np.linalg.norm(leg2, axis=-1)
-    safe2 = np.where(length2 > 0, length2, 1.0)
-    r2 = leg2 / safe2[:, None]
-    along = np.sum(leg3 * r2, axis=-1)
-    rest = leg3 - along[:, None] * r2
+    good = finite & (length2 > rounding)
+    r2 = np.where(good[:, None], leg2, (1.0, 0.0, 0.0)) / np.where(good, length2, 1.0)[:, None]
+    rest = leg3 - np.sum(leg3 * r2, axis=-1)[:, None] * r2
     length3 = np.linalg.norm(rest, axis=-1)
-    safe3 = np.where(length3 > 0, length3, 1.0)
-    r3 = rest / safe3[:, None]
-    good = (length2 > 0) & (length3 > 1e-9 * np.maximum(length2, np.linalg.norm(leg3, axis=-1)))
+    # The first leg's rounding tilts r2, and a longer second leg magnifies the tilt.
+    stretch = np.maximum(1.0, np.linalg.norm(leg3, axis=-1) / np.where(good, length2, 1.0))
+    good &= length3 > rounding * stretch
+    r3 = np.where(good[:, None], rest, 0.0) / np.where(good, length3, 1.0)[:, None]
     rotations = np.stack([np.cross(r2, r3), r2, r3], axis=-1)
     rotations[~good] = np.eye(3)
-    finite = np.isfinite(leg2).all(axis=-1) & np.isfinite(leg3).all(axis=-1)
-    return finite, quaternions(rotations), np.stack([length2, length3], axis=-1), good & finite
+    lengths = np.where(good[:, None], np.stack([length2, length3], axis=-1), 1.0)
+    return quaternions(rotations), lengths, good

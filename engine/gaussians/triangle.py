@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import _frames_from_legs
+from engine.gaussians.octagon import coordinate_rounding, frames_from_legs
 
 
 def triangles_world(gaussians: FlatGaussians) -> Float[np.ndarray, "n 3 3"]:
@@ -26,13 +26,11 @@ def frames_from_triangles(
 ]:
     """Means, unit quaternions (wxyz) and log scales of triangles; r3 by Gram-Schmidt, s3 = <V3 - V1, r3>.
 
-    The last result is False for triangles without area, whose other values mean nothing.
+    The last result is False for triangles without area, which get the identity rotation and log scales 0.
     """
-    means = vertices_world[:, 0].astype(np.float64)
-    finite, quats, lengths, good = _frames_from_legs(
-        vertices_world[:, 1] - means, vertices_world[:, 2] - means
-    )
-    good = good & finite
-    log_scales = np.log(np.where(good[:, None], lengths, 1.0))
+    vertices = vertices_world.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        legs = vertices[:, 1:] - vertices[:, :1]
+    quats, lengths, good = frames_from_legs(legs, coordinate_rounding(vertices_world))
     dtype = vertices_world.dtype
-    return means.astype(dtype), quats.astype(dtype), log_scales.astype(dtype), good
+    return vertices_world[:, 0].copy(), quats.astype(dtype), np.log(lengths).astype(dtype), good

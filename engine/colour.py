@@ -1,0 +1,23 @@
+"""Transfer functions between display (sRGB-encoded) and linear colour values (IEC 61966-2-1)."""
+
+import numpy as np
+from jaxtyping import Float
+
+
+def srgb_to_linear(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Linear values of display values in [0, 1]; values below 0 are treated as 0."""
+    s = np.maximum(srgb.astype(np.float64), 0.0)
+    linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    return linear.astype(srgb.dtype)
+
+
+def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Display values of linear values in [0, 1]; values below 0 are treated as 0."""
+    s = np.maximum(linear.astype(np.float64), 0.0)
+    srgb = np.where(s <= 0.0031308, s * 12.92, 1.055 * s ** (1 / 2.4) - 0.055)
+    return srgb.astype(linear.dtype)
+
+
+def to_bytes(values: Float[np.ndarray, "*shape"]) -> np.ndarray:
+    """Values in [0, 1], clipped and rounded, as uint8 of the same shape."""
+    return np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)
