@@ -1,0 +1,1 @@
+"""How good a reconstruction is: image metrics, per-view results and the report page."""

@@ -1,0 +1,191 @@
+"""Image metrics: PSNR, SSIM in two variants, MS-SSIM and FLIP.
+
+All take images of display values in [0, 1] and compute in float64. ``ssim`` is not one number: the papers on
+Gaussian splatting pad the image with zeros, Wang et al. keep only windows that lie wholly inside, and the two
+differ in the second decimal; both are here under names of their own.
+"""
+
+from typing import NamedTuple
+
+import flip_evaluator
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.ndimage import correlate1d
+
+from engine.render.images import to_8_bits
+
+WINDOW = 11
+SIGMA = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
+MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+PIXELS_PER_DEGREE = 67.0
+
+DEFINITIONS: dict[str, str] = {
+    "psnr": "dB; 10 log10(1 / mean squared error over all valid pixels and channels), averaged over views",
+    "psnr_foreground": "dB; PSNR over the valid pixels whose reference alpha is above 0.5",
+    "ssim": "as in 3D Gaussian Splatting: Gaussian window 11, sigma 1.5, zero padding, C1 1e-4, C2 9e-4, "
+    "mean over all pixels and channels",
+    "ssim_valid": "the same formula over the windows that lie wholly inside the image (Wang et al. 2004)",
+    "ms_ssim": "Wang et al. 2003, five scales; null where the smaller side is 160 pixels or less",
+    "flip": "mean LDR-FLIP (Andersson et al. 2020) at 67 pixels per degree; 0 is best",
+    "images": "renders and references are rounded to 8 bits first; pixels that a mask rules out do not count "
+    "in PSNR and are replaced by the reference's in the other metrics",
+    "mean": "the mean of the per-view values, not of pooled errors",
+    "mean_psnr_ci95": "95 % bootstrap interval of the mean PSNR over the views",
+}
+"""What each key of ``metrics.json`` means."""
+
+
+class FlipError(NamedTuple):
+    """The FLIP error of every pixel, in [0, 1], and its mean."""
+
+    error: Float32[np.ndarray, "h w"]
+    mean: float
+
+
+def rounded_to_8_bits(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """The image as it would come back from an 8-bit file."""
+    return to_8_bits(image).astype(np.float32) / np.float32(255.0)
+
+
+def filled_outside(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"],
+) -> Float32[np.ndarray, "h w 3"]:
+    """The render with its invalid pixels (weight 0) replaced by the reference's.
+
+    For metrics that look at neighbourhoods: what a mask rules out then adds no error, inside or nearby.
+    Weights between 0 and 1 blend.
+    """
+    w = weight[..., None]
+    return np.asarray(render * w + reference * (1 - w), dtype=np.float32)
+
+
+def psnr(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"] | None = None,
+) -> float:
+    """Peak signal-to-noise ratio in dB, for a peak of 1.
+
+    Args:
+        render: Display values.
+        reference: Display values.
+        weight: How much each pixel counts, 0 for invalid; ``None`` counts all alike.
+
+    Returns:
+        The PSNR; infinite for images that agree wherever they count, not-a-number when no pixel counts.
+    """
+    squared = np.square(render.astype(np.float64) - reference).mean(axis=-1)
+    if weight is None:
+        error = float(squared.mean())
+    else:
+        total = float(weight.sum(dtype=np.float64))
+        if total <= 0:
+            return float("nan")
+        error = float((squared * weight).sum()) / total
+    return float("inf") if error == 0 else float(-10.0 * np.log10(error))
+
+
+def ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float:
+    """SSIM as in 3D Gaussian Splatting: windows reach over the border, where the images count as black."""
+    return ssim_both(render, reference)[0]
+
+
+def ssim_valid(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float:
+    """SSIM of Wang et al. (2004): only windows that lie wholly inside the image count.
+
+    Not-a-number when the image is smaller than the window of 11 pixels.
+    """
+    return ssim_both(render, reference)[1]
+
+
+def ssim_both(
+    render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]
+) -> tuple[float, float]:
+    """``ssim`` and ``ssim_valid`` from one filtering, since the second is the inner part of the first."""
+    luminance, structure = _similarity(render.astype(np.float64), reference.astype(np.float64))
+    similarity = luminance * structure
+    inner = _inner(similarity)
+    return float(similarity.mean()), float(inner.mean()) if inner.size else float("nan")
+
+
+def ms_ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float | None:
+    """Multi-scale SSIM over five scales (Wang, Simoncelli and Bovik 2003), windows wholly inside.
+
+    Negative means are cut to 0, per channel and scale, and the channels averaged last.
+
+    Returns:
+        The index, or ``None`` when the smaller side is 160 pixels or less, too small for the fifth scale.
+    """
+    if min(render.shape[:2]) <= (WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1):
+        return None
+    x, y = render.astype(np.float64), reference.astype(np.float64)
+    product = np.ones(3)
+    for scale, exponent in enumerate(MS_SSIM_WEIGHTS):
+        luminance, structure = _similarity(x, y)
+        last = scale == len(MS_SSIM_WEIGHTS) - 1
+        mean = _inner(luminance * structure if last else structure).mean(axis=(0, 1))
+        product *= np.maximum(mean, 0.0) ** exponent
+        if not last:
+            x, y = _halved(x), _halved(y)
+    return float(product.mean())
+
+
+def flip(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> FlipError:
+    """LDR-FLIP (Andersson et al. 2020): what a viewer notices when the two images alternate.
+
+    Computed by NVIDIA's own library for a screen of 67 pixels per degree.
+    """
+    error, _, _ = flip_evaluator.evaluate(
+        np.ascontiguousarray(reference, dtype=np.float32),
+        np.ascontiguousarray(render, dtype=np.float32),
+        "LDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"ppd": PIXELS_PER_DEGREE},
+    )
+    error = np.asarray(error, dtype=np.float32).reshape(render.shape[:2])
+    return FlipError(error, float(error.mean(dtype=np.float64)))
+
+
+def _gaussian_window() -> Float64[np.ndarray, "taps"]:
+    offsets = np.arange(WINDOW) - WINDOW // 2
+    window = np.exp(-np.square(offsets) / (2 * SIGMA**2))
+    return np.asarray(window / window.sum())
+
+
+def _blurred(image: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "h w 3"]:
+    window = _gaussian_window()
+    for axis in (0, 1):
+        image = correlate1d(image, window, axis=axis, mode="constant", cval=0.0)
+    return image
+
+
+def _similarity(
+    x: Float64[np.ndarray, "h w 3"], y: Float64[np.ndarray, "h w 3"]
+) -> tuple[Float64[np.ndarray, "h w 3"], Float64[np.ndarray, "h w 3"]]:
+    """The luminance term and the contrast-structure term of SSIM at every pixel, black around the image."""
+    mean_x, mean_y = _blurred(x), _blurred(y)
+    variance_x = _blurred(x * x) - mean_x * mean_x
+    variance_y = _blurred(y * y) - mean_y * mean_y
+    covariance = _blurred(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x * mean_x + mean_y * mean_y + C1)
+    structure = (2 * covariance + C2) / (variance_x + variance_y + C2)
+    return luminance, structure
+
+
+def _inner(values: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "a b 3"]:
+    reach = WINDOW // 2
+    return values[reach : values.shape[0] - reach, reach : values.shape[1] - reach]
+
+
+def _halved(image: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "a b 3"]:
+    """Means of 2x2 blocks; odd sides get a black line before them, which counts as image."""
+    odd = [(side % 2, 0) for side in image.shape[:2]]
+    even = np.pad(image, [*odd, (0, 0)])
+    # The reference implementation pads both sides and floors, which drops the padding at the far end.
+    h, w = even.shape[0] // 2, even.shape[1] // 2
+    return np.asarray(even.reshape(h, 2, w, 2, 3).mean(axis=(1, 3)))

@@ -1,0 +1,89 @@
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from engine.errors import DatasetError, OutputError
+from engine.render import images
+
+
+@pytest.fixture
+def picture():
+    return np.random.default_rng(1).random((6, 9, 3), dtype=np.float32)
+
+
+def test_a_png_keeps_display_values_to_8_bits(tmp_path, picture):
+    images.write_png(tmp_path / "a.png", picture)
+    again = images.read_image(tmp_path / "a.png")
+    assert np.array_equal(images.to_8_bits(again), images.to_8_bits(picture))
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_a_png_keeps_straight_colours_under_any_alpha(tmp_path, picture):
+    alpha = np.linspace(0, 1, 54, dtype=np.float32).reshape(6, 9)
+    images.write_png(tmp_path / "a.png", picture, alpha)
+    again = images.read_image(tmp_path / "a.png")
+    assert again.shape == (6, 9, 4)
+    assert np.array_equal(images.to_8_bits(again[..., :3]), images.to_8_bits(picture))
+    assert np.array_equal(images.to_8_bits(again[..., 3]), images.to_8_bits(alpha))
+
+
+def test_an_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):
+    rng = np.random.default_rng(2)
+    alpha, depth = rng.random((6, 9), np.float32), rng.random((6, 9), np.float32) * 1e6
+    normals = rng.normal(size=(6, 9, 3)).astype(np.float32)
+    layers = images.exr_layers(picture, alpha=alpha, depth=depth, normals_world=normals)
+    images.write_exr(tmp_path / "a.exr", layers)
+    again = images.read_channels(tmp_path / "a.exr")
+    assert set(again) == {"R", "G", "B", "A", "Z", "N.x", "N.y", "N.z"}
+    assert all(np.array_equal(again[name], layers[name]) for name in layers)
+    rgb = np.stack([again[c] for c in "RGB"], axis=-1)
+    assert np.allclose(images.srgb_from_linear(rgb), picture, atol=1e-6)
+
+
+def test_a_half_exr_keeps_depth_in_full(tmp_path, picture):
+    depth = np.full((6, 9), 123456.789, np.float32)
+    images.write_exr(tmp_path / "a.exr", images.exr_layers(picture, depth=depth), half=True)
+    again = images.read_channels(tmp_path / "a.exr")
+    assert np.array_equal(again["Z"], depth)
+    assert np.allclose(again["R"], images.linear_from_srgb(picture)[..., 0], rtol=1e-3)
+    spec = oiio.ImageInput.open(str(tmp_path / "a.exr")).spec()
+    formats = dict(zip(spec.channelnames, (str(f) for f in spec.channelformats), strict=True))
+    assert formats["R"] == "half" and formats["Z"] == "float"
+
+
+def test_the_srgb_curve_has_its_known_points():
+    values = np.array([0, 0.04045, 0.5, 1], np.float32)
+    assert images.linear_from_srgb(values) == pytest.approx([0, 0.0031308, 0.2140411, 1], abs=1e-6)
+    assert images.srgb_from_linear(images.linear_from_srgb(values)) == pytest.approx(values, abs=1e-6)
+
+
+def test_shrinking_keeps_the_shape_and_the_mean_and_never_enlarges(picture):
+    big = np.repeat(np.repeat(picture, 20, axis=0), 20, axis=1)
+    small = images.resized(big, 90)
+    assert small.shape == (60, 90, 3)
+    assert small.mean() == pytest.approx(big.mean(), abs=2e-3)
+    assert images.resized(big, 180) is big
+
+
+def test_what_is_no_image_is_refused_by_name(tmp_path):
+    with pytest.raises(DatasetError, match=r"missing\.png"):
+        images.read_image(tmp_path / "missing.png")
+    (tmp_path / "text.png").write_text("no image")
+    with pytest.raises(DatasetError, match=r"text\.png"):
+        images.read_image(tmp_path / "text.png")
+
+
+def test_a_damaged_image_is_refused_by_name(tmp_path, picture):
+    path = tmp_path / "cut.png"
+    images.write_png(path, np.repeat(picture, 30, axis=0))
+    path.write_bytes(path.read_bytes()[:400])
+    with pytest.raises(DatasetError, match=r"cut\.png"):
+        images.read_image(path)
+
+
+def test_an_unwritable_place_is_an_output_error(tmp_path, picture):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"a\.png"):
+        images.write_png(tmp_path / "file" / "a.png", picture)
+    with pytest.raises(OutputError, match="unknown"):
+        images.write_png(tmp_path / "a.unknown", picture)
