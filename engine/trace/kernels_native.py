@@ -1,0 +1,39 @@
+"""Numba intrinsics that read raw memory and call a native function by its address."""
+
+import llvmlite.ir as ir
+from numba import types
+from numba.extending import intrinsic
+
+
+def _pointer_cast(element):
+    @intrinsic
+    def cast(typingctx, address):
+        signature = types.CPointer(element)(types.uintp)
+
+        def codegen(context, builder, sig, args):
+            return builder.inttoptr(args[0], context.get_value_type(sig.return_type))
+
+        return signature, codegen
+
+    return cast
+
+
+int32_pointer = _pointer_cast(types.int32)
+float32_pointer = _pointer_cast(types.float32)
+float64_pointer = _pointer_cast(types.float64)
+uint64_pointer = _pointer_cast(types.uint64)
+
+
+@intrinsic
+def call_with_three_pointers(typingctx, function, first, second, third):
+    """Call ``void function(void*, void*, void*)`` at a run-time address."""
+    signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        pointer = ir.IntType(8).as_pointer()
+        function_type = ir.FunctionType(ir.VoidType(), [pointer, pointer, pointer])
+        address = builder.inttoptr(args[0], function_type.as_pointer())
+        builder.call(address, [builder.inttoptr(argument, pointer) for argument in args[1:]])
+        return context.get_dummy_value()
+
+    return signature, codegen

@@ -1,0 +1,70 @@
+"""Parameters of flat Gaussians turned into the tracer's records and boxes."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from engine.trace.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN, NORMAL, OPACITY
+
+
+@njit
+def rotation_columns(q0, q1, q2, q3):
+    """Columns r1, r2, r3 of the rotation of a quaternion (w, x, y, z) of any length, float64."""
+    scale = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    w, x, y, z = q0 * scale, q1 * scale, q2 * scale, q3 * scale
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@njit
+def write_record(record, mean, quat, log_scale, logit, q):
+    """One record; returns the in-plane corner radii in world units along r2 and r3."""
+    r1, r2, r3 = rotation_columns(
+        np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    )
+    s2, s3 = math.exp(np.float64(log_scale[0])), math.exp(np.float64(log_scale[1]))
+    logit64 = np.float64(logit)
+    # ln sigmoid(x) without overflow at either end
+    log_opacity = -math.log1p(math.exp(-logit64)) if logit64 > 0 else logit64 - math.log1p(math.exp(logit64))
+    radius = math.sqrt(max(0.0, q + 2.0 * log_opacity))
+    for axis in range(3):
+        record[MEAN + axis] = mean[axis]
+        record[NORMAL + axis] = r1[axis]
+        record[AXIS_U + axis] = r2[axis] / s2
+        record[AXIS_V + axis] = r3[axis] / s3
+    # A Gaussian without an octagon must not be hit even through its centre.
+    record[INNER_RADIUS] = radius * COS_22 if radius > 0.0 else -1.0
+    record[OPACITY] = math.exp(log_opacity)
+    return radius * s2, radius * s3, r2, r3
+
+
+@njit(cache=True, parallel=True)
+def write_records(records, boxes, means, quats, log_scales, logits, q, padding):
+    """All records, and the boxes of the octagons' ellipses enlarged by the fraction ``padding``.
+
+    A Gaussian without an octagon gets a box turned inside out, which Embree leaves out of its hierarchy.
+    """
+    for i in prange(len(means)):
+        a, b, r2, r3 = write_record(records[i], means[i], quats[i], log_scales[i], logits[i], q)
+        reach = padding * max(a, b)
+        for axis in range(3):
+            half = math.sqrt((a * r2[axis]) ** 2 + (b * r3[axis]) ** 2)
+            centre = np.float64(means[i, axis])
+            # Room for float32 rounding in the box test, and for changes until the next build.
+            half += reach + 4e-6 * (abs(centre) + half)
+            if a <= 0.0 or not math.isfinite(half):
+                boxes[i, axis], boxes[i, 3 + axis] = np.inf, -np.inf
+            else:
+                boxes[i, axis], boxes[i, 3 + axis] = centre - half, centre + half
+
+
+@njit(cache=True, parallel=True)
+def refresh_records(records, ids, means, quats, log_scales, logits, q):
+    """Records of the Gaussians ``ids`` from their changed parameters; boxes stay."""
+    for k in prange(len(ids)):
+        i = ids[k]
+        write_record(records[i], means[i], quats[i], log_scales[i], logits[i], q)

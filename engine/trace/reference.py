@@ -1,0 +1,176 @@
+"""The slow twin: the same rays through the same Gaussians in plain float64 torch, written to be read.
+
+Every Gaussian is tested against every ray, so it is for a few thousand of each at most. It is the judge of
+the fast tracer's values and, through autograd, of its gradients. Symbols are the paper's: m the mean,
+r1 r2 r3 the frame, s2 s3 the scales, o and d the ray.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.octagon import APOTHEM
+from engine.trace.protocol import TraceSettings
+
+GRAZING_COSINE = 1e-6
+
+
+@dataclass
+class ReferenceParameters:
+    """Raw parameters as float64 leaves that require gradients; fields as in :class:`FlatGaussians`."""
+
+    means_world: Tensor
+    quats_wxyz: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh: Tensor
+    features: Tensor
+
+    @classmethod
+    def of(cls, gaussians: FlatGaussians, features: np.ndarray | None = None) -> "ReferenceParameters":
+        """Leaves with the values of ``gaussians``."""
+        extra = np.zeros((len(gaussians), 0)) if features is None else features
+        arrays = (
+            gaussians.means_world,
+            gaussians.quats_wxyz,
+            gaussians.log_scales,
+            gaussians.opacity_logits,
+            gaussians.sh,
+            extra,
+        )
+        return cls(*(torch.tensor(array, dtype=torch.float64, requires_grad=True) for array in arrays))
+
+
+@dataclass
+class ReferenceResult:
+    """Outputs as in :class:`engine.trace.protocol.TraceResult`, float64, and the ordered ids of each ray."""
+
+    rgb_srgb: Tensor
+    transmittance: Tensor
+    depth_sum: Tensor
+    depth_median: Tensor
+    normal_world: Tensor
+    features: Tensor
+    hit_ids: list[np.ndarray]
+
+
+def rotation_matrices(quats_wxyz: Tensor) -> Tensor:
+    """Rotation matrices (n, 3, 3) of quaternions of any length."""
+    w, x, y, z = (quats_wxyz / quats_wxyz.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+
+
+def sh_basis(directions: Tensor, count: int) -> Tensor:
+    """Real spherical harmonics (r, count) of unit directions, 3DGS signs and order, by their polynomials."""
+    x, y, z = directions.unbind(-1)
+    pi = np.pi
+    functions = [torch.full_like(x, 0.5 / pi**0.5)]
+    if count > 1:
+        k = (3 / (4 * pi)) ** 0.5
+        functions += [-k * y, k * z, -k * x]
+    if count > 4:
+        k = 0.5 * (15 / pi) ** 0.5
+        functions += [
+            k * x * y,
+            -k * y * z,
+            0.25 * (5 / pi) ** 0.5 * (2 * z * z - x * x - y * y),
+            -k * x * z,
+            0.5 * k * (x * x - y * y),
+        ]
+    if count > 9:
+        a, b, c = 0.25 * (35 / (2 * pi)) ** 0.5, 0.5 * (105 / pi) ** 0.5, 0.25 * (21 / (2 * pi)) ** 0.5
+        functions += [
+            -a * y * (3 * x * x - y * y),
+            b * x * y * z,
+            -c * y * (4 * z * z - x * x - y * y),
+            0.25 * (7 / pi) ** 0.5 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -c * x * (4 * z * z - x * x - y * y),
+            0.5 * b * z * (x * x - y * y),
+            -a * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(functions, dim=-1)
+
+
+def trace_reference(
+    parameters: ReferenceParameters,
+    origins_world: np.ndarray,
+    directions_world: np.ndarray,
+    settings: TraceSettings,
+) -> ReferenceResult:
+    """Every ray against every Gaussian; see :class:`TraceSettings` for where rays end."""
+    p = parameters
+    o = torch.tensor(origins_world, dtype=torch.float64)
+    d = torch.tensor(directions_world, dtype=torch.float64)
+    frames = rotation_matrices(p.quats_wxyz)
+    r1, r2, r3 = frames.unbind(-1)
+    s2, s3 = p.log_scales.exp().unbind(-1)
+    a = torch.sigmoid(p.opacity_logits)
+    inner_radius = APOTHEM * torch.sqrt(torch.clamp(settings.q + 2 * torch.log(a.detach()), min=0))
+
+    # --- plane hit (method section 2): t = <m - o, r1> / <d, r1>, all (rays, Gaussians) pairs ---
+    to_mean = p.means_world[None] - o[:, None]
+    cosine = torch.einsum("rj,nj->rn", d, r1)
+    grazing = cosine.abs() < GRAZING_COSINE
+    t = torch.einsum("rnj,nj->rn", to_mean, r1) / torch.where(grazing, 1.0, cosine)
+    offset = t[..., None] * d[:, None] - to_mean  # p - m
+    u = torch.einsum("rnj,nj->rn", offset, r2) / s2
+    v = torch.einsum("rnj,nj->rn", offset, r3) / s3
+    alpha = torch.clamp(a * torch.exp(-0.5 * (u * u + v * v)), max=settings.alpha_max)
+
+    # --- inside the octagon: no further along any edge normal (22.5 + 45 k degrees) than the apothem ---
+    cos, sin = np.cos(np.pi / 8), np.sin(np.pi / 8)
+    au, av = u.detach().abs(), v.detach().abs()
+    inside = torch.maximum(au * cos + av * sin, au * sin + av * cos) <= inner_radius
+    t32 = t.detach().float()
+    hit = inside & ~grazing & (t32 > settings.t_min) & (inner_radius > 0)
+
+    basis = sh_basis(d, p.sh.shape[1])
+    out: list[list[Tensor]] = []
+    hit_ids = []
+    for ray in range(len(o)):
+        ids = torch.nonzero(hit[ray]).squeeze(-1)
+        # Front to back; equal float32 distances are ordered by id (the sort is stable, ids ascend).
+        ids = ids[torch.sort(t32[ray, ids], stable=True).indices]
+        ids = ids[: _stop(alpha[ray, ids].detach(), settings)]
+        hit_ids.append(ids.numpy())
+        al = alpha[ray, ids]
+        through = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1 - al, 0)])
+        weight = al * through[:-1]  # alpha_k T_k
+        colour = torch.clamp(0.5 + torch.einsum("k,nkc->nc", basis[ray], p.sh[ids]), min=0)
+        facing = -torch.sign(cosine[ray, ids].detach())
+        crossing = torch.nonzero((through[:-1] > 0.5) & (through[1:] <= 0.5)).squeeze(-1)
+        median = t[ray, ids[crossing[0]]] if len(crossing) else torch.zeros((), dtype=torch.float64)
+        out.append(
+            [
+                weight @ colour,
+                through[-1],
+                weight @ t[ray, ids],
+                median,
+                (weight * facing) @ r1[ids],
+                weight @ p.features[ids],
+            ]
+        )
+    return ReferenceResult(*(torch.stack(column) for column in zip(*out, strict=True)), hit_ids)
+
+
+def _stop(alphas: Tensor, settings: TraceSettings) -> int:
+    """Number of hits that count: the two thresholds of the paper's Algorithm 1, or the single one."""
+    t1, t2, second_phase = 1.0, 1.0, False
+    for k, alpha in enumerate(alphas.tolist()):
+        t1 *= 1 - alpha
+        if second_phase:
+            t2 *= 1 - alpha
+        elif t1 < settings.transmittance_min:
+            second_phase = True
+        done = second_phase and (settings.second_phase_min is None or t2 < settings.second_phase_min)
+        if done or k + 1 == settings.max_hits:
+            return k + 1
+    return len(alphas)
