@@ -27,6 +27,8 @@ from engine.gaussians.ply_format import (
 
 FLAT_LOG_SCALE = np.float32(np.log(FLAT_SCALE))
 MAX_SH_DEGREE = 3
+LARGEST_LOGIT = np.float32(16.0)
+"""Stands for an infinite logit, which converters write for opacity 1; its sigmoid is 1 - 1e-7."""
 ROWS_AT_ONCE = 65536
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
@@ -48,6 +50,7 @@ class ImportReport:
         median_thickness: over the flattened ones, median of smallest / second-smallest scale (1 = a ball or a
             needle, no surface at all; 0 if none was flattened).
         max_thickness: the largest such ratio.
+        saturated: opacities of exactly 0 or 1, whose infinite logits became -16 or 16.
     """
 
     count: int
@@ -56,6 +59,7 @@ class ImportReport:
     flattened: int
     median_thickness: float
     max_thickness: float
+    saturated: int
 
 
 def write_gaussian_ply(gaussians: FlatGaussians, path: Path, *, sh_pad_degree: int | None = None) -> None:
@@ -136,6 +140,8 @@ def read_gaussian_ply(
     means, quats = columns(table, _POSITION), columns(table, _ROTATION)
     scales = columns(table, _scale_names(scale_count))
     logits = columns(table, ["opacity"])[:, 0]
+    infinite = np.isinf(logits)
+    logits[infinite] = np.copysign(LARGEST_LOGIT, logits[infinite])
     colours = columns(table, [*_SH_DC, *(f"f_rest_{k}" for k in range(rest_count))])
     _check_values(
         path, {"position": means, "rotation": quats, "scale": scales, "opacity": logits, "colour": colours}
@@ -155,6 +161,7 @@ def read_gaussian_ply(
         flattened=len(thickness),
         median_thickness=float(np.median(thickness)) if len(thickness) else 0.0,
         max_thickness=float(thickness.max()) if len(thickness) else 0.0,
+        saturated=int(infinite.sum()),
     )
     return gaussians, report
 
@@ -202,7 +209,7 @@ def _check_values(path: Path, values: dict[str, np.ndarray]) -> None:
         bad = int((~np.isfinite(array.reshape(len(array), -1))).any(axis=1).sum())
         if bad:
             raise SceneFileError(
-                f"{path}: {bad} of {len(array)} Gaussians have a {what} that is not a finite number; "
+                f"{path}: {bad} of {len(array)} Gaussians have no finite {what}; "
                 "remove them and save the file again."
             )
     zero = int((values["rotation"] == 0).all(axis=1).sum())

@@ -1,0 +1,1 @@
+"""Files for other programs: one small module a format, all found by `engine.export.registry`."""

@@ -1,0 +1,26 @@
+"""Settings shared by all export formats."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from engine.gaussians.octagon import CHI2_2_99
+
+
+class ExportOptions(BaseModel):
+    """How scenes are written; each format takes what concerns it.
+
+    Attributes:
+        q: chi-square quantile Q of the octagons; alpha falls to exp(-Q/2) at their corners.
+        min_opacity: Gaussians fainter than this are left out, in every format.
+        sh_pad_degree: Gaussian PLY: write at least this degree of spherical harmonics, padded with zeros.
+        texture_size: side of the radial alpha texture of GLB and OBJ, in pixels.
+        ids: GLB: write the vertex attributes ``_GID`` and ``_CORNER``, by which an edited mesh finds back to
+            its Gaussians.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    q: float = Field(default=CHI2_2_99, gt=0.0, le=100.0)
+    min_opacity: float = Field(default=0.0, ge=0.0, lt=1.0)
+    sh_pad_degree: int | None = Field(default=None, ge=0, le=3)
+    texture_size: int = Field(default=128, ge=8, le=4096)
+    ids: bool = True
