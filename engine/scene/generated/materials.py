@@ -1,0 +1,246 @@
+"""What the things of the generated scene are made of: linear albedo from texture coordinates.
+
+Every material takes positions (n, 3) in the object's own frame, in metres, and uv (n, 2), and returns colours
+(n, 3) in linear light.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float32
+
+from engine.scene.generated.textures import (
+    cell_noise,
+    checker,
+    dots,
+    grey,
+    grooves,
+    linear,
+    mix,
+    noise,
+    octagons,
+    scaled,
+    step,
+    text,
+    within,
+    zigzag,
+)
+
+Points = Float32[np.ndarray, "n 3"]
+Coordinates = Float32[np.ndarray, "n 2"]
+Colours = Float32[np.ndarray, "n 3"]
+Material = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def _grain(xyz: Points, light: str, dark: str, seed: int) -> Colours:
+    """Wood whose fibres run along x."""
+    wander = noise(scaled(xyz, (1.2, 5, 5)), octaves=2, seed=seed)
+    rings = 0.5 + 0.5 * np.sin(70 * xyz[:, 1] + 22 * xyz[:, 2] + 9 * wander)
+    fibre = noise(scaled(xyz, (5, 130, 130)), octaves=2, seed=seed + 1)
+    return mix(linear(light), linear(dark), np.clip(0.18 + 0.5 * rings * rings + 0.38 * fibre, 0, 1))
+
+
+def table_wood(xyz: Points, uv: Coordinates) -> Colours:
+    """Oiled planks with dark seams."""
+    plank = np.floor(xyz[:, 1] / 0.19 + 0.5)
+    shade = cell_noise(plank, np.zeros_like(plank), seed=3)
+    shifted = xyz + np.stack([7 * shade, 3 * shade, 5 * shade], axis=1)
+    colours = _grain(shifted, "d9a066", "8a5428", seed=20) * grey(0.72 + 0.5 * shade)
+    seam = np.abs(np.mod(xyz[:, 1] / 0.19 + 0.5, 1) - 0.5) > 0.485
+    return mix(colours, linear("3a2212"), 0.85 * seam.astype(np.float32))
+
+
+def pedestal_wood(xyz: Points, uv: Coordinates) -> Colours:
+    """Dark turned wood, fibres upright."""
+    return _grain(np.ascontiguousarray(xyz[:, [2, 0, 1]]), "7a4a2c", "3b2012", seed=24)
+
+
+def floor_tiles(xyz: Points, uv: Coordinates) -> Colours:
+    """Terracotta and cream tiles, some with an octagon, all stained and grouted."""
+    u, v = xyz[:, 0] / 0.4, xyz[:, 1] / 0.4
+    tone = cell_noise(u, v, seed=5)
+    odd = checker(u, v)
+    colours = mix(linear("c9704a"), linear("e6d9bd"), odd)
+    inlay = octagons(u, v, 0.3) - octagons(u, v, 0.24) + dots(u, v, 0.09)
+    colours = mix(colours, linear("2f5d62"), inlay * odd)
+    colours = mix(colours, linear("8a3d26"), octagons(u, v, 0.14) * (1 - odd))
+    stain = noise(xyz * np.float32(6), octaves=4, seed=31)
+    colours = colours * grey(0.82 + 0.26 * tone + 0.2 * stain)
+    return mix(colours, linear("6d665c"), grooves(u, v, 0.035))
+
+
+def _picture(index: int, u: np.ndarray, v: np.ndarray) -> Colours:
+    """Eight different paintings, u and v in [0, 1] across the canvas."""
+    flat = np.stack([u, v, np.full_like(u, index)], axis=1).astype(np.float32)
+    if index == 0:  # hills at dusk, one behind another
+        colours = mix(linear("f6c177"), linear("3e5c9a"), step(0.35, 1.0, v))
+        colours = mix(colours, linear("fff1c9"), within(np.hypot(u - 0.7, v - 0.62), 0, 0.1))
+        for k, shade in enumerate(("7d5a8c", "4b4a78", "2c3657", "18233a")):
+            line = np.stack([3 * u + 9 * k, np.full_like(u, k), np.zeros_like(u)], axis=1).astype(np.float32)
+            ridge = np.float32(0.52 - 0.13 * k) + 0.13 * noise(line, octaves=4, seed=40)
+            colours = mix(colours, linear(shade), (v < ridge).astype(np.float32))
+        return colours
+    if index == 1:  # rings
+        ring = np.floor(9 * np.hypot(u - 0.5, v - 0.5) + 0.25 * noise(flat * 5, octaves=2, seed=41))
+        return mix(linear("f2e8cf"), linear("bc4749"), np.mod(ring, 2)) * grey(1 - 0.05 * ring)
+    if index == 2:  # letters
+        ink = text(8 * u, 5 * (v - 1), ["OCTAGON ", "PLATES  ", "SPLATS  ", "ORIGINAL"])
+        return mix(linear("f4f1de"), linear("1d3557"), ink)
+    if index == 3:  # marble
+        vein = np.abs(np.sin(9 * u + 6 * v + 4 * noise(flat * 3, octaves=5, seed=42)))
+        return mix(linear("183a37"), linear("efd6ac"), np.clip(1.2 - 2.2 * vein, 0, 1).astype(np.float32))
+    if index == 4:  # patchwork
+        tone = cell_noise(6 * u, 6 * v, seed=43)
+        colours = mix(linear("264653"), linear("e9c46a"), step(0.2, 0.75, tone))
+        colours = mix(colours, linear("e76f51"), (tone > 0.72).astype(np.float32))
+        return mix(colours, linear("f8f4e3"), dots(6 * u, 6 * v, 0.22) * (tone < 0.4))
+    if index == 5:  # waves
+        wave = np.sin(40 * v + 5 * np.sin(9 * u) + 3 * noise(flat * 4, octaves=2, seed=44))
+        return mix(linear("0b3954"), linear("bfd7ea"), (0.5 + 0.5 * wave).astype(np.float32))
+    if index == 6:  # octagon mosaic
+        tone = cell_noise(7 * u, 7 * v, seed=45)
+        colours = mix(linear("f1faee"), linear("6a994e"), tone)
+        return mix(linear("33272a"), colours, octagons(7 * u, 7 * v, 0.46))
+    spots = noise(flat * 9, octaves=3, seed=46)  # ink blots
+    return mix(linear("faedcd"), linear("6d2e46"), step(0.02, 0.1, spots))
+
+
+def room_walls(xyz: Points, uv: Coordinates) -> Colours:
+    """Panelled below, papered above, a painting on each side, letters along a frieze; u has 10 m a side."""
+    side = np.floor(uv[:, 0] / 10 + 0.5).astype(np.int32)
+    u, v = uv[:, 0] - 10 * side.astype(np.float32), uv[:, 1]
+    stripe = within(np.mod(u / 0.24, 1), 0, 0.5)
+    colours = mix(linear("9fb8ad"), linear("c7d3bf"), stripe)
+    motif = octagons(u / 0.24 - 0.25, v / 0.24, 0.2) - octagons(u / 0.24 - 0.25, v / 0.24, 0.1)
+    colours = mix(colours, linear("e0a458"), motif)
+    colours = colours * grey(1 + 0.12 * noise(xyz * np.float32(9), octaves=3, seed=33))
+    wainscot = _grain(
+        np.ascontiguousarray(np.stack([v, u, 3 * side], axis=1).astype(np.float32)), "8c6a4f", "5b4032", 50
+    )
+    panel = grooves(u / 0.42, (v - 0.05) / 0.75, 0.09)
+    colours = np.where((v < 0.8)[:, None], wainscot * grey(1 - 0.55 * panel), colours)
+    colours = mix(colours, linear("efe6d5"), within(v, 0.8, 0.86) + within(v, 0.0, 0.08))
+    frieze = within(v, 2.5, 2.86)
+    ink = text(u / 0.17 + 0.5, (v - 2.82) / 0.36, ["OCTASPLAT "])
+    colours = mix(colours, mix(linear("274060"), linear("f3d9a4"), ink), frieze)
+    half_width, middle, half_height = 0.72, 1.68, 0.54
+    frame = (np.abs(u) < half_width + 0.07) & (np.abs(v - middle) < half_height + 0.07)
+    canvas = (np.abs(u) < half_width) & (np.abs(v - middle) < half_height)
+    colours = mix(colours, linear("5a3e1b"), frame.astype(np.float32))
+    for index in range(8):
+        here = np.flatnonzero(canvas & (side == index))
+        if len(here):
+            across, up = (u[here] / half_width + 1) / 2, ((v[here] - middle) / half_height + 1) / 2
+            weave = noise(scaled(xyz[here], (60, 60, 60)), octaves=1, seed=34)
+            colours[here] = _picture(index, across, up) * grey(1 + 0.1 * weave)
+    return colours
+
+
+def vase_glaze(xyz: Points, uv: Coordinates) -> Colours:
+    """White porcelain painted with blue bands."""
+    turn, z = uv[:, 0], xyz[:, 2]
+    paint = noise(xyz * np.float32(35), octaves=3, seed=60)
+    colours = np.broadcast_to(linear("eee8dc"), xyz.shape) * grey(1 + 0.07 * paint)
+    blue = mix(linear("1f3f87"), linear("4a78c0"), np.clip(0.5 + 0.8 * paint, 0, 1))
+    bands = within(z, 0.03, 0.045) + within(z, 0.105, 0.115) + within(z, 0.335, 0.35) + within(z, 0.46, 0.47)
+    bands = bands + within(z, 0.045, 0.105) * zigzag(24 * turn, (z - 0.05) / 0.05)
+    bands = bands + within(z, 0.35, 0.37) * (1 - dots(30 * turn, (z - 0.35) / 0.02, 0.33))
+    belly = within(z, 0.125, 0.325)
+    petals = np.cos(2 * np.pi * 8 * turn) * 0.5 + 0.5
+    height = np.abs(z - 0.225) / 0.1
+    flower = (
+        (height < petals).astype(np.float32) - (height < 0.72 * petals - 0.08) + (height < 0.4 * petals - 0.1)
+    )
+    leaf = (
+        (height > 1 - 0.6 * (1 - petals)) & (noise(xyz * np.float32(50), octaves=2, seed=61) > 0.05)
+    ).astype(np.float32)
+    bands = bands + belly * np.clip(flower + leaf, 0, 1)
+    bands = bands + within(z, 0.38, 0.455) * zigzag(16 * turn, (z - 0.38) / 0.075) * zigzag(
+        48 * turn, (z - 0.36) / 0.09
+    )
+    colours = mix(colours, blue, np.clip(bands, 0, 1).astype(np.float32))
+    return mix(colours, linear("c8963e"), (z > 0.492).astype(np.float32))
+
+
+def knot_glaze(xyz: Points, uv: Coordinates) -> Colours:
+    """Glossy bands that wind around the tube, flecked."""
+    phase = 30 * uv[:, 0] + 2 * uv[:, 1]
+    band = np.floor(np.mod(phase, 3))
+    colours = mix(linear("d62839"), linear("f6b92b"), (band == 1).astype(np.float32))
+    colours = mix(colours, linear("1d6a96"), (band == 2).astype(np.float32))
+    fleck = step(0.5, 0.6, noise(xyz * np.float32(90), octaves=2, seed=62))
+    colours = mix(colours, linear("fbf3e4"), 0.75 * fleck)
+    return mix(colours, linear("161616"), within(np.mod(phase, 1), 0, 0.07))
+
+
+def tower_bricks(xyz: Points, uv: Coordinates) -> Colours:
+    """Small bricks with mortar, and a band of letters on each side."""
+    u, v = uv[:, 0], uv[:, 1]
+    course = v / 0.032
+    along = u / 0.07 + 0.5 * np.mod(np.floor(course), 2)
+    tone = cell_noise(along, course, seed=63)
+    colours = mix(linear("b9573b"), linear("d9a07a"), tone)
+    colours = mix(colours, linear("6f7f86"), (tone > 0.86).astype(np.float32))
+    colours = colours * grey(0.95 + 0.35 * noise(xyz * np.float32(45), octaves=3, seed=64))
+    mortar = np.maximum(within(np.mod(course, 1), 0, 0.13), within(np.mod(along, 1), 0, 0.06))
+    colours = mix(colours, linear("cfc6b4"), mortar)
+    sign = within(v, 0.30, 0.40)
+    across = np.mod(u + 5, 10) - 5
+    ink = text(across / 0.042 + 2.5, (v - 0.386) / 0.1, ["SPLAT"]) * within(across, -0.104, 0.104)
+    return mix(colours, mix(linear("f5efe0"), linear("22333b"), ink), sign)
+
+
+def boulder_stone(xyz: Points, uv: Coordinates) -> Colours:
+    """Speckled granite with lichen on its upper side."""
+    body = noise(xyz * np.float32(9), octaves=4, seed=65)
+    colours = mix(linear("8d8a83"), linear("4f4b48"), np.clip(0.5 + 0.9 * body, 0, 1))
+    speck = noise(xyz * np.float32(110), octaves=2, seed=66)
+    colours = mix(colours, linear("e4ddd0"), 0.8 * step(0.36, 0.5, speck))
+    colours = mix(colours, linear("1f1d1d"), 0.7 * step(-0.36, -0.5, speck))
+    patches = noise(xyz * np.float32(13), octaves=4, seed=67) + 2.2 * (xyz[:, 2] - 0.06)
+    lichen = mix(linear("6f7d43"), linear("b9a548"), np.clip(0.5 + speck, 0, 1))
+    return mix(colours, lichen, 0.85 * step(0.2, 0.32, patches))
+
+
+def cube_paint(xyz: Points, uv: Coordinates) -> Colours:
+    """A toy block: a chequered body whose faces carry large letters in octagons."""
+    axis = np.argmax(np.abs(xyz), axis=1)
+    rows = np.arange(len(xyz))
+    first, second = xyz[rows, (axis + 1) % 3], xyz[rows, (axis + 2) % 3]
+    sign = np.sign(xyz[rows, axis])
+    # Letters read upright on the sides: horizontal to the right as seen from outside, z upwards.
+    upright = axis != 2
+    across = np.where(axis == 0, first * sign, np.where(axis == 1, -second * sign, first))
+    up = np.where(axis == 0, second, np.where(axis == 1, first, second))
+    up = np.where(upright, xyz[:, 2], up)
+    colours = mix(linear("f2e9e4"), linear("2a9d8f"), checker(across / 0.045, up / 0.045))
+    colours = colours * grey(0.95 + 0.2 * noise(xyz * np.float32(40), octaves=3, seed=68))
+    medal = octagons(across / 0.4 + 0.5, up / 0.4 + 0.5, 0.27)
+    colours = mix(colours, linear("fdf6e3"), medal)
+    face = (2 * axis + (sign > 0)).astype(np.float32)
+    ink = text((across + 0.065) / 0.156 + np.clip(face, 0, 5), (up - 0.075) / 0.215, ["OCTAGS"])
+    near = (np.abs(across) < 0.066) & (np.abs(up) < 0.08)
+    return mix(colours, linear("d1495b"), ink * near * medal)
+
+
+def book_cloth(xyz: Points, uv: Coordinates) -> Colours:
+    """A closed book on its side: cloth covers with a title and lines of print, pages between."""
+    x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
+    weave = checker(x / 0.004, y / 0.004) * 0.12 + 0.9
+    colours = np.broadcast_to(linear("7b2d26"), xyz.shape) * grey(weave)
+    label = within(np.abs(x), 0, 0.135) * within(np.abs(y), 0, 0.185)
+    colours = mix(colours, linear("efe3c8"), label)
+    title = (
+        text((x + 0.12) / 0.03, (y - 0.165) / 0.06, ["OCTAGONS"])
+        * within(y, 0.12, 0.166)
+        * within(x, -0.12, 0.12)
+    )
+    prose = ["A SPLAT IS A", "SPOT ON A PLANE", "PLUS ITS COLOR", "AN OCTAGON IS"]
+    prose += ["ITS OUTLINE", "TRACE IT AGAIN", "UNTIL IT SITS", "IN ITS PLACE"]
+    print_ = (
+        text((x + 0.12) / 0.016, (y - 0.1) / 0.034, prose) * within(y, -0.17, 0.1) * within(x, -0.12, 0.12)
+    )
+    colours = mix(colours, linear("2b2118"), label * np.clip(title + print_, 0, 1))
+    pages = mix(linear("f3ead7"), linear("b7a98c"), (np.sin(z * 1600) * 0.5 + 0.5).astype(np.float32))
+    inside = (z > 0.008) & (z < 0.062) & (x > -0.155)
+    return np.where(inside[:, None], pages, colours)

@@ -1,0 +1,190 @@
+"""The still life in Embree, lit once: light that falls on each vertex, and colours of hits."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Float, Float32, Int32
+
+from engine.scene.generated import kernels_scene
+from engine.scene.generated.arrangement import StillLife
+
+# Fixed, so that equal sums are summed alike on every machine.
+_PIECES = 16
+THREADS = min(8, os.cpu_count() or 1)
+
+_LAMP_WORLD = np.array([1.9, -1.5, 4.2])
+_LAMP_RADIUS = 0.4
+_LAMP = np.array([1.0, 0.9, 0.76]) * 42.0
+_GLINT = np.array([9.0, 8.2, 7.0], np.float32)
+_ZENITH, _HORIZON, _BOUNCE = (np.array(c) for c in ([0.34, 0.42, 0.6], [0.5, 0.5, 0.52], [0.15, 0.125, 0.1]))
+_EXPOSURE = 1.1
+# Shadow rays start this far above the surface, so that a facet does not shade itself.
+_LIFT = 1.5e-3
+# Columns of the vertex attributes that a hit interpolates.
+_UV, _XYZ, _NORMAL, _LIGHT, _LAMP_SEEN = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, 11), 11
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First hits of n rays; ``face`` is -1 and ``distance`` infinite where a ray leaves the room.
+
+    ``distance`` counts in lengths of the ray's direction, which need not be 1; ``u`` and ``v`` weigh the
+    second and third corner of the face.
+    """
+
+    face: Int32[np.ndarray, " n"]
+    distance: Float32[np.ndarray, " n"]
+    u: Float32[np.ndarray, " n"]
+    v: Float32[np.ndarray, " n"]
+
+
+class LitScene:
+    """The still life ready to be photographed; its methods may be called from several threads."""
+
+    def __init__(self, still_life: StillLife) -> None:
+        self.still_life = still_life
+        self._embree = EmbreeScene()
+        self._mesh = TriangleMesh(self._embree, still_life.vertices, still_life.faces)
+        # The first run builds Embree's tree, which must not happen in two threads at once.
+        self.trace(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+        light, lamp_seen = self._light_on_vertices()
+        self._attributes = np.ascontiguousarray(
+            np.concatenate(
+                [still_life.uv, still_life.texture_xyz, still_life.vertex_normals, light, lamp_seen[:, None]],
+                axis=1,
+            ),
+            dtype=np.float32,
+        )
+
+    def trace(self, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]) -> Hits:
+        """First hits along rays in the world frame."""
+        found = self._embree.run(origins, directions, query="INTERSECT", output=True)
+        missed = found["primID"] < 0
+        return Hits(
+            found["primID"], np.where(missed, np.float32(np.inf), found["tfar"]), found["u"], found["v"]
+        )
+
+    def _free(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> np.ndarray:
+        """1.0 where nothing lies between an origin and the origin plus its direction, else 0.0."""
+        rays = origins.astype(np.float32), np.ascontiguousarray(directions, np.float32)
+        occluded = self._embree.run(*rays, query="OCCLUDED", dists=np.ones(len(origins), np.float32))
+        return (occluded < 0).astype(np.float64)
+
+    def _light_on_vertices(self) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
+        """Irradiance on each vertex (lamp, sky, a constant for bounces) and the share of the lamp seen."""
+        pieces = np.array_split(np.arange(len(self.still_life.vertices)), _PIECES)
+        with ThreadPoolExecutor(THREADS) as pool:
+            parts = list(pool.map(self._light_on, pieces))
+        return np.concatenate([light for light, _ in parts]), np.concatenate([seen for _, seen in parts])
+
+    def _light_on(self, which: np.ndarray) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
+        normals = self.still_life.vertex_normals[which].astype(np.float64)
+        starts = self.still_life.vertices[which] + _LIFT * normals
+        light, seen = np.zeros_like(starts), np.zeros(len(starts))
+        lamp_points = _lamp_points(48)
+        for lamp_point in lamp_points:
+            way = lamp_point - starts
+            squared = np.sum(way * way, axis=1)
+            cosine = np.maximum(np.sum(normals * way, axis=1), 0) / np.sqrt(squared)
+            free = np.zeros(len(starts))
+            lit = np.flatnonzero(cosine > 0)
+            free[lit] = self._free(starts[lit], way[lit])
+            seen += free / len(lamp_points)
+            light += (free * cosine / squared)[:, None] * _LAMP / len(lamp_points)
+        directions = _sphere_directions(160)
+        for direction in directions:
+            cosine = np.maximum(np.sum(normals * direction, axis=1), 0)
+            up = np.flatnonzero(cosine > 0)
+            free = np.zeros((len(starts), 1))
+            free[up, 0] = self._free(starts[up], np.broadcast_to(20 * direction, (len(up), 3)))
+            sky = np.zeros(3) if direction[2] <= 0 else _sky(direction[None])[0]
+            light += (4 / len(directions)) * cosine[:, None] * (free * sky + (1 - free) * _BOUNCE)
+        return light.astype(np.float32), seen.astype(np.float32)
+
+    def colours(
+        self, hits: Hits, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Display colours in [0, 1] that rays bring back from their hits."""
+        radiance = np.empty_like(directions)
+        missed = hits.face < 0
+        radiance[missed] = _sky(directions[missed])
+        hit = np.flatnonzero(hits.face >= 0)
+        faces = hits.face[hit]
+        at = np.empty((len(hit), self._attributes.shape[1]), np.float32)
+        kernels_scene.interpolate(
+            self._attributes, self.still_life.faces, faces, hits.u[hit], hits.v[hit], at
+        )
+        kinds = self.still_life.face_thing[faces]
+        for kind in np.unique(kinds):
+            thing = self.still_life.things[kind]
+            mine = np.flatnonzero(kinds == kind)
+            here = at[mine]
+            albedo = thing.material(np.ascontiguousarray(here[:, _XYZ]), np.ascontiguousarray(here[:, _UV]))
+            bright = albedo * here[:, _LIGHT]
+            if thing.gloss:
+                rays = hit[mine]
+                places = origins[rays] + hits.distance[rays, None] * directions[rays]
+                bright += (
+                    np.float32(thing.gloss)
+                    * _highlight(places, directions[rays], here[:, _NORMAL])[:, None]
+                    * (here[:, _LAMP_SEEN, None] * _GLINT)
+                )
+            radiance[hit[mine]] = bright
+        return _display(radiance)
+
+
+def _highlight(
+    places: Float32[np.ndarray, "n 3"],
+    directions: Float32[np.ndarray, "n 3"],
+    normals: Float32[np.ndarray, "n 3"],
+) -> Float32[np.ndarray, " n"]:
+    """Mirrored lamp on a glossy surface: a Phong lobe about the mirrored ray."""
+    ahead, upwards, to_lamp = (
+        _unit(a) for a in (directions, normals, _LAMP_WORLD.astype(np.float32) - places)
+    )
+    mirrored = ahead - 2 * np.sum(ahead * upwards, axis=1, keepdims=True) * upwards
+    return np.maximum(np.sum(mirrored * to_lamp, axis=1), 0) ** 90
+
+
+def _unit(vectors: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _lamp_points(count: int) -> Float[np.ndarray, "n 3"]:
+    """Points spread evenly (by the golden angle) over the lamp's disc, which faces the table."""
+    k = np.arange(count)
+    radius, angle = _LAMP_RADIUS * np.sqrt((k + 0.5) / count), k * np.pi * (3 - np.sqrt(5))
+    down = -_LAMP_WORLD / np.linalg.norm(_LAMP_WORLD)
+    side = np.cross(down, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    return (
+        _LAMP_WORLD
+        + np.outer(radius * np.cos(angle), side)
+        + np.outer(radius * np.sin(angle), np.cross(down, side))
+    )
+
+
+def _sphere_directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """Unit vectors spread evenly over the sphere (Fibonacci)."""
+    k = np.arange(count)
+    z, angle = 1 - (2 * k + 1) / count, k * np.pi * (3 - np.sqrt(5))
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
+def _sky(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Radiance of the open roof."""
+    height = np.clip(directions[:, 2:] / np.linalg.norm(directions, axis=1, keepdims=True), 0, 1)
+    return _HORIZON + (_ZENITH - _HORIZON) * height
+
+
+def _display(radiance: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+    """sRGB-encoded colours of linear light, with a soft shoulder so that nothing clips hard."""
+    x = 1 - np.exp(radiance * np.float32(-_EXPOSURE))
+    return np.where(
+        x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** np.float32(1 / 2.4) - 0.055
+    )
