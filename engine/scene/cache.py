@@ -1,0 +1,236 @@
+"""The pixel cache: all photographs of a scene, decoded and reduced, as flat files to be mapped.
+
+``rgb.bin`` holds the colours of all views one after the other, row by row, as uint8 or, if any photograph
+is deeper, uint16; ``alpha.bin`` and ``mask.bin`` hold one byte a pixel and exist only where they are needed.
+``pixels.json`` says from which files they were made.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+from jaxtyping import Int64
+
+from engine.errors import DatasetError, OutputError
+from engine.files import replacing, write_json
+from engine.scene.images import ImageInfo, read_mask, read_photo
+from engine.scene.mapped import MappedArray
+from engine.scene.model import SceneModel, View
+
+CACHE_VERSION = 1
+"""Raised whenever the contents of the cache files change for the same photographs."""
+
+DECODING_BYTES = 2 << 30
+"""Memory that decoding threads may take together; one thread always runs."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class PixelCache:
+    """Mapped planes of all views; ``alpha`` and ``mask`` are empty where there is nothing to say.
+
+    Attributes:
+        rgb: straight display colours, 3 values a pixel.
+        alpha: 255 where opaque, one value a pixel.
+        mask: 255 where valid, one value a pixel.
+        offsets: first pixel of every view, and the count of all pixels at the end.
+        warnings: one sentence each on what is odd but usable.
+    """
+
+    rgb: MappedArray
+    alpha: MappedArray
+    mask: MappedArray
+    offsets: Int64[np.ndarray, " views_and_end"]
+    warnings: tuple[str, ...]
+
+
+def open_pixel_cache(
+    scene: SceneModel, folder: Path, *, threads: int = 0, progress: Progress | None = None
+) -> PixelCache:
+    """Map the pixels of ``scene``, decoding them into ``folder`` first unless they are there already.
+
+    Args:
+        scene: the scene.
+        folder: folder of the cache files.
+        threads: decoding threads; 0 takes one a processor. Fewer run where photographs are huge.
+        progress: told (photographs done, photographs in all) while decoding.
+
+    Raises:
+        DatasetError: a photograph or a mask cannot be read.
+        OutputError: the cache cannot be written.
+    """
+    sizes = [view.width_px * view.height_px for view in scene.views]
+    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    fingerprint = _fingerprint(scene)
+    index = _read_index(folder, fingerprint, int(offsets[-1]))
+    if index is None:
+        _build(scene, folder, offsets, fingerprint, threads, progress)
+        index = _read_index(folder, fingerprint, int(offsets[-1]))
+        if index is None:
+            raise OutputError(
+                f"The pixel cache in {folder} changed while it was written; use another folder."
+            )
+    rgb_type = np.uint8 if index["bits"] == 8 else np.uint16
+    return PixelCache(
+        rgb=MappedArray.open(folder / "rgb.bin", rgb_type),
+        alpha=_plane(folder / "alpha.bin", index["alpha"]),
+        mask=_plane(folder / "mask.bin", index["mask"]),
+        offsets=offsets,
+        warnings=tuple(index["warnings"]),
+    )
+
+
+class _Index(TypedDict):
+    fingerprint: str
+    bits: int
+    alpha: bool
+    mask: bool
+    warnings: list[str]
+
+
+def _plane(path: Path, exists: bool) -> MappedArray:
+    return MappedArray.open(path, np.uint8) if exists else MappedArray.empty(np.uint8)
+
+
+def _fingerprint(scene: SceneModel) -> str:
+    sources: list[object] = [CACHE_VERSION, str(scene.root.resolve())]
+    for view in scene.views:
+        for path in (view.image_path, view.mask_path):
+            if path is None:
+                sources.append(None)
+                continue
+            stat = path.stat()
+            sources.append([str(path.relative_to(scene.root)), stat.st_size, stat.st_mtime_ns])
+        sources.append([view.width_px, view.height_px])
+    return hashlib.sha256(json.dumps(sources).encode()).hexdigest()
+
+
+def _read_index(folder: Path, fingerprint: str, pixels: int) -> _Index | None:
+    """The index, if it belongs to the scene and the files are as long as it says."""
+    try:
+        index: _Index = json.loads((folder / "pixels.json").read_text(encoding="utf-8"))
+        expected = {"rgb.bin": 3 * pixels * index["bits"] // 8}
+        expected |= {f"{name}.bin": pixels for name in ("alpha", "mask") if index[name]}
+        whole = all((folder / name).stat().st_size == size for name, size in expected.items())
+        return index if whole and index["fingerprint"] == fingerprint else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _build(
+    scene: SceneModel,
+    folder: Path,
+    offsets: Int64[np.ndarray, " views_and_end"],
+    fingerprint: str,
+    threads: int,
+    progress: Progress | None,
+) -> None:
+    bits = max(info.bits for info in scene.image_infos)
+    pixels = int(offsets[-1])
+    planes = {"rgb": 3 * pixels * bits // 8}
+    if any(info.has_alpha for info in scene.image_infos):
+        planes["alpha"] = pixels
+    if any(view.mask_path is not None for view in scene.views):
+        planes["mask"] = pixels
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "pixels.json").unlink(missing_ok=True)
+        with ExitStack() as stack:
+            files: dict[str, int] = {}
+            for name, size in planes.items():
+                temporary = stack.enter_context(replacing(folder / f"{name}.bin"))
+                files[name] = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+                stack.callback(os.close, files[name])
+                os.posix_fallocate(files[name], 0, size)  # a full disk shows now, not after an hour
+            summaries = _decode_all(scene, offsets, bits, files, threads, progress)
+        # Many RGBA files are opaque throughout; their plane would only cost memory traffic.
+        transparent = any(summary.is_transparent for summary in summaries)
+        for name in ("alpha", "mask"):
+            if name not in planes or (name == "alpha" and not transparent):
+                (folder / f"{name}.bin").unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"The pixel cache of {sum(planes.values()) / 1e9:.2f} GB cannot be written to {folder} "
+            f"({error.strerror}); free space there or name another folder."
+        ) from error
+    black = [view.name for view, summary in zip(scene.views, summaries, strict=True) if summary.is_masked_out]
+    warnings = [f"{len(black)} masks hold no valid (white) pixel, e.g. that of {black[0]}."] if black else []
+    index: _Index = {
+        "fingerprint": fingerprint,
+        "bits": bits,
+        "alpha": "alpha" in planes and transparent,
+        "mask": "mask" in planes,
+        "warnings": warnings,
+    }
+    write_json(folder / "pixels.json", index)
+
+
+@dataclass(frozen=True)
+class _Summary:
+    is_transparent: bool
+    is_masked_out: bool
+
+
+def _decode_all(
+    scene: SceneModel,
+    offsets: Int64[np.ndarray, " views_and_end"],
+    bits: int,
+    files: dict[str, int],
+    threads: int,
+    progress: Progress | None,
+) -> list[_Summary]:
+    def decode(index: int) -> _Summary:
+        return _decode_view(scene.views[index], scene.image_infos[index], int(offsets[index]), bits, files)
+
+    # Bytes a pixel: as stored, as float32, and a copy of either while channels are rearranged.
+    largest = max(36 * info.width_px * info.height_px for info in scene.image_infos)
+    workers = min(threads if threads > 0 else os.cpu_count() or 1, max(1, DECODING_BYTES // largest))
+    summaries: list[_Summary] = []
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(decode, index) for index in range(len(scene.views))]
+        try:
+            for future in futures:
+                summaries.append(future.result())
+                if progress is not None:
+                    progress(len(summaries), len(futures))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return summaries
+
+
+def _decode_view(view: View, info: ImageInfo, offset: int, bits: int, files: dict[str, int]) -> _Summary:
+    width, height = view.width_px, view.height_px
+    rgb, alpha = read_photo(view.image_path, width, height, bits)
+    if rgb.shape != (height, width, 3):
+        raise DatasetError(
+            f"{view.image_path} changed while it was read; leave the scene alone until it is read."
+        )
+    _write_at(files["rgb"], rgb, offset * 3 * bits // 8)
+    if "alpha" in files:
+        opaque = np.full((height, width), 255, dtype=np.uint8)
+        _write_at(files["alpha"], opaque if alpha is None else alpha, offset)
+    mask = None
+    if "mask" in files:
+        mask = np.full((height, width), 255, dtype=np.uint8)
+        if view.mask_path is not None:
+            mask = read_mask(view.mask_path, (info.width_px, info.height_px), width, height)
+        _write_at(files["mask"], mask, offset)
+    return _Summary(
+        is_transparent=alpha is not None and int(alpha.min()) < 255,
+        is_masked_out=mask is not None and int(mask.max()) < 128,
+    )
+
+
+def _write_at(file: int, values: np.ndarray, position: int) -> None:
+    data = np.ascontiguousarray(values).data.cast("B")
+    while data:
+        written = os.pwrite(file, data, position)
+        data, position = data[written:], position + written

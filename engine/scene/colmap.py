@@ -1,0 +1,148 @@
+"""Reading a COLMAP model, with or without rigs, binary or text, into plain records."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float64
+
+from engine.errors import DatasetError
+from engine.scene.binary import check_binary_model
+from engine.scene.cameras import Camera
+from engine.scene.model import SparsePoints
+
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+"""Where a scene keeps its model; the first that holds one counts."""
+
+_PARTS = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """A registered image of the model: its name, its camera's id and its pose."""
+
+    name: str
+    camera_id: int
+    rotation_cam_from_world: Float64[np.ndarray, "3 3"]
+    translation_cam_from_world: Float64[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """What a COLMAP model says, checked to be finite.
+
+    Attributes:
+        folder: where it was read from.
+        cameras: by COLMAP's camera id, at the size COLMAP worked with.
+        images: registered images, sorted by name.
+        points: sparse point cloud.
+        warnings: one sentence each on what is odd but usable.
+    """
+
+    folder: Path
+    cameras: dict[int, Camera]
+    images: tuple[PosedImage, ...]
+    points: SparsePoints
+    warnings: tuple[str, ...]
+
+
+def find_model_folder(root: Path) -> Path:
+    """The folder of the scene's model, the first of :data:`MODEL_FOLDERS` that holds one.
+
+    Raises:
+        DatasetError: there is none, or the first one lacks a file.
+    """
+    for name in MODEL_FOLDERS:
+        folder = root / name
+        if not any((folder / f"{part}{suffix}").is_file() for part in _PARTS for suffix in (".bin", ".txt")):
+            continue
+        for suffix in (".bin", ".txt"):
+            if all((folder / f"{part}{suffix}").is_file() for part in _PARTS):
+                return folder
+        suffix = ".bin" if any((folder / f"{part}.bin").is_file() for part in _PARTS) else ".txt"
+        missing = [f"{part}{suffix}" for part in _PARTS if not (folder / f"{part}{suffix}").is_file()]
+        raise DatasetError(f"{folder} lacks {' and '.join(missing)}; copy the whole COLMAP model there.")
+    raise DatasetError(
+        f"{root} holds no COLMAP model; put cameras, images and points3D (.bin or .txt) "
+        f"into {root / 'sparse/0'}."
+    )
+
+
+def read_colmap_model(root: Path) -> ColmapModel:
+    """Read the COLMAP model of the scene in ``root``.
+
+    Raises:
+        DatasetError: there is no model, it is damaged, or it holds values that are not finite.
+    """
+    folder = find_model_folder(root)
+    check_binary_model(folder)
+    try:
+        reconstruction = pycolmap.Reconstruction(str(folder))
+    except (ValueError, IndexError, KeyError, TypeError, RuntimeError, MemoryError, OSError) as error:
+        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+        raise DatasetError(
+            f"The COLMAP model in {folder} cannot be read ({reason}); copy it anew or run COLMAP again."
+        ) from error
+    warnings: list[str] = []
+    images = _posed_images(reconstruction, folder, warnings)
+    cameras = _cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
+    points = _sparse_points(reconstruction, folder, warnings)
+    return ColmapModel(folder, cameras, images, points, tuple(warnings))
+
+
+def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tuple[PosedImage, ...]:
+    images: list[PosedImage] = []
+    unposed = 0
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            unposed += 1
+            continue
+        matrix = np.array(image.cam_from_world().matrix(), dtype=np.float64)
+        if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3]) - 1) > 1e-3:
+            raise DatasetError(
+                f"The pose of {image.name} in {folder} is not a finite rigid motion; run COLMAP again."
+            )
+        images.append(PosedImage(image.name, int(image.camera_id), matrix[:, :3].copy(), matrix[:, 3].copy()))
+    if unposed:
+        warnings.append(f"{unposed} images of the model in {folder} have no pose and are left out.")
+    return tuple(sorted(images, key=lambda image: image.name))
+
+
+def _cameras(reconstruction: Any, used: set[int], folder: Path, warnings: list[str]) -> dict[int, Camera]:
+    cameras: dict[int, Camera] = {}
+    for camera_id, camera in reconstruction.cameras.items():
+        if camera_id not in used:
+            continue
+        params = np.array(camera.params, dtype=np.float64)
+        focals = params[list(camera.focal_length_idxs())]
+        valid = camera.verify_params() and np.isfinite(params).all() and (focals > 0).all()
+        if not valid or camera.width < 1 or camera.height < 1:
+            raise DatasetError(
+                f"Camera {camera_id} of the model in {folder} has impossible parameters "
+                f"({camera.model_name}, {camera.width}x{camera.height}, {params.tolist()}); run COLMAP again."
+            )
+        cameras[int(camera_id)] = Camera(
+            camera.model_name, tuple(params.tolist()), int(camera.width), int(camera.height)
+        )
+    idle = reconstruction.num_cameras() - len(cameras)
+    if idle:
+        warnings.append(f"{idle} cameras of the model in {folder} belong to no posed image.")
+    return cameras
+
+
+def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> SparsePoints:
+    points = list(reconstruction.points3D.values())
+    xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], dtype=np.float32).reshape(-1, 3) / np.float32(255)
+    tracks = np.array([point.track.length() for point in points], dtype=np.int32)
+    errors = np.array([point.error for point in points], dtype=np.float32)
+    finite = np.isfinite(xyz).all(axis=1)
+    if not finite.all():
+        warnings.append(
+            f"{int((~finite).sum())} points of the model in {folder} are not finite and left out."
+        )
+    if not finite.any():
+        warnings.append(f"The model in {folder} has no 3D points; the start will be random.")
+    return SparsePoints(xyz[finite], rgb[finite], tracks[finite], errors[finite])

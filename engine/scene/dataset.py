@@ -1,0 +1,282 @@
+"""A scene with its pixels: rays and colours of any pixels of any views."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int, Int64
+
+from engine.scene import kernels
+from engine.scene.cache import PixelCache, open_pixel_cache
+from engine.scene.cameras import Camera
+from engine.scene.directions import (
+    MAX_TABLE_BYTES,
+    NO_TABLE_DIRECT,
+    RayTables,
+    covers_its_image,
+    open_ray_tables,
+    rows_at_once,
+)
+from engine.scene.load import load_scene
+from engine.scene.model import SceneModel, SparsePoints, View, scene_extent
+from engine.scene.split import split_views
+
+MaskUse = Literal["ignore", "alpha"]
+
+
+class Dataset:
+    """Photographs with poses, ready to train on; pixels stay on disk and are mapped into memory.
+
+    Colours are straight display values; world coordinates are COLMAP's. Every method that takes pixels takes
+    three arrays: the view, the row ``y`` and the column ``x`` of each pixel.
+
+    Attributes:
+        root: folder of the scene.
+        views: all views, sorted by name.
+        cameras: cameras at the working size.
+        points: sparse point cloud.
+        train_indices: views to train on.
+        test_indices: views held out.
+        warnings: one sentence each on what is odd but usable.
+        has_alpha: whether any pixel can have an alpha below 1.
+        has_masks: whether any view has a mask.
+        extent: radius of the training cameras, see :func:`engine.scene.model.scene_extent`.
+    """
+
+    def __init__(
+        self,
+        scene: SceneModel,
+        cache: PixelCache,
+        tables: RayTables,
+        *,
+        test_every: int = 8,
+        held_out: Sequence[str] | None = None,
+        masks: MaskUse = "ignore",
+    ) -> None:
+        self.root: Path = scene.root
+        self.views: tuple[View, ...] = scene.views
+        self.cameras: tuple[Camera, ...] = scene.cameras
+        self.points: SparsePoints = scene.points
+        self.warnings: list[str] = [*scene.warnings, *cache.warnings]
+        self.train_indices: Int64[np.ndarray, " train"]
+        self.test_indices: Int64[np.ndarray, " test"]
+        self.train_indices, self.test_indices = split_views(
+            [view.name for view in scene.views], test_every, held_out
+        )
+        self.has_masks: bool = len(cache.mask.values) > 0
+        self._mask_is_alpha = masks == "alpha"
+        self.has_alpha: bool = len(cache.alpha.values) > 0 or (self._mask_is_alpha and self.has_masks)
+        self._cache = cache
+        self._tables = tables
+        self._sizes: Int64[np.ndarray, "v 2"] = np.array(
+            [[view.width_px, view.height_px] for view in scene.views], dtype=np.int64
+        )
+        self._view_camera: Int64[np.ndarray, " v"] = np.array(
+            [view.camera_index for view in scene.views], dtype=np.int64
+        )
+        self._rotations_world_from_cam: Float64[np.ndarray, "v 3 3"] = np.stack(
+            [view.rotation_cam_from_world.T for view in scene.views]
+        )
+        origins = np.stack([view.origin_world for view in scene.views])
+        self._origins_world: Float32[np.ndarray, "v 3"] = origins.astype(np.float32)
+        self._pinholes: Float64[np.ndarray, "c 4"] = np.array(
+            [camera.pinhole_params if camera.is_pinhole else (1.0, 1.0, 0.0, 0.0) for camera in scene.cameras]
+        )
+        self._is_direct = tables.offsets == NO_TABLE_DIRECT
+        self._may_lack_rays = np.array(
+            [
+                bool(direct) and not covers_its_image(camera)
+                for direct, camera in zip(self._is_direct, scene.cameras, strict=True)
+            ]
+        )
+        self.extent: float = scene_extent(origins[self.train_indices], scene.points)
+        self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
+            self._sizes[self.train_indices].prod(axis=1)
+        )
+
+    @classmethod
+    def open(
+        cls,
+        root: Path,
+        cache_dir: Path,
+        *,
+        max_side: int | None = None,
+        test_every: int = 8,
+        held_out: Sequence[str] | None = None,
+        masks: MaskUse = "ignore",
+        threads: int = 0,
+        progress: Callable[[int, int], None] | None = None,
+        max_table_bytes: int = MAX_TABLE_BYTES,
+    ) -> "Dataset":
+        """Load a scene and decode its photographs into ``cache_dir``, or find them there.
+
+        Args:
+            root: folder with ``images/``, a COLMAP model in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``
+                and, if there are any, ``masks/<image name>.png`` (white = valid).
+            cache_dir: folder of the cache, some 3 bytes a pixel (6 if a photograph has more than 8 bits).
+            max_side: cap on the longer side of the photographs, in pixels.
+            test_every: every how-manieth view by name is held out, beginning with the first; 0 for none.
+            held_out: names of the views to hold out instead.
+            masks: ``ignore`` gives pixels outside the mask the weight 0; ``alpha`` multiplies the mask into
+                alpha, for an object on a transparent background.
+            threads: decoding threads; 0 takes one a processor.
+            progress: told (photographs done, photographs in all) while decoding.
+            max_table_bytes: limit on the ray tables of cameras that are not pinholes.
+
+        Raises:
+            DatasetError: something is missing, damaged or does not fit together.
+            OutputError: the cache cannot be written.
+            ConfigError: a setting is out of range.
+        """
+        scene = load_scene(root, max_side=max_side)
+        split_views(
+            [view.name for view in scene.views], test_every, held_out
+        )  # complain before the long work
+        cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)
+        tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
+        return cls(scene, cache, tables, test_every=test_every, held_out=held_out, masks=masks)
+
+    @property
+    def train_pixel_count(self) -> int:
+        """Number of pixels of all training views, those of weight 0 included."""
+        return int(self._train_pixels[-1])
+
+    def rays(
+        self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+    ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+        """Origins and unit directions, in world coordinates, of the rays through pixel centres.
+
+        A pixel that its camera model cannot un-project looks along the axis of the camera; :meth:`pixels`
+        gives it the weight 0.
+
+        Raises:
+            IndexError: a pixel does not exist.
+        """
+        view, y, x = _int64(view), _int64(y), _int64(x)
+        origins = np.empty((len(view), 3), dtype=np.float32)
+        directions = np.empty((len(view), 3), dtype=np.float32)
+        bad = kernels.gather_rays(
+            view, y, x, self._sizes, self._view_camera, self._rotations_world_from_cam, self._origins_world,
+            self._pinholes, self._tables.offsets, self._tables.values.values, origins, directions,
+        )  # fmt: skip
+        self._refuse(bad, view, y, x)
+        if self._is_direct.any():
+            self._direct_rays(view, y, x, directions)
+        return origins, directions
+
+    def pixels(
+        self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+    ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+        """Straight display colours and alpha in [0, 1], and weights: 1, or 0 where a pixel does not count.
+
+        Raises:
+            IndexError: a pixel does not exist.
+        """
+        view, y, x = _int64(view), _int64(y), _int64(x)
+        rgb = np.empty((len(view), 3), dtype=np.float32)
+        alpha = np.empty(len(view), dtype=np.float32)
+        weight = np.empty(len(view), dtype=np.float32)
+        values = self._cache.rgb.values
+        bad = kernels.gather_pixels(
+            view, y, x, self._sizes, self._view_camera, self._cache.offsets, self._tables.offsets,
+            self._tables.values.values, values, np.float32(np.iinfo(values.dtype).max),
+            self._cache.alpha.values, self._cache.mask.values, self._mask_is_alpha, rgb, alpha, weight,
+        )  # fmt: skip
+        self._refuse(bad, view, y, x)
+        if self._may_lack_rays.any():
+            for camera, chosen in self._by_camera(view, self._may_lack_rays):
+                found = self.cameras[camera].directions_cam(_centres(y[chosen], x[chosen]))
+                weight[chosen[np.isnan(found).any(axis=1)]] = 0.0
+        return rgb, alpha, weight
+
+    def view_rays(self, view_index: int) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]:
+        """Origin and directions of all rays of one view."""
+        width, height = self._size(view_index)
+        directions = np.empty((height * width, 3), dtype=np.float32)
+        for pixels, view, y, x in _row_blocks(view_index, width, height):
+            directions[pixels] = self.rays(view, y, x)[1]
+        return self._origins_world[view_index].copy(), directions.reshape(height, width, 3)
+
+    def view_image(
+        self, view_index: int
+    ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+        """Colours, alpha and weights of all pixels of one view, as by :meth:`pixels`."""
+        width, height = self._size(view_index)
+        rgb = np.empty((height * width, 3), dtype=np.float32)
+        alpha = np.empty(height * width, dtype=np.float32)
+        weight = np.empty(height * width, dtype=np.float32)
+        for pixels, view, y, x in _row_blocks(view_index, width, height):
+            rgb[pixels], alpha[pixels], weight[pixels] = self.pixels(view, y, x)
+        return rgb.reshape(height, width, 3), alpha.reshape(height, width), weight.reshape(height, width)
+
+    def sample_pixels(
+        self, rng: np.random.Generator, count: int
+    ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+        """``count`` pixels (view, y, x), uniform and independent over all pixels of all training views."""
+        drawn = rng.integers(0, self._train_pixels[-1], size=count, dtype=np.int64)
+        which = np.searchsorted(self._train_pixels, drawn, side="right")
+        view = self.train_indices[which]
+        width = self._sizes[view, 0]
+        inside = drawn - (self._train_pixels[which] - width * self._sizes[view, 1])
+        y = inside // width
+        return view, y, inside - y * width
+
+    def release_pages(self) -> None:
+        """Give mapped pages back to the system, e.g. before a stage that needs the memory."""
+        for mapped in (self._cache.rgb, self._cache.alpha, self._cache.mask, self._tables.values):
+            mapped.release()
+
+    def _size(self, view_index: int) -> tuple[int, int]:
+        if not 0 <= view_index < len(self.views):
+            raise IndexError(f"there is no view {view_index} among {len(self.views)}")
+        return self.views[view_index].width_px, self.views[view_index].height_px
+
+    def _refuse(
+        self, bad: int, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+    ) -> None:
+        if bad >= 0:
+            raise IndexError(f"there is no pixel with view {view[bad]}, y {y[bad]}, x {x[bad]}")
+
+    def _by_camera(
+        self, view: Int64[np.ndarray, " n"], wanted: np.ndarray
+    ) -> list[tuple[int, Int64[np.ndarray, " m"]]]:
+        camera = self._view_camera[view]
+        chosen = np.flatnonzero(wanted[camera])
+        chosen = chosen[np.argsort(camera[chosen], kind="stable")]
+        if len(chosen) == 0:
+            return []
+        groups = np.split(chosen, np.flatnonzero(np.diff(camera[chosen])) + 1)
+        return [(int(camera[group[0]]), group) for group in groups]
+
+    def _direct_rays(
+        self,
+        view: Int64[np.ndarray, " n"],
+        y: Int64[np.ndarray, " n"],
+        x: Int64[np.ndarray, " n"],
+        directions: Float32[np.ndarray, "n 3"],
+    ) -> None:
+        for camera, chosen in self._by_camera(view, self._is_direct):
+            found = self.cameras[camera].directions_cam(_centres(y[chosen], x[chosen]))
+            known = np.isfinite(found).all(axis=1)
+            rotations = self._rotations_world_from_cam[view[chosen[known]]]
+            directions[chosen[known]] = np.einsum("nij,nj->ni", rotations, found[known])
+
+
+def _int64(values: Int[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    return np.ascontiguousarray(values, dtype=np.int64)
+
+
+def _centres(y: Int64[np.ndarray, " n"], x: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 2"]:
+    return np.stack([x + 0.5, y + 0.5], axis=1)
+
+
+def _row_blocks(
+    view_index: int, width: int, height: int
+) -> Iterator[tuple[slice, Int64[np.ndarray, " n"], Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]]:
+    """All pixels of a view, some rows at a time: their place in the view, view, y and x."""
+    step = rows_at_once(width)
+    for start in range(0, height, step):
+        stop = min(start + step, height)
+        y, x = np.divmod(np.arange(start * width, stop * width, dtype=np.int64), width)
+        yield slice(start * width, stop * width), np.full(len(y), view_index, dtype=np.int64), y, x

@@ -1,0 +1,183 @@
+"""Matching a COLMAP model with the photographs and masks on disk."""
+
+import os
+import unicodedata
+from pathlib import Path
+
+from engine.errors import ConfigError, DatasetError
+from engine.scene.cameras import Camera
+from engine.scene.colmap import ColmapModel, PosedImage, read_colmap_model
+from engine.scene.images import ImageInfo, read_image_info
+from engine.scene.model import SceneModel, View
+
+MIN_VIEWS = 3
+"""Fewer photographs than this do not make a scene."""
+
+_IMAGE_SUFFIXES = frozenset(
+    {
+        ".jpg",
+        ".jpeg",
+        ".png",
+        ".tif",
+        ".tiff",
+        ".exr",
+        ".hdr",
+        ".bmp",
+        ".webp",
+        ".ppm",
+        ".pgm",
+        ".tga",
+        ".jp2",
+    }
+    | {".jxl", ".heic", ".avif", ".dpx", ".psd"}
+)
+
+
+def load_scene(root: Path, *, max_side: int | None = None) -> SceneModel:
+    """Read the model of a scene and the headers of its photographs, but no pixels.
+
+    Args:
+        root: folder with ``images/``, a COLMAP model (see :mod:`engine.scene.colmap`) and, if there are any,
+            ``masks/<image name>.png``.
+        max_side: cap on the longer side of the photographs, in pixels.
+
+    Raises:
+        DatasetError: something is missing, damaged or does not fit together.
+        ConfigError: ``max_side`` is not positive.
+    """
+    if max_side is not None and max_side < 1:
+        raise ConfigError(f"max_side is {max_side}; it must be at least 1 pixel.")
+    if not root.is_dir():
+        raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
+    if not (root / "images").is_dir():
+        raise DatasetError(f"{root} has no folder images; put the photographs into {root / 'images'}.")
+    model = read_colmap_model(root)
+    if len(model.images) < MIN_VIEWS:
+        raise DatasetError(
+            f"The model in {model.folder} has {len(model.images)} posed images; "
+            f"at least {MIN_VIEWS} are needed."
+        )
+    warnings = list(model.warnings)
+    paths = _image_paths(root, model, warnings)
+    masks = _mask_paths(root, [image.name for image in model.images], warnings)
+    _warn_of_other_models(model.folder, warnings)
+
+    views: list[View] = []
+    infos: list[ImageInfo] = []
+    camera_indices: dict[Camera, int] = {}
+    for image, path, mask in zip(model.images, paths, masks, strict=True):
+        info = read_image_info(path)
+        original = model.cameras[image.camera_id]
+        _check_size(original, info, image, path)
+        width, height = capped_size(info.width_px, info.height_px, max_side)
+        camera = original.scaled_to(width, height)
+        views.append(
+            View(
+                name=image.name,
+                image_path=path,
+                mask_path=mask,
+                camera_index=camera_indices.setdefault(camera, len(camera_indices)),
+                rotation_cam_from_world=image.rotation_cam_from_world,
+                translation_cam_from_world=image.translation_cam_from_world,
+                width_px=width,
+                height_px=height,
+            )
+        )
+        infos.append(info)
+    return SceneModel(
+        root, model.folder, tuple(views), tuple(infos), tuple(camera_indices), model.points, tuple(warnings)
+    )
+
+
+def capped_size(width_px: int, height_px: int, max_side: int | None) -> tuple[int, int]:
+    """Width and height after the cap on the longer side; never enlarged, never below one pixel."""
+    longer = max(width_px, height_px)
+    if max_side is None or longer <= max_side:
+        return width_px, height_px
+    ratio = max_side / longer
+    return max(1, round(width_px * ratio)), max(1, round(height_px * ratio))
+
+
+def _image_paths(root: Path, model: ColmapModel, warnings: list[str]) -> list[Path]:
+    folder = root / "images"
+    on_disk = _files_below(folder)
+    paths: list[Path] = []
+    missing: list[str] = []
+    for image in model.images:
+        # Nothing outside images/ is read, whatever a model from elsewhere asks for.
+        path = on_disk.pop(unicodedata.normalize("NFC", image.name), None)
+        if path is None:
+            missing.append(image.name)
+        else:
+            paths.append(path)
+    if missing:
+        raise DatasetError(
+            f"{len(missing)} of {len(model.images)} images of the model are not in {folder} "
+            f"({_some(missing)}); put them there or run COLMAP without them."
+        )
+    unposed = sorted(name for name, path in on_disk.items() if path.suffix.lower() in _IMAGE_SUFFIXES)
+    if unposed:
+        warnings.append(
+            f"{len(unposed)} images in {folder} have no pose and are left out ({_some(unposed)})."
+        )
+    return paths
+
+
+def _mask_paths(root: Path, names: list[str], warnings: list[str]) -> list[Path | None]:
+    folder = root / "masks"
+    if not folder.is_dir():
+        return [None] * len(names)
+    on_disk = _files_below(folder)
+    masks = [on_disk.get(unicodedata.normalize("NFC", f"{name}.png")) for name in names]
+    without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
+    if len(without) == len(names):
+        warnings.append(
+            f"No mask in {folder} belongs to an image; a mask is named like its image with .png added "
+            f"({names[0]}.png)."
+        )
+    elif without:
+        warnings.append(f"{len(without)} images have no mask in {folder} and count whole ({_some(without)}).")
+    return masks
+
+
+def _files_below(folder: Path) -> dict[str, Path]:
+    """Files by their NFC-normalised path below ``folder``, hidden ones left out."""
+    files: dict[str, Path] = {}
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            if not name.startswith("."):
+                path = Path(parent) / name
+                # File systems differ in how they spell an umlaut; models come from other machines.
+                files[unicodedata.normalize("NFC", path.relative_to(folder).as_posix())] = path
+    return files
+
+
+def _check_size(camera: Camera, info: ImageInfo, image: PosedImage, path: Path) -> None:
+    expected_height = camera.height_px * info.width_px / camera.width_px
+    expected_width = camera.width_px * info.height_px / camera.height_px
+    if min(abs(expected_height - info.height_px), abs(expected_width - info.width_px)) <= 1:
+        return
+    turned = (
+        " (its EXIF orientation asks to turn it, which COLMAP does not do)" if info.orientation >= 5 else ""
+    )
+    raise DatasetError(
+        f"{path} is {info.width_px}x{info.height_px} but camera {image.camera_id} of the model is "
+        f"{camera.width_px}x{camera.height_px}{turned}; use the photographs COLMAP was given."
+    )
+
+
+def _warn_of_other_models(folder: Path, warnings: list[str]) -> None:
+    if folder.name != "0":
+        return
+    others = sorted(
+        other.name
+        for other in folder.parent.iterdir()
+        if other != folder and any((other / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))
+    )
+    if others:
+        warnings.append(f"{folder.parent} holds further models ({_some(others)}); only {folder} is used.")
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

@@ -1,0 +1,45 @@
+"""Flat arrays that live in files and are mapped, not read, into memory."""
+
+import mmap
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class MappedArray:
+    """A read-only flat array over a mapped file; its pages can be given back at any time."""
+
+    values: np.ndarray[Any, np.dtype[Any]]
+    _map: mmap.mmap | None = None
+
+    @classmethod
+    def open(cls, path: Path, dtype: Any) -> "MappedArray":
+        """Map the file at ``path`` as a flat array of ``dtype``.
+
+        A file below half of the machine's memory is read ahead; of a larger one only the pages asked for
+        are read, as random access would drag in many neighbours for nothing.
+        """
+        size = path.stat().st_size
+        if size == 0:
+            return cls.empty(dtype)
+        with path.open("rb") as handle:
+            mapped = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        mapped.madvise(mmap.MADV_WILLNEED if size < memory / 2 else mmap.MADV_RANDOM)
+        return cls(np.frombuffer(mapped, dtype=dtype), mapped)
+
+    @classmethod
+    def empty(cls, dtype: Any) -> "MappedArray":
+        """An array without values that stands for a file that is not there."""
+        values = np.zeros(0, dtype=dtype)
+        values.flags.writeable = False  # the same compiled kernels as for mapped files
+        return cls(values)
+
+    def release(self) -> None:
+        """Give the pages back to the system; they are read again when they are next asked for."""
+        if self._map is not None:
+            self._map.madvise(mmap.MADV_DONTNEED)

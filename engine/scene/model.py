@@ -1,0 +1,105 @@
+"""What a photographed scene is made of, as plain records without pixels."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32
+
+from engine.scene.cameras import Camera
+from engine.scene.images import ImageInfo
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One posed photograph at its working size.
+
+    Attributes:
+        name: name in the COLMAP model, relative to ``images/``, with forward slashes.
+        image_path: the photograph on disk.
+        mask_path: ``masks/<name>.png`` where there is one.
+        camera_index: index into the cameras of the scene.
+        rotation_cam_from_world: takes world to camera coordinates (x right, y down, z forward).
+        translation_cam_from_world: ``x_cam = rotation @ x_world + translation``, world units.
+        width_px: width after the resolution cap.
+        height_px: height after the resolution cap.
+    """
+
+    name: str
+    image_path: Path
+    mask_path: Path | None
+    camera_index: int
+    rotation_cam_from_world: Float64[np.ndarray, "3 3"]
+    translation_cam_from_world: Float64[np.ndarray, "3"]
+    width_px: int
+    height_px: int
+
+    @property
+    def origin_world(self) -> Float64[np.ndarray, "3"]:
+        """Centre of projection, in world coordinates."""
+        return -self.rotation_cam_from_world.T @ self.translation_cam_from_world
+
+
+@dataclass(frozen=True, eq=False)
+class SparsePoints:
+    """The sparse point cloud of structure from motion; it may be empty.
+
+    Attributes:
+        xyz_world: positions.
+        rgb_srgb: display colours in [0, 1].
+        track_lengths: number of observations of each point.
+        errors_px: mean reprojection error at the size COLMAP worked with; -1 where it is not known.
+    """
+
+    xyz_world: Float32[np.ndarray, "n 3"]
+    rgb_srgb: Float32[np.ndarray, "n 3"]
+    track_lengths: Int32[np.ndarray, " n"]
+    errors_px: Float32[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.xyz_world)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneModel:
+    """A scene before its pixels are read.
+
+    Attributes:
+        root: folder of the scene.
+        model_folder: folder of the COLMAP model in use.
+        views: posed photographs, sorted by name.
+        image_infos: headers of the photographs, in the order of ``views``.
+        cameras: cameras at the working size, without duplicates.
+        points: sparse point cloud.
+        warnings: one sentence each on what is odd but usable.
+    """
+
+    root: Path
+    model_folder: Path
+    views: tuple[View, ...]
+    image_infos: tuple[ImageInfo, ...]
+    cameras: tuple[Camera, ...]
+    points: SparsePoints
+    warnings: tuple[str, ...]
+
+
+def scene_extent(origins_world: Float64[np.ndarray, "n 3"], points: SparsePoints) -> float:
+    """Radius of the camera positions, the unit of length of learning rates and densification; never 0.
+
+    1.1 times the largest distance of a camera centre to their mean, as in 3D Gaussian Splatting (Kerbl et
+    al. 2023), among the centres that are not strays, i.e. not farther than 5 times the median distance from
+    the median centre. Cameras that all stand in one place take the median distance of the points instead.
+    """
+    middle = np.median(origins_world, axis=0)
+    distances = np.linalg.norm(origins_world - middle, axis=1)
+    typical = float(np.median(distances))
+    kept = origins_world[distances <= 5 * typical] if typical > 0 else origins_world
+    centre = kept.mean(axis=0)
+    radius = 1.1 * float(np.linalg.norm(kept - centre, axis=1).max())
+    if len(points) == 0:
+        return radius if radius > 0 else 1.0
+    to_points = float(np.median(np.linalg.norm(points.xyz_world - centre, axis=1)))
+    # Rounding alone gives cameras in one place a tiny radius, hence the comparison with the points.
+    if radius > 1e-4 * to_points:
+        return radius
+    return to_points if to_points > 0 else 1.0
