@@ -86,6 +86,18 @@ def write_png(
     _write(path, spec, to_8_bits(image))
 
 
+def write_webp(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"], *, quality: int = 90) -> None:
+    """Write display values as a lossy WebP, atomically; ``quality`` runs from 0 to 100.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    height, width, channels = rgb_srgb.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
+    spec.attribute("Compression", f"webp:{quality}")
+    _write(path, spec, to_8_bits(rgb_srgb))
+
+
 def write_exr(path: Path, channels: Mapping[str, Float32[np.ndarray, "h w"]], *, half: bool = False) -> None:
     """Write named channels as one OpenEXR image with ZIP compression, atomically.
 

@@ -1,0 +1,217 @@
+"""Training curves as geometry for inline SVG: scales, ticks and polylines, drawn by the report's template."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+WIDTH, HEIGHT = 420, 240
+LEFT, RIGHT, TOP, BOTTOM = 52, 12, 12, 34
+MAX_POINTS = 300
+"""Of one curve on the page; more would not be seen at its width."""
+
+Row = Mapping[str, object]
+
+
+@dataclass(frozen=True)
+class Tick:
+    """A labelled position along an axis, in SVG units."""
+
+    at: float
+    label: str
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a chart; ``points`` are SVG coordinates and ``style`` a class of the template's."""
+
+    label: str
+    style: str
+    points: tuple[tuple[float, float], ...]
+
+    @property
+    def path(self) -> str:
+        """The points as the ``points`` attribute of an SVG polyline."""
+        return " ".join(f"{x:g},{y:g}" for x, y in self.points)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart ready to be drawn.
+
+    Attributes:
+        title: What is shown.
+        x_key: ``iteration`` or ``seconds``.
+        x_label: Under the horizontal axis.
+        unit: Of the vertical axis, may be empty.
+        x_range: Values at the left and right edge of the plot.
+        y_range: Values at its bottom and top; logarithms to base 10 if ``logarithmic``.
+        logarithmic: Whether the vertical axis is.
+        x_ticks: Along the bottom.
+        y_ticks: Along the left.
+        curves: The lines.
+    """
+
+    title: str
+    x_key: str
+    x_label: str
+    unit: str
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    logarithmic: bool
+    x_ticks: tuple[Tick, ...]
+    y_ticks: tuple[Tick, ...]
+    curves: tuple[Curve, ...]
+
+
+@dataclass(frozen=True)
+class _Source:
+    kind: str
+    key: str
+    label: str
+    style: str
+
+
+_CHARTS = (
+    (
+        "PSNR",
+        "dB",
+        False,
+        (
+            _Source("training_progress", "psnr", "training rays", "quiet"),
+            _Source("held_out_measured", "psnr", "held-out views", "main"),
+        ),
+    ),
+    ("Loss", "", True, (_Source("training_progress", "loss", "loss", "main"),)),
+    ("Gaussians", "", False, (_Source("training_progress", "gaussians", "Gaussians", "main"),)),
+)
+
+
+def training_charts(events: Sequence[Row]) -> list[Chart]:
+    """Charts of PSNR, loss and the number of Gaussians, each over iterations and over seconds.
+
+    Args:
+        events: Rows of ``events.jsonl``. Where a resumed run repeats an iteration, the later row counts.
+
+    Returns:
+        The charts, those over iterations first; without rows to draw, none.
+    """
+    charts = []
+    for x_key, x_label in (("iteration", "iteration"), ("seconds", "training time")):
+        for title, unit, logarithmic, sources in _CHARTS:
+            lines = [(source, _values(events, source, x_key)) for source in sources]
+            lines = [(source, values) for source, values in lines if values]
+            if lines:
+                charts.append(_chart(title, x_key, x_label, unit, logarithmic, lines))
+    return charts
+
+
+def duration(seconds: float) -> str:
+    """A time span for people: ``8.2 s``, ``4 min 10 s``, ``2 h 05 min``."""
+    if seconds < 60:
+        return f"{seconds:.1f} s" if 0 < seconds < 10 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s" if rest else f"{minutes} min"
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes % 60 else f"{minutes // 60} h"
+
+
+def short_number(value: float) -> str:
+    """A number for an axis: ``1500`` as ``1.5 k``, ``2000000`` as ``2 M``."""
+    for size, suffix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if abs(value) >= size:
+            return f"{value / size:.4g}{suffix}"
+    return f"{value:.4g}"
+
+
+def _values(events: Sequence[Row], source: _Source, x_key: str) -> list[tuple[float, float]]:
+    """Finite (x, y) of a source, one per iteration, in order of iteration and thinned."""
+    latest: dict[float, tuple[float, float]] = {}
+    for row in events:
+        if row.get("kind") != source.kind:
+            continue
+        numbers = [row.get("iteration"), row.get(x_key), row.get(source.key)]
+        if all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
+            iteration, x, y = (float(n) for n in numbers)  # type: ignore[arg-type]
+            latest[iteration] = (x, y)
+    ordered = [latest[iteration] for iteration in sorted(latest)]
+    step = max(1, math.ceil(len(ordered) / MAX_POINTS))
+    return ordered[::step] + ([ordered[-1]] if ordered and (len(ordered) - 1) % step else [])
+
+
+def _chart(
+    title: str,
+    x_key: str,
+    x_label: str,
+    unit: str,
+    logarithmic: bool,
+    lines: list[tuple[_Source, list[tuple[float, float]]]],
+) -> Chart:
+    logarithmic = logarithmic and all(y > 0 for _, values in lines for _, y in values)
+    if logarithmic:
+        lines = [(source, [(x, math.log10(y)) for x, y in values]) for source, values in lines]
+    xs = [x for _, values in lines for x, _ in values]
+    ys = [y for _, values in lines for _, y in values]
+    x_low, x_high = _opened(min(0.0, *xs), max(xs))
+    y_low, y_high = _opened(min(ys), max(ys))
+    if title == "Gaussians":
+        y_low = 0.0
+    margin = 0.05 * (y_high - y_low)
+    y_low, y_high = (y_low - margin if y_low else y_low), y_high + margin
+
+    def across(x: float) -> float:
+        return round(LEFT + (x - x_low) / (x_high - x_low) * (WIDTH - LEFT - RIGHT), 2)
+
+    def up(y: float) -> float:
+        return round(HEIGHT - BOTTOM - (y - y_low) / (y_high - y_low) * (HEIGHT - TOP - BOTTOM), 2)
+
+    if x_key == "seconds":
+        x_ticks = [Tick(across(x), duration(x)) for x in _time_steps(x_low, x_high)]
+    else:
+        x_ticks = [Tick(across(x), short_number(x)) for x in _steps(x_low, x_high, 5)]
+    if logarithmic:
+        y_ticks = [Tick(up(y), f"{10**y:.2g}") for y in _log_steps(y_low, y_high)]
+    else:
+        y_ticks = [Tick(up(y), short_number(y)) for y in _steps(y_low, y_high, 5)]
+    curves = tuple(
+        Curve(source.label, source.style, tuple((across(x), up(y)) for x, y in values))
+        for source, values in lines
+    )
+    return Chart(
+        title, x_key, x_label, unit, (x_low, x_high), (y_low, y_high), logarithmic,
+        tuple(x_ticks), tuple(y_ticks), curves,
+    )  # fmt: skip
+
+
+def _opened(low: float, high: float) -> tuple[float, float]:
+    """A range with some width, so that a single value can be drawn."""
+    if high > low:
+        return low, high
+    half = abs(low) * 0.1 or 1.0
+    return low - half, high + half
+
+
+def _steps(low: float, high: float, about: int) -> list[float]:
+    """Round numbers within a range, ``about`` of them."""
+    raw = (high - low) / about
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(power * f for f in (1, 2, 2.5, 5, 10) if power * f >= raw * 0.999)
+    first = math.ceil(low / step - 1e-9)
+    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def _time_steps(low: float, high: float) -> list[float]:
+    """Whole seconds, minutes or hours within a range."""
+    round_spans = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400, 28800, 86400)
+    step = next((span for span in round_spans if (high - low) / span <= 5), None)
+    if step is None or high - low < 3:
+        return _steps(low, high, 4)
+    return [float(k * step) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+def _log_steps(low: float, high: float) -> list[float]:
+    """Logarithms of 1, 2 and 5 times the powers of ten within a range; fewer where it is wide."""
+    factors = (1,) if high - low > 2.5 else (1, 2, 5) if high - low > 0.5 else (1, 1.5, 2, 3, 4, 5, 6, 8)
+    powers = range(math.floor(low), math.ceil(high) + 1)
+    steps = [power + math.log10(factor) for power in powers for factor in factors]
+    inside = [step for step in steps if low <= step <= high]
+    return inside if len(inside) > 1 else [low, high]

@@ -1,0 +1,100 @@
+"""The pictures of the report: which views to keep, the colours of an error map, images as data URIs."""
+
+import base64
+import bisect
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from engine.render.images import resized, write_webp
+
+WORST = 12
+BEST = 4
+MAX_SIDE_PX = 800
+QUALITY = 85
+
+MAGMA = np.array(
+    [
+        [0.001, 0.000, 0.014], [0.039, 0.031, 0.133], [0.112, 0.065, 0.276], [0.210, 0.062, 0.417],
+        [0.315, 0.071, 0.485], [0.413, 0.110, 0.504], [0.511, 0.147, 0.508], [0.611, 0.181, 0.499],
+        [0.713, 0.214, 0.476], [0.814, 0.254, 0.438], [0.901, 0.316, 0.390], [0.959, 0.414, 0.360],
+        [0.986, 0.530, 0.380], [0.996, 0.648, 0.442], [0.997, 0.763, 0.530], [0.993, 0.878, 0.634],
+        [0.987, 0.991, 0.750],
+    ],
+    dtype=np.float32,
+)  # fmt: skip
+"""The colours FLIP maps are shown in, at 17 equal steps of the error from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class ViewImages:
+    """What the report shows of one view: display values, and the FLIP error per pixel."""
+
+    photograph: Float32[np.ndarray, "h w 3"]
+    render: Float32[np.ndarray, "h w 3"]
+    flip_map: Float32[np.ndarray, "h w"]
+
+    def shrunk(self, max_side_px: int = MAX_SIDE_PX) -> "ViewImages":
+        """The same at most ``max_side_px`` wide and high."""
+        return ViewImages(
+            resized(self.photograph, max_side_px),
+            resized(self.render, max_side_px),
+            resized(self.flip_map[..., None], max_side_px)[..., 0],
+        )
+
+
+class WorstAndBest(Mapping[str, ViewImages]):
+    """Keeps the images of the views that the report embeds, shrunk, while views pass by one by one."""
+
+    def __init__(self, worst: int = WORST, best: int = BEST) -> None:
+        """Keep ``worst`` views of the lowest and ``best`` of the highest PSNR."""
+        self._worst, self._best = worst, best
+        self._order: list[tuple[float, str]] = []
+        self._images: dict[str, ViewImages] = {}
+
+    def offer(self, name: str, psnr: float, images: ViewImages) -> None:
+        """Keep the images of ``name`` for as long as it is among the worst or the best."""
+        # An undefined PSNR (no valid pixel) says nothing; it sorts last, as in the report's table.
+        entry = (float("inf") if np.isnan(psnr) else psnr, name)
+        place = bisect.bisect(self._order, entry)
+        full = len(self._order) == self._worst + self._best
+        if full and place == self._worst:
+            return
+        self._order.insert(place, entry)
+        self._images[name] = images.shrunk()
+        if full:
+            _, dropped = self._order.pop(self._worst)
+            del self._images[dropped]
+
+    def __getitem__(self, name: str) -> ViewImages:
+        return self._images[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for _, name in self._order)
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+
+def embedded_names(worst_first: list[str], images: Mapping[str, ViewImages]) -> list[str]:
+    """The views to embed: all that have images, or the 12 worst and 4 best of them when there are more."""
+    known = [name for name in worst_first if name in images]
+    return known if len(known) <= WORST + BEST else [*known[:WORST], *known[-BEST:]]
+
+
+def magma(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 3"]:
+    """Colours of errors in [0, 1], from black over purple and orange to pale yellow."""
+    steps = np.linspace(0, 1, len(MAGMA))
+    return np.stack([np.interp(values, steps, MAGMA[:, k]) for k in range(3)], axis=-1).astype(np.float32)
+
+
+def data_uri(image: Float32[np.ndarray, "h w 3"]) -> str:
+    """The image as a WebP data URI, for a page without other files."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.webp"
+        write_webp(path, image, quality=QUALITY)
+        return "data:image/webp;base64," + base64.b64encode(path.read_bytes()).decode("ascii")

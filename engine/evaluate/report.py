@@ -1,0 +1,253 @@
+"""The report: one self-contained HTML page with figures, curves, and every view beside its photograph.
+
+The page needs no other file and no network; what it shows is escaped by the template, so that names of files
+and settings cannot change it.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+from engine.errors import OutputError
+from engine.evaluate.curves import duration, training_charts
+from engine.evaluate.gallery import BEST, MAGMA, WORST, ViewImages, data_uri, embedded_names, magma
+from engine.files import write_text
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric of the table: its key in ``metrics.json``, heading, decimals, and which end is better."""
+
+    key: str
+    heading: str
+    decimals: int
+    higher_is_better: bool
+
+
+COLUMNS = (
+    Column("psnr", "PSNR", 2, True),
+    Column("psnr_foreground", "PSNR fg", 2, True),
+    Column("ssim", "SSIM", 4, True),
+    Column("ssim_valid", "SSIM valid", 4, True),
+    Column("ms_ssim", "MS-SSIM", 4, True),
+    Column("flip", "FLIP", 4, False),
+)
+
+
+def write_report(
+    path: Path,
+    *,
+    title: str,
+    metrics: Mapping[str, object],
+    events: Sequence[Mapping[str, object]],
+    config: Mapping[str, object],
+    images: Mapping[str, ViewImages],
+) -> None:
+    """Write the report page, atomically.
+
+    Args:
+        path: Where to, ``report.html`` by custom.
+        title: Name of the scene.
+        metrics: Content of ``metrics.json``; only ``mean`` and ``views`` must be there.
+        events: Rows of ``events.jsonl``: curves, warnings and times of the stages are taken from them.
+        config: Settings of the run, nested as in ``config.json``.
+        images: Pictures by view name. Views without any are in the table only; of more than 16, the 12
+            worst and 4 best are embedded, and no others are asked for, so that the mapping may load lazily.
+
+    Raises:
+        OutputError: The page cannot be written.
+    """
+    environment = Environment(
+        loader=PackageLoader("engine.evaluate", package_path=""),
+        autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("report.html").render(
+        _content(title, metrics, events, config, images),
+    )
+    try:
+        write_text(path, page)
+    except OSError as error:
+        raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error
+
+
+def _content(
+    title: str,
+    metrics: Mapping[str, object],
+    events: Sequence[Mapping[str, object]],
+    config: Mapping[str, object],
+    images: Mapping[str, ViewImages],
+) -> dict[str, object]:
+    """The values that the template shows."""
+    mean = _mapping(metrics.get("mean"))
+    views = {name: _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
+    columns = [column for column in COLUMNS if column.key in mean]
+    worst_first = sorted(views, key=lambda name: (_number(views[name].get("psnr"), math.inf), name))
+    embedded = embedded_names(worst_first, images)
+    interval = metrics.get("mean_psnr_ci95")
+    return {
+        "title": title,
+        "tiles": _tiles(mean, interval, metrics),
+        "facts": _facts(metrics, len(views)),
+        "stages": _stages(events),
+        "charts": training_charts(events),
+        "columns": columns,
+        "rows": _rows(worst_first, views, columns, embedded),
+        "figures": [_figure(name, views[name], images[name]) for name in embedded],
+        "left_out": len(views) - len(embedded),
+        "thinned": len(embedded) < len(views) and embedded == [*worst_first[:WORST], *worst_first[-BEST:]],
+        "worst": WORST,
+        "best": BEST,
+        "magma": [f"rgb({r} {g} {b})" for r, g, b in (MAGMA * 255).round().astype(int).tolist()],
+        "settings": _flattened(config),
+        "versions": _flattened(_mapping(metrics.get("versions"))),
+        "definitions": list(_mapping(metrics.get("definitions")).items()),
+        "warnings": list(dict.fromkeys(str(e.get("message")) for e in events if e.get("kind") == "warning")),
+    }
+
+
+def _tiles(
+    mean: Mapping[str, object], interval: object, metrics: Mapping[str, object]
+) -> list[dict[str, str]]:
+    """The main figures at the head of the page."""
+    tiles = []
+    for column in COLUMNS:
+        if column.key in mean and column.key != "ssim_valid":
+            note = {"ssim": "as in 3DGS, zero padding", "flip": "lower is better"}.get(column.key, "")
+            if column.key == "psnr" and isinstance(interval, list | tuple):
+                low, high = (_shown(bound, 2) for bound in interval)
+                note = f"95 % interval {low} – {high}"
+            unit = "dB" if column.key.startswith("psnr") else ""
+            value = _shown(mean[column.key], column.decimals)
+            tiles.append({"label": column.heading, "value": value, "unit": unit, "note": note})
+    gaussians = metrics.get("gaussians")
+    if isinstance(gaussians, int):
+        tiles.append({"label": "Gaussians", "value": _thousands(gaussians), "unit": "", "note": ""})
+    seconds = metrics.get("seconds")
+    if isinstance(seconds, int | float):
+        iterations = metrics.get("iterations")
+        note = f"{_thousands(iterations)} iterations" if isinstance(iterations, int) else ""
+        tiles.append({"label": "Time", "value": duration(float(seconds)), "unit": "", "note": note})
+    return tiles
+
+
+def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
+    """Short statements under the title."""
+    facts = [f"{views} held-out view{'' if views == 1 else 's'}"]
+    resolution = metrics.get("resolution")
+    if isinstance(resolution, Mapping):
+        shown = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in _flattened(resolution))
+        facts.append(f"resolution: {shown}")
+    elif resolution is not None:
+        facts.append(f"resolution {resolution}")
+    if metrics.get("seed") is not None:
+        facts.append(f"seed {metrics['seed']}")
+    return facts
+
+
+def _stages(events: Sequence[Mapping[str, object]]) -> list[dict[str, object]]:
+    """Where the time went: the last finish of each stage, with its share of the whole."""
+    spent = {
+        str(row.get("stage")): _number(row.get("seconds"), 0.0)
+        for row in events
+        if row.get("kind") == "stage_finished"
+    }
+    total = sum(spent.values())
+    if total <= 0:
+        return []
+    return [
+        {"name": name, "time": duration(seconds), "share": round(100 * seconds / total, 2)}
+        for name, seconds in spent.items()
+    ]
+
+
+def _rows(
+    worst_first: list[str],
+    views: Mapping[str, Mapping[str, object]],
+    columns: list[Column],
+    embedded: list[str],
+) -> list[dict[str, object]]:
+    """The table, worst view first."""
+    known = [_number(views[name].get("psnr"), math.nan) for name in worst_first]
+    finite = [value for value in known if math.isfinite(value)]
+    low, high = (min(finite), max(finite)) if finite else (0.0, 0.0)
+    place = {name: index for index, name in enumerate(embedded)}
+    rows: list[dict[str, object]] = []
+    for name, psnr in zip(worst_first, known, strict=True):
+        view = views[name]
+        share = 100.0 if not math.isfinite(psnr) or high == low else 100 * (psnr - low) / (high - low)
+        cells = [
+            {"value": view.get(column.key), "text": _shown(view.get(column.key), column.decimals)}
+            for column in columns
+        ]
+        size = f"{view['width']} × {view['height']}" if "width" in view and "height" in view else "–"
+        pixels = _number(view.get("width"), 0) * _number(view.get("height"), 0)
+        rows.append(
+            {
+                "name": name,
+                "figure": place.get(name),
+                "cells": cells,
+                "size": size,
+                "pixels": pixels,
+                "share": round(share, 1),
+            }
+        )
+    return rows
+
+
+def _figure(name: str, view: Mapping[str, object], images: ViewImages) -> dict[str, object]:
+    """The three pictures of a view, and what is written under them."""
+    small = images.shrunk()
+    height, width = small.flip_map.shape
+    summary = " · ".join(
+        f"{column.heading} {_shown(view[column.key], column.decimals)}"
+        for column in COLUMNS
+        if view.get(column.key) is not None and column.key in ("psnr", "ssim", "flip")
+    )
+    return {
+        "name": name,
+        "summary": summary,
+        "psnr": _shown(view.get("psnr"), 2),
+        "width": width,
+        "height": height,
+        "layers": [
+            ("photograph", data_uri(small.photograph)),
+            ("render", data_uri(small.render)),
+            ("flip", data_uri(magma(small.flip_map))),
+        ],
+    }
+
+
+def _flattened(values: Mapping[str, object], prefix: str = "") -> list[tuple[str, str]]:
+    """Nested settings as dotted names and short texts."""
+    rows: list[tuple[str, str]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            rows += _flattened(value, f"{prefix}{key}.")
+        else:
+            rows.append(
+                (f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value, default=str))
+            )
+    return rows
+
+
+def _mapping(value: object) -> Mapping[str, object]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _number(value: object, otherwise: float) -> float:
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else otherwise
+
+
+def _shown(value: object, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if isinstance(value, int | float) and math.isfinite(value) else "–"
+
+
+def _thousands(value: int) -> str:
+    return f"{value:,}".replace(",", "\u202f")

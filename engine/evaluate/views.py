@@ -1,0 +1,209 @@
+"""Measured views and their summary, as ``metrics.json`` holds them."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+
+from engine.errors import DatasetError
+from engine.evaluate.metrics import (
+    DEFINITIONS,
+    filled_outside,
+    flip,
+    ms_ssim,
+    psnr,
+    rounded_to_8_bits,
+    ssim_both,
+)
+
+FOREGROUND_ALPHA = 0.5
+BOOTSTRAP_DRAWS = 2000
+
+
+class RenderedView(NamedTuple):
+    """A held-out photograph beside its render.
+
+    Attributes:
+        name: The photograph's name.
+        render: Display values.
+        reference: Display values of the photograph at the render's size, over the same background.
+        weight: 1 where the photograph is valid, 0 where a mask rules it out.
+        alpha: Coverage of the photograph's foreground, for photographs that have one.
+    """
+
+    name: str
+    render: Float32[np.ndarray, "h w 3"]
+    reference: Float32[np.ndarray, "h w 3"]
+    weight: Float32[np.ndarray, "h w"]
+    alpha: Float32[np.ndarray, "h w"] | None = None
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """The metrics of one view; see ``metrics.DEFINITIONS``.
+
+    ``psnr`` is infinite for a perfect render and not-a-number when the mask leaves no pixel. Metrics that the
+    view is too small for, or has no foreground for, are ``None``.
+    """
+
+    name: str
+    width: int
+    height: int
+    psnr: float
+    ssim: float
+    ssim_valid: float | None
+    ms_ssim: float | None
+    flip: float
+    psnr_foreground: float | None = None
+
+
+class MeasuredView(NamedTuple):
+    """A view's metrics and its FLIP error map, in [0, 1] per pixel."""
+
+    metrics: ViewMetrics
+    flip_map: Float32[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """All views and their means.
+
+    Attributes:
+        views: In the order in which they came.
+        mean: Mean over the views that have the metric, by key; ``None`` when none has.
+        mean_psnr_ci95: 95 % bootstrap interval of the mean PSNR over the views.
+    """
+
+    views: tuple[ViewMetrics, ...]
+    mean: dict[str, float | None]
+    mean_psnr_ci95: tuple[float, float] | None
+
+    def as_dict(self, run: Mapping[str, object]) -> dict[str, object]:
+        """The content of ``metrics.json``.
+
+        Args:
+            run: What the caller adds about the run: gaussians, iterations, seconds, resolution, seed,
+                versions. Must be JSON-ready.
+
+        Returns:
+            JSON-ready values; infinite and undefined numbers become ``None``.
+        """
+        has_foreground = "psnr_foreground" in self.mean
+        views = {}
+        for view in self.views:
+            row = {key: _finite(value) for key, value in asdict(view).items() if key != "name"}
+            if not has_foreground:
+                del row["psnr_foreground"]
+            views[view.name] = row
+        interval = self.mean_psnr_ci95
+        return {
+            "mean": {key: _finite(value) for key, value in self.mean.items()},
+            "mean_psnr_ci95": None if interval is None else [_finite(bound) for bound in interval],
+            "views": views,
+            "definitions": dict(DEFINITIONS),
+            **run,
+        }
+
+
+def measure_view(view: RenderedView) -> MeasuredView:
+    """All metrics of one view.
+
+    Render and reference are rounded to 8 bits first, as they would be in files. Pixels that the weight rules
+    out do not count in PSNR; in the metrics that look at neighbourhoods they are replaced by the reference's.
+
+    Raises:
+        DatasetError: Render and reference differ in size, or the render has pixels that are no number.
+    """
+    if view.render.shape != view.reference.shape:
+        raise DatasetError(
+            f"The render of {view.name} has {_size(view.render)} pixels but its photograph "
+            f"{_size(view.reference)}; render at the photograph's size."
+        )
+    if not np.isfinite(view.render).all():
+        raise DatasetError(f"The render of {view.name} has pixels that are no number.")
+    reference = rounded_to_8_bits(view.reference)
+    render = rounded_to_8_bits(view.render)
+    filled = filled_outside(render, reference, view.weight)
+    padded, valid = ssim_both(filled, reference)
+    flip_map, mean_flip = flip(filled, reference)
+    height, width = view.weight.shape
+    metrics = ViewMetrics(
+        name=view.name,
+        width=width,
+        height=height,
+        psnr=psnr(render, reference, view.weight),
+        ssim=padded,
+        ssim_valid=None if math.isnan(valid) else valid,
+        ms_ssim=ms_ssim(filled, reference),
+        flip=mean_flip,
+        psnr_foreground=_psnr_foreground(render, reference, view.weight, view.alpha),
+    )
+    return MeasuredView(metrics, flip_map)
+
+
+def measure_views(views: Iterable[RenderedView]) -> Iterator[MeasuredView]:
+    """Measure views one by one, so that only one needs to be in memory."""
+    for view in views:
+        yield measure_view(view)
+
+
+def summarise(views: Iterable[ViewMetrics]) -> Metrics:
+    """Means over views, each metric over those that have it.
+
+    Raises:
+        DatasetError: Two views share a name.
+    """
+    rows = tuple(views)
+    names = [row.name for row in rows]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DatasetError(f"Two measured views are named {twice}; names must differ.")
+    keys = ["psnr", "ssim", "ssim_valid", "ms_ssim", "flip"]
+    if any(row.psnr_foreground is not None for row in rows):
+        keys.append("psnr_foreground")
+    mean = {key: _mean([getattr(row, key) for row in rows]) for key in keys}
+    return Metrics(rows, mean, bootstrap_interval([row.psnr for row in rows]))
+
+
+def bootstrap_interval(
+    values: Sequence[float], *, level: float = 0.95, seed: int = 0
+) -> tuple[float, float] | None:
+    """Percentile bootstrap interval of the mean (Efron 1979); the same values always give the same interval.
+
+    Numbers that are not finite are left out. ``None`` for fewer than two values, which have no spread.
+    """
+    kept = np.array([value for value in values if math.isfinite(value)])
+    if len(kept) < 2:
+        return None
+    draws = np.random.default_rng(seed).integers(0, len(kept), (BOOTSTRAP_DRAWS, len(kept)))
+    means = kept[draws].mean(axis=1)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+def _psnr_foreground(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"],
+    alpha: Float32[np.ndarray, "h w"] | None,
+) -> float | None:
+    if alpha is None:
+        return None
+    value = psnr(render, reference, np.where(alpha > FOREGROUND_ALPHA, weight, np.float32(0)))
+    return None if math.isnan(value) else value
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None and not math.isnan(value)]
+    return sum(known) / len(known) if known else None
+
+
+def _finite(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _size(image: np.ndarray) -> str:
+    return f"{image.shape[1]} x {image.shape[0]}"

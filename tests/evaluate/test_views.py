@@ -1,0 +1,132 @@
+import json
+
+import numpy as np
+import pytest
+
+from engine.errors import DatasetError
+from engine.evaluate import metrics
+from engine.evaluate.views import RenderedView, bootstrap_interval, measure_view, measure_views, summarise
+
+
+def view(name="a.jpg", error=0.1, size=(30, 40), seed=0, **changes):
+    rng = np.random.default_rng(seed)
+    reference = (rng.integers(60, 190, (*size, 3)) / np.float32(255)).astype(np.float32)
+    render = reference + np.float32(error)
+    weight = np.ones(size, np.float32)
+    return RenderedView(name, render, reference, weight)._replace(**changes)
+
+
+def test_metrics_are_those_of_the_images_rounded_to_8_bits():
+    one = view(error=0.1003)
+    row, flip_map = measure_view(one)
+    render, reference = (metrics.rounded_to_8_bits(image) for image in (one.render, one.reference))
+    assert row.psnr == metrics.psnr(render, reference)
+    assert row.ssim == metrics.ssim(render, reference)
+    assert row.ssim_valid == metrics.ssim_valid(render, reference)
+    assert row.ms_ssim is None
+    assert row.flip == pytest.approx(flip_map.mean())
+    assert (row.width, row.height) == (40, 30)
+    assert row.psnr_foreground is None
+
+
+def test_an_error_smaller_than_half_a_step_is_no_error():
+    assert measure_view(view(error=0.3 / 255)).metrics.psnr == np.inf
+
+
+def test_pixels_under_the_mask_do_not_matter():
+    weight = np.ones((30, 40), np.float32)
+    weight[:, :15] = 0
+    clean = view(weight=weight)
+    spoiled = clean.render.copy()
+    spoiled[:, :15] = 0.9
+    assert measure_view(clean._replace(render=spoiled)).metrics == measure_view(clean).metrics
+
+
+def test_foreground_psnr_is_over_covered_valid_pixels():
+    one = view(error=0.0)
+    render = one.render.copy()
+    render[:10] += 51 / 255
+    alpha = np.zeros((30, 40), np.float32)
+    alpha[:20] = 1
+    weight = one.weight.copy()
+    row = measure_view(one._replace(render=render, alpha=alpha, weight=weight)).metrics
+    assert row.psnr_foreground == pytest.approx(-10 * np.log10(0.04 / 2), abs=1e-4)
+    weight[:10] = 0
+    assert (
+        measure_view(one._replace(render=render, alpha=alpha, weight=weight)).metrics.psnr_foreground
+        == np.inf
+    )
+    row = measure_view(one._replace(alpha=np.zeros((30, 40), np.float32))).metrics
+    assert row.psnr_foreground is None
+
+
+def test_the_summary_is_the_mean_of_views():
+    rows = [
+        m.metrics
+        for m in measure_views(view(f"{k}.jpg", error, seed=k) for k, error in enumerate((0.1, 0.05)))
+    ]
+    summary = summarise(rows)
+    for key in ("psnr", "ssim", "ssim_valid", "flip"):
+        assert summary.mean[key] == pytest.approx(np.mean([getattr(row, key) for row in rows]))
+    assert summary.mean["ms_ssim"] is None
+    assert "psnr_foreground" not in summary.mean
+
+
+def test_the_json_has_its_documented_layout():
+    alpha = np.ones((30, 40), np.float32)
+    rows = [
+        measure_view(view("a.jpg", 0.1, alpha=alpha)).metrics,
+        measure_view(view("sub/b.jpg", 0.0, size=(170, 180))).metrics,
+    ]
+    run = {
+        "gaussians": 7,
+        "iterations": 9,
+        "seconds": 1.5,
+        "resolution": {"scale": 2},
+        "seed": 0,
+        "versions": {},
+    }
+    content = summarise(rows).as_dict(run)
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    keys = {"psnr", "ssim", "ssim_valid", "ms_ssim", "flip", "psnr_foreground"}
+    assert set(content) == {"mean", "mean_psnr_ci95", "views", "definitions", *run}
+    assert set(content["mean"]) == keys
+    assert list(content["views"]) == ["a.jpg", "sub/b.jpg"]
+    assert set(content["views"]["a.jpg"]) == keys | {"width", "height"}
+    assert keys <= set(content["definitions"])
+    assert content["views"]["sub/b.jpg"]["psnr"] is None
+    assert content["mean"]["ms_ssim"] == pytest.approx(1.0)
+
+
+def test_a_view_without_valid_pixels_does_not_spoil_the_mean():
+    empty = view("b.jpg", weight=np.zeros((30, 40), np.float32))
+    rows = [measure_view(one).metrics for one in (view(), empty)]
+    assert summarise(rows).mean["psnr"] == rows[0].psnr
+
+
+def test_the_interval_holds_the_mean_narrows_with_views_and_repeats():
+    rng = np.random.default_rng(0)
+    few, many = rng.normal(25, 2, 10).tolist(), rng.normal(25, 2, 200).tolist()
+    low, high = bootstrap_interval(few)
+    assert low < np.mean(few) < high
+    assert bootstrap_interval(few) == (low, high)
+    # The interval of a mean of many values is that of the normal distribution.
+    low, high = bootstrap_interval(many)
+    assert high - low == pytest.approx(2 * 1.96 * np.std(many) / np.sqrt(200), rel=0.1)
+    assert bootstrap_interval([25.0]) is None
+
+
+def test_sizes_that_differ_are_refused_by_name():
+    with pytest.raises(DatasetError, match=r"a\.jpg has 40 x 20 .* 40 x 30"):
+        measure_view(view(render=np.zeros((20, 40, 3), np.float32)))
+
+
+def test_a_render_that_is_no_number_is_refused():
+    with pytest.raises(DatasetError, match="no number"):
+        measure_view(view(error=np.nan))
+
+
+def test_two_views_of_one_name_are_refused():
+    row = measure_view(view()).metrics
+    with pytest.raises(DatasetError, match=r"a\.jpg"):
+        summarise([row, row])
