@@ -151,8 +151,8 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     total = 12 + 8 + room + 8 + layout.length
     if total > MAX_BYTES:
         raise SceneFileError(
-            f"{path}: not written; {len(soup)} octagons need {total / 2**30:.1f} GiB, and a GLB holds at most "
-            "4. Leave faint Gaussians out with min_opacity, or export a mesh PLY."
+            f"{path}: not written; {len(soup)} octagons need {total / 2**30:.1f} GiB, and a GLB holds "
+            "at most 4. Leave faint Gaussians out with min_opacity, or export a mesh PLY."
         )
     try:
         with replacing(path) as temporary, temporary.open("wb") as handle:
