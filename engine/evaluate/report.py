@@ -187,7 +187,7 @@ def _rows(
             for column in columns
         ]
         size = f"{view['width']} × {view['height']}" if "width" in view and "height" in view else "–"
-        pixels = _number(view.get("width"), 0) * _number(view.get("height"), 0)
+        pixels = _number(view.get("width"), 0.0) * _number(view.get("height"), 0.0)
         rows.append(
             {
                 "name": name,
