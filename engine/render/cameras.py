@@ -1,0 +1,99 @@
+"""Pinhole cameras for new views, and the rays through their pixels."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+
+@dataclass(frozen=True)
+class RenderCamera:
+    """A pinhole camera: looks along +z, x right, y down; pixel centres at +0.5.
+
+    Attributes:
+        width_px: Image width.
+        height_px: Image height.
+        fx_px: Focal length across.
+        fy_px: Focal length down.
+        cx_px: Principal point from the left edge.
+        cy_px: Principal point from the top edge.
+        rotation_cam_from_world: Takes world directions to camera directions.
+        translation_cam_from_world: The world origin in the camera frame.
+    """
+
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    rotation_cam_from_world: Float64[np.ndarray, "3 3"]
+    translation_cam_from_world: Float64[np.ndarray, "3"]
+
+    @classmethod
+    def from_pose(
+        cls,
+        world_from_cam: Float64[np.ndarray, "4 4"],
+        width_px: int,
+        height_px: int,
+        *,
+        fy_px: float,
+        fx_px: float | None = None,
+        cx_px: float | None = None,
+        cy_px: float | None = None,
+    ) -> "RenderCamera":
+        """A camera at a pose (camera-to-world matrix); square pixels and a centred axis unless given."""
+        rotation = world_from_cam[:3, :3].T
+        return cls(
+            width_px=width_px,
+            height_px=height_px,
+            fx_px=fy_px if fx_px is None else fx_px,
+            fy_px=fy_px,
+            cx_px=width_px / 2 if cx_px is None else cx_px,
+            cy_px=height_px / 2 if cy_px is None else cy_px,
+            rotation_cam_from_world=np.ascontiguousarray(rotation),
+            translation_cam_from_world=-rotation @ world_from_cam[:3, 3],
+        )
+
+    @property
+    def centre_world(self) -> Float64[np.ndarray, "3"]:
+        """Where the camera stands."""
+        return np.asarray(-self.rotation_cam_from_world.T @ self.translation_cam_from_world)
+
+    @property
+    def world_from_cam(self) -> Float64[np.ndarray, "4 4"]:
+        """The camera-to-world matrix."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation_cam_from_world.T
+        pose[:3, 3] = self.centre_world
+        return pose
+
+    def rays(self) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]:
+        """The common origin of all rays and the unit world direction through each pixel's centre."""
+        x = (np.arange(self.width_px) + 0.5 - self.cx_px) / self.fx_px
+        y = (np.arange(self.height_px) + 0.5 - self.cy_px) / self.fy_px
+        directions_cam = np.empty((self.height_px, self.width_px, 3))
+        directions_cam[..., 0] = x
+        directions_cam[..., 1] = y[:, None]
+        directions_cam[..., 2] = 1.0
+        directions_cam /= np.linalg.norm(directions_cam, axis=-1, keepdims=True)
+        directions_world = directions_cam @ self.rotation_cam_from_world
+        return self.centre_world.astype(np.float32), directions_world.astype(np.float32)
+
+    def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
+        """Pixel coordinates of points; not-a-number for those not in front of the camera."""
+        points_cam = points_world @ self.rotation_cam_from_world.T + self.translation_cam_from_world
+        depth = np.where(points_cam[:, 2] > 0, points_cam[:, 2], np.nan)
+        across = self.fx_px * points_cam[:, 0] / depth + self.cx_px
+        return np.stack([across, self.fy_px * points_cam[:, 1] / depth + self.cy_px], axis=-1)
+
+
+def focal_from_fov(fov_degrees: float, side_px: int) -> float:
+    """The focal length in pixels at which ``side_px`` pixels span the angle ``fov_degrees``."""
+    return side_px / (2 * math.tan(math.radians(fov_degrees) / 2))
+
+
+def fov_from_focal(focal_px: float, side_px: int) -> float:
+    """The angle in degrees that ``side_px`` pixels span at a focal length."""
+    return math.degrees(2 * math.atan(side_px / (2 * focal_px)))

@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from engine.render.cameras import RenderCamera, focal_from_fov, fov_from_focal
+
+
+def camera(**changes):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [20, -50, 130], degrees=True).as_matrix()
+    pose[:3, 3] = [1, -2, 3]
+    return RenderCamera.from_pose(pose, 8, 6, **({"fy_px": 9.0} | changes))
+
+
+def test_a_ray_projects_back_to_the_centre_of_its_pixel():
+    one = camera(fx_px=7.0, cx_px=3.2, cy_px=2.9)
+    origin, directions = one.rays()
+    assert directions.shape == (6, 8, 3)
+    assert np.linalg.norm(directions, axis=-1) == pytest.approx(1, abs=1e-6)
+    points = origin + directions.reshape(-1, 3) * 4.5
+    y, x = np.mgrid[0:6, 0:8] + 0.5
+    assert np.allclose(one.project(points), np.stack([x.ravel(), y.ravel()], axis=-1), atol=1e-4)
+
+
+def test_an_unturned_camera_looks_along_z_with_y_down():
+    one = RenderCamera.from_pose(np.eye(4), 2, 2, fy_px=1.0)
+    _, directions = one.rays()
+    assert np.allclose(directions[0, 1] * np.sqrt(1.5), [0.5, -0.5, 1])
+    assert np.allclose(one.project(np.array([[0.0, 0, 1]])), [[1, 1]])
+    assert np.isnan(one.project(np.array([[0.0, 0, -1]]))).all()
+
+
+def test_the_pose_is_given_back():
+    one = camera()
+    again = RenderCamera.from_pose(one.world_from_cam, 8, 6, fy_px=9.0)
+    assert np.allclose(one.centre_world, [1, -2, 3])
+    assert np.allclose(again.rotation_cam_from_world, one.rotation_cam_from_world)
+    assert np.allclose(again.translation_cam_from_world, one.translation_cam_from_world)
+    assert (one.fx_px, one.cx_px, one.cy_px) == (9.0, 4.0, 3.0)
+
+
+def test_a_field_of_view_spans_the_image():
+    assert focal_from_fov(90.0, 200) == pytest.approx(100)
+    assert fov_from_focal(focal_from_fov(37.0, 480), 480) == pytest.approx(37)

@@ -1,0 +1,82 @@
+import json
+
+import numpy as np
+import pytest
+
+from engine.errors import ConfigError
+from engine.render.cameras import RenderCamera
+from engine.render.path_file import CameraPath, path_from_poses, read_camera_path, write_camera_path
+from engine.render.paths import turntable
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "path.json"
+
+
+def content(**frame):
+    pose = np.eye(4)
+    pose[0, 3] = 2.0
+    first = {"camera_to_world": pose.tolist(), "fov_y_degrees": 90}
+    return {"width": 40, "height": 30, "frames": [first, first | frame]}
+
+
+def test_a_written_path_reads_back_the_same(path):
+    poses = turntable(np.zeros(3), np.array([0.0, -1, 0]), 2.0, 0.5, 5)
+    like = RenderCamera.from_pose(np.eye(4), 64, 48, fy_px=50.0, fx_px=51.0, cx_px=30.0, cy_px=25.0)
+    written = path_from_poses(list(poses), like, 24.0)
+    write_camera_path(path, written)
+    again = read_camera_path(path)
+    assert again.fps == 24
+    for one, other in zip(again.cameras, written.cameras, strict=True):
+        assert np.allclose(one.world_from_cam, other.world_from_cam)
+        assert (one.width_px, one.height_px, one.fx_px, one.fy_px) == (64, 48, 51.0, 50.0)
+        assert (one.cx_px, one.cy_px) == (30.0, 25.0)
+
+
+def test_a_field_of_view_and_focal_lengths_both_do(path):
+    path.write_text(json.dumps(content(fov_y_degrees=None, fx=11, fy=12)))
+    first, second = read_camera_path(path).cameras
+    assert (first.fx_px, first.fy_px, first.cx_px, first.cy_px) == pytest.approx((15, 15, 20, 15))
+    assert (second.fx_px, second.fy_px) == (11, 12)
+    assert np.allclose(first.centre_world, [2, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fov_y_degrees": 200}, r"frames\[1\]\.fov_y_degrees"),
+        ({"fov_y_degrees": None}, r"frames\[1\]: needs either fov_y_degrees or both"),
+        ({"fx": 10, "fy": 10}, r"frames\[1\]: needs either"),
+        ({"fov_y_degrees": None, "fy": 10}, r"frames\[1\]: needs either"),
+        ({"fov": 3}, r"frames\[1\]\.fov"),
+        ({"camera_to_world": [[1, 0, 0, 0]] * 3}, r"frames\[1\]\.camera_to_world"),
+        ({"camera_to_world": (2 * np.eye(4)).tolist()}, r"frames\[1\]: camera_to_world must be a rotation"),
+        ({"camera_to_world": np.diag([1, 1, -1, 1]).tolist()}, r"mirroring"),
+        (
+            {"camera_to_world": [[1, 0, 0, "x"], *np.eye(4).tolist()[1:]]},
+            r"frames\[1\]\.camera_to_world\[0\]\[3\]",
+        ),
+    ],
+)
+def test_a_fault_is_named_by_file_and_field(path, change, message):
+    path.write_text(json.dumps(content(**change)))
+    with pytest.raises(ConfigError, match=rf"path\.json.*{message}"):
+        read_camera_path(path)
+
+
+def test_a_file_that_is_missing_or_no_json_is_refused(path):
+    with pytest.raises(ConfigError, match=r"path\.json"):
+        read_camera_path(path)
+    path.write_text("{")
+    with pytest.raises(ConfigError, match=r"path\.json"):
+        read_camera_path(path)
+    path.write_text(json.dumps({"width": 4, "height": 3, "frames": []}))
+    with pytest.raises(ConfigError, match="frames"):
+        read_camera_path(path)
+
+
+def test_cameras_of_two_sizes_make_no_path(path):
+    cameras = tuple(RenderCamera.from_pose(np.eye(4), width, 5, fy_px=5.0) for width in (5, 6))
+    with pytest.raises(ConfigError, match="one image size"):
+        write_camera_path(path, CameraPath(30.0, cameras))
