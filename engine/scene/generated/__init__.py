@@ -23,9 +23,9 @@ from pathlib import Path
 
 from engine.errors import DatasetError, OutputError
 from engine.files import write_json
-from engine.scene.generated.config import CameraModel, GeneratedSceneConfig
+from engine.scene.generated.config import CAMERA_MODELS, GeneratedSceneConfig
 
-__all__ = ["CameraModel", "GeneratedSceneConfig", "write_generated_scene"]
+__all__ = ["CAMERA_MODELS", "GeneratedSceneConfig", "write_generated_scene"]
 
 # Raised whenever the same settings give other files than before.
 _VERSION = 1

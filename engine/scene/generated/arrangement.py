@@ -101,7 +101,7 @@ def _walls() -> Mesh:
     for k in range(8):
         turn = _turn_z(45.0 * k)
         corner = turn @ [ROOM_APOTHEM, half, FLOOR_Z]
-        side = patch(corner, turn @ [0, -2 * half, 0], [0, 0, WALL_HEIGHT], columns=36, rows=50)
+        side = patch(corner, turn @ [0.0, -2 * half, 0.0], [0.0, 0.0, WALL_HEIGHT], columns=36, rows=50)
         # u is centred on the side and ten metres apart between sides, so that the material can tell them.
         side.uv[:, 0] += 10 * k - half
         sides.append(side)
@@ -129,34 +129,38 @@ def _vase() -> Mesh:
 
 def _things() -> tuple[Thing, ...]:
     stand = np.eye(3)
-    floor = patch([-3.95, -3.95, FLOOR_Z], [7.9, 0, 0], [0, 7.9, 0], columns=180, rows=180)
+    floor = patch([-3.95, -3.95, FLOOR_Z], [7.9, 0.0, 0.0], [0.0, 7.9, 0.0], columns=180, rows=180)
     return (
         Thing("floor", floor, materials.floor_tiles, is_object=False),
         Thing("walls", _walls(), materials.room_walls, is_object=False),
         Thing("table", _table_top(), materials.table_wood),
-        Thing("pedestal", placed(_pedestal(), stand, 0, 0, FLOOR_Z), materials.pedestal_wood),
-        Thing("vase", placed(_vase(), _turn_z(20), -0.48, 0.36, 0), materials.vase_glaze, gloss=0.12),
+        Thing("pedestal", placed(_pedestal(), stand, 0.0, 0.0, FLOOR_Z), materials.pedestal_wood),
+        Thing("vase", placed(_vase(), _turn_z(20.0), -0.48, 0.36, 0.0), materials.vase_glaze, gloss=0.12),
         Thing(
             "knot",
-            placed(torus_knot(0.078, 0.052, 420, 40), _turn_z(35) @ _turn_x(78), 0.42, 0.36, 0),
+            placed(torus_knot(0.078, 0.052, 420, 40), _turn_z(35.0) @ _turn_x(78.0), 0.42, 0.36, 0.0),
             materials.knot_glaze,
             gloss=0.3,
         ),
         Thing(
             "tower",
-            placed(twisted_tower(0.125, 0.66, np.radians(70), 0.62, 24), _turn_z(10), 0.02, -0.06, 0),
+            placed(twisted_tower(0.125, 0.66, np.radians(70), 0.62, 24), _turn_z(10.0), 0.02, -0.06, 0.0),
             materials.tower_bricks,
         ),
         Thing(
             "boulder",
-            placed(boulder(0.21, 0.28, 160, 110), _turn_z(0), 0.5, -0.36, 0),
+            placed(boulder(0.21, 0.28, 160, 110), _turn_z(0.0), 0.5, -0.36, 0.0),
             materials.boulder_stone,
         ),
         Thing(
-            "cube", placed(rounded_cube(0.15, 7, 128, 96), _turn_z(28), -0.34, -0.46, 0), materials.cube_paint
+            "cube",
+            placed(rounded_cube(0.15, 7.0, 128, 96), _turn_z(28.0), -0.34, -0.46, 0.0),
+            materials.cube_paint,
         ),
         Thing(
-            "book", placed(box((0.32, 0.44, 0.07), 16), _turn_z(-62), -0.02, 0.62, 0), materials.book_cloth
+            "book",
+            placed(box((0.32, 0.44, 0.07), 16), _turn_z(-62.0), -0.02, 0.62, 0.0),
+            materials.book_cloth,
         ),
     )
 

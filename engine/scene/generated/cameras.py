@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, Float32
 
-from engine.scene.generated.config import CameraModel, GeneratedSceneConfig
+from engine.scene.generated.config import GeneratedSceneConfig
 
 # (share of the views, distance from the table's axis, height above the table), metres.
 _RINGS = ((0.4, 2.45, 0.5), (0.35, 2.25, 1.05), (0.25, 1.75, 1.75))
@@ -33,7 +33,7 @@ def lens(config: GeneratedSceneConfig) -> pycolmap.Camera:
     width, height = config.width_px, config.height_px
     focal = 0.5 * width / np.tan(_HALF_FIELD_OF_VIEW)
     cx, cy = 0.5 * width + 0.011 * width, 0.5 * height - 0.008 * width
-    params: dict[CameraModel, list[float]] = {
+    params: dict[str, list[float]] = {
         "SIMPLE_PINHOLE": [focal, cx, cy],
         "PINHOLE": [focal, focal, cx, cy],
         "SIMPLE_RADIAL": [focal, cx, cy, -0.11],

@@ -1,16 +1,15 @@
 """What a generated scene is made with; imports nothing heavy, so that a front end can use it."""
 
 from dataclasses import asdict, dataclass
-from typing import Literal, get_args
 
 from engine.errors import ConfigError
 
-CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
 
 
 @dataclass(frozen=True)
 class GeneratedSceneConfig:
-    """Settings of a generated scene; equal settings give equal files, byte for byte.
+    """Settings of a generated scene; on one machine equal settings give equal files, byte for byte.
 
     Attributes:
         views: Number of photographs, on three rings around the table.
@@ -19,7 +18,8 @@ class GeneratedSceneConfig:
         samples_per_side: A pixel is the mean of this number squared of display colours, on a regular grid.
         points: Number of points in the COLMAP model.
         seed: Seeds the jitter of the cameras and the choice of the points; the objects stay the same.
-        camera_model: COLMAP's name of the lens; the photographs are distorted accordingly.
+        camera_model: COLMAP's name of the lens, one of ``CAMERA_MODELS``; it distorts the
+            photographs accordingly.
         transparent: Write RGBA photographs (straight alpha) that show the table and its objects only, with
             their coverage of each pixel as alpha.
         with_masks: Also write the object masks where a reconstruction looks for them: ``masks/``.
@@ -34,7 +34,7 @@ class GeneratedSceneConfig:
     samples_per_side: int = 3
     points: int = 4000
     seed: int = 0
-    camera_model: CameraModel = "PINHOLE"
+    camera_model: str = "PINHOLE"
     transparent: bool = False
     with_masks: bool = False
 
@@ -53,8 +53,8 @@ class GeneratedSceneConfig:
                 raise ConfigError(
                     f"Generated scene: {name} is {value}, but must lie between {low} and {high}."
                 )
-        if self.camera_model not in get_args(CameraModel):
-            names = ", ".join(get_args(CameraModel))
+        if self.camera_model not in CAMERA_MODELS:
+            names = ", ".join(CAMERA_MODELS)
             raise ConfigError(
                 f"Generated scene: camera_model is {self.camera_model!r}, but must be one of {names}."
             )

@@ -18,6 +18,8 @@ def _write_image(path: Path, pixels: np.ndarray, kind: str, channels: tuple[str,
         spec.attribute("oiio:UnassociatedAlpha", 1)
     if path.suffix == ".exr":
         spec.attribute("compression", "zip")
+        # Otherwise the file holds the time of writing, and equal settings give different bytes.
+        spec.attribute("DateTime", "1970:01:01 00:00:00")
     output = oiio.ImageOutput.create(str(path))
     if output is None or not output.open(str(path), spec):
         raise OutputError(
@@ -44,8 +46,8 @@ def write_depth(path: Path, depth_cam: Float32[np.ndarray, "height width"]) -> N
 
 
 def write_normals(path: Path, normals: Float32[np.ndarray, "height width 3"]) -> None:
-    """Write normals as OpenEXR, channels R, G, B for x, y, z."""
-    _write_image(path, normals, "float", ("R", "G", "B"))
+    """Write normals as OpenEXR, channels N.x, N.y, N.z."""
+    _write_image(path, normals, "float", ("N.x", "N.y", "N.z"))
 
 
 def write_mesh(path: Path, vertices: Float32[np.ndarray, "n 3"], faces: Int32[np.ndarray, "m 3"]) -> None:

@@ -34,9 +34,9 @@ Material = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def _grain(xyz: Points, light: str, dark: str, seed: int) -> Colours:
     """Wood whose fibres run along x."""
-    wander = noise(scaled(xyz, (1.2, 5, 5)), octaves=2, seed=seed)
+    wander = noise(scaled(xyz, (1.2, 5.0, 5.0)), octaves=2, seed=seed)
     rings = 0.5 + 0.5 * np.sin(70 * xyz[:, 1] + 22 * xyz[:, 2] + 9 * wander)
-    fibre = noise(scaled(xyz, (5, 130, 130)), octaves=2, seed=seed + 1)
+    fibre = noise(scaled(xyz, (5.0, 130.0, 130.0)), octaves=2, seed=seed + 1)
     return mix(linear(light), linear(dark), np.clip(0.18 + 0.5 * rings * rings + 0.38 * fibre, 0, 1))
 
 
@@ -74,7 +74,7 @@ def _picture(index: int, u: np.ndarray, v: np.ndarray) -> Colours:
     flat = np.stack([u, v, np.full_like(u, index)], axis=1).astype(np.float32)
     if index == 0:  # hills at dusk, one behind another
         colours = mix(linear("f6c177"), linear("3e5c9a"), step(0.35, 1.0, v))
-        colours = mix(colours, linear("fff1c9"), within(np.hypot(u - 0.7, v - 0.62), 0, 0.1))
+        colours = mix(colours, linear("fff1c9"), within(np.hypot(u - 0.7, v - 0.62), 0.0, 0.1))
         for k, shade in enumerate(("7d5a8c", "4b4a78", "2c3657", "18233a")):
             line = np.stack([3 * u + 9 * k, np.full_like(u, k), np.zeros_like(u)], axis=1).astype(np.float32)
             ridge = np.float32(0.52 - 0.13 * k) + 0.13 * noise(line, octaves=4, seed=40)
@@ -109,7 +109,7 @@ def room_walls(xyz: Points, uv: Coordinates) -> Colours:
     """Panelled below, papered above, a painting on each side, letters along a frieze; u has 10 m a side."""
     side = np.floor(uv[:, 0] / 10 + 0.5).astype(np.int32)
     u, v = uv[:, 0] - 10 * side.astype(np.float32), uv[:, 1]
-    stripe = within(np.mod(u / 0.24, 1), 0, 0.5)
+    stripe = within(np.mod(u / 0.24, 1), 0.0, 0.5)
     colours = mix(linear("9fb8ad"), linear("c7d3bf"), stripe)
     motif = octagons(u / 0.24 - 0.25, v / 0.24, 0.2) - octagons(u / 0.24 - 0.25, v / 0.24, 0.1)
     colours = mix(colours, linear("e0a458"), motif)
@@ -131,7 +131,7 @@ def room_walls(xyz: Points, uv: Coordinates) -> Colours:
         here = np.flatnonzero(canvas & (side == index))
         if len(here):
             across, up = (u[here] / half_width + 1) / 2, ((v[here] - middle) / half_height + 1) / 2
-            weave = noise(scaled(xyz[here], (60, 60, 60)), octaves=1, seed=34)
+            weave = noise(scaled(xyz[here], (60.0, 60.0, 60.0)), octaves=1, seed=34)
             colours[here] = _picture(index, across, up) * grey(1 + 0.1 * weave)
     return colours
 
@@ -170,7 +170,7 @@ def knot_glaze(xyz: Points, uv: Coordinates) -> Colours:
     colours = mix(colours, linear("1d6a96"), (band == 2).astype(np.float32))
     fleck = step(0.5, 0.6, noise(xyz * np.float32(90), octaves=2, seed=62))
     colours = mix(colours, linear("fbf3e4"), 0.75 * fleck)
-    return mix(colours, linear("161616"), within(np.mod(phase, 1), 0, 0.07))
+    return mix(colours, linear("161616"), within(np.mod(phase, 1), 0.0, 0.07))
 
 
 def tower_bricks(xyz: Points, uv: Coordinates) -> Colours:
@@ -182,7 +182,7 @@ def tower_bricks(xyz: Points, uv: Coordinates) -> Colours:
     colours = mix(linear("b9573b"), linear("d9a07a"), tone)
     colours = mix(colours, linear("6f7f86"), (tone > 0.86).astype(np.float32))
     colours = colours * grey(0.95 + 0.35 * noise(xyz * np.float32(45), octaves=3, seed=64))
-    mortar = np.maximum(within(np.mod(course, 1), 0, 0.13), within(np.mod(along, 1), 0, 0.06))
+    mortar = np.maximum(within(np.mod(course, 1), 0.0, 0.13), within(np.mod(along, 1), 0.0, 0.06))
     colours = mix(colours, linear("cfc6b4"), mortar)
     sign = within(v, 0.30, 0.40)
     across = np.mod(u + 5, 10) - 5
@@ -228,7 +228,7 @@ def book_cloth(xyz: Points, uv: Coordinates) -> Colours:
     x, y, z = xyz[:, 0], xyz[:, 1], xyz[:, 2]
     weave = checker(x / 0.004, y / 0.004) * 0.12 + 0.9
     colours = np.broadcast_to(linear("7b2d26"), xyz.shape) * grey(weave)
-    label = within(np.abs(x), 0, 0.135) * within(np.abs(y), 0, 0.185)
+    label = within(np.abs(x), 0.0, 0.135) * within(np.abs(y), 0.0, 0.185)
     colours = mix(colours, linear("efe3c8"), label)
     title = (
         text((x + 0.12) / 0.03, (y - 0.165) / 0.06, ["OCTAGONS"])

@@ -11,6 +11,8 @@ from jaxtyping import Float, Float32, Int32
 
 from engine.scene.generated.textures import noise
 
+Vector = Sequence[float] | Float[np.ndarray, "3"]
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -88,9 +90,7 @@ def placed(mesh: Mesh, rotation: Float[np.ndarray, "3 3"], x: float, y: float, b
     return replace(mesh, vertices=turned.astype(np.float32), normals=normals.astype(np.float32))
 
 
-def patch(
-    corner: Sequence[float], along: Sequence[float], up: Sequence[float], columns: int, rows: int
-) -> Mesh:
+def patch(corner: Vector, along: Vector, up: Vector, columns: int, rows: int) -> Mesh:
     """A flat parallelogram that faces ``along`` x ``up``; uv are metres from ``corner``."""
     s, t = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     points = (
@@ -107,12 +107,12 @@ def box(size: Sequence[float], cells: int) -> Mesh:
     x, y, z = (0.5 * size[0], 0.5 * size[1], float(size[2]))
     return joined(
         [
-            patch([-x, -y, 0], [2 * x, 0, 0], [0, 0, z], cells, cells),
-            patch([x, -y, 0], [0, 2 * y, 0], [0, 0, z], cells, cells),
-            patch([x, y, 0], [-2 * x, 0, 0], [0, 0, z], cells, cells),
-            patch([-x, y, 0], [0, -2 * y, 0], [0, 0, z], cells, cells),
-            patch([-x, -y, z], [2 * x, 0, 0], [0, 2 * y, 0], cells, cells),
-            patch([-x, y, 0], [2 * x, 0, 0], [0, -2 * y, 0], cells, cells),
+            patch([-x, -y, 0.0], [2 * x, 0.0, 0.0], [0.0, 0.0, z], cells, cells),
+            patch([x, -y, 0.0], [0.0, 2 * y, 0.0], [0.0, 0.0, z], cells, cells),
+            patch([x, y, 0.0], [-2 * x, 0.0, 0.0], [0.0, 0.0, z], cells, cells),
+            patch([-x, y, 0.0], [0.0, -2 * y, 0.0], [0.0, 0.0, z], cells, cells),
+            patch([-x, -y, z], [2 * x, 0.0, 0.0], [0.0, 2 * y, 0.0], cells, cells),
+            patch([-x, y, 0.0], [2 * x, 0.0, 0.0], [0.0, -2 * y, 0.0], cells, cells),
         ]
     )
 

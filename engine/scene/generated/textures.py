@@ -45,8 +45,8 @@ def linear(colour: str) -> Float32[np.ndarray, "3"]:
 
 
 def mix(
-    first: Float32[np.ndarray, "*#n 3"],
-    second: Float32[np.ndarray, "*#n 3"],
+    first: Float32[np.ndarray, "... 3"],
+    second: Float32[np.ndarray, "... 3"],
     amount: Float32[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "n 3"]:
     """Colours on the way from ``first`` (amount 0) to ``second`` (amount 1)."""

@@ -85,7 +85,7 @@ class LitScene:
         normals = self.still_life.vertex_normals[which].astype(np.float64)
         starts = self.still_life.vertices[which] + _LIFT * normals
         light, seen = np.zeros_like(starts), np.zeros(len(starts))
-        lamp_points = _lamp_points(48)
+        lamp_points = _lamp_points(36)
         for lamp_point in lamp_points:
             way = lamp_point - starts
             squared = np.sum(way * way, axis=1)
@@ -95,7 +95,7 @@ class LitScene:
             free[lit] = self._free(starts[lit], way[lit])
             seen += free / len(lamp_points)
             light += (free * cosine / squared)[:, None] * _LAMP / len(lamp_points)
-        directions = _sphere_directions(160)
+        directions = _sphere_directions(112)
         for direction in directions:
             cosine = np.maximum(np.sum(normals * direction, axis=1), 0)
             up = np.flatnonzero(cosine > 0)
