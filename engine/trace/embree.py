@@ -191,15 +191,16 @@ class EmbreeTracer:
             sh=np.empty((segments, *gaussians.sh.shape[1:]), np.float32),
             features=np.empty((segments, self._features.shape[1]), np.float32),
             weight_sums=np.empty(segments, np.float32),
+            error_sums=np.empty(segments, np.float32),
             hit_counts=np.empty(segments, np.int32),
         )
         with numba.parallel_chunksize(1):
             gather_gaussians(
                 hits.origins_world, hits.directions_world, self._records, gaussians.quats_wxyz,
                 order, sorted_keys, starts, bounds,
-                flags, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, with_geometry,
+                flags, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, _or_zeros(g.ray_errors, (rays,)), with_geometry,
                 out.ids, out.means_world, out.quats_wxyz, out.log_scales, out.opacity_logits, out.sh,
-                out.features, out.weight_sums, out.hit_counts,
+                out.features, out.weight_sums, out.error_sums, out.hit_counts,
             )  # fmt: skip
         return out
 

@@ -85,8 +85,9 @@ def replay_rays(
 @njit(cache=True, parallel=True, fastmath={"contract"})
 def gather_gaussians(
     origins, directions, records, quats, order, sorted_keys, starts, chunk_bounds,
-    rays, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, with_geometry,
-    out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features, out_weights, out_counts,
+    rays, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, ray_errors, with_geometry,
+    out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features,
+    out_weights, out_errors, out_counts,
 ):  # fmt: skip
     """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters.
 
@@ -109,7 +110,7 @@ def gather_gaussians(
             b0, b1, b2 = np.float64(record[AXIS_V]), np.float64(record[AXIS_V + 1]), np.float64(record[AXIS_V + 2])
             s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = 0.0
             s_tau = s_tau_u = s_tau_v = 0.0
-            s_n0 = s_n1 = s_n2 = s_w = 0.0
+            s_n0 = s_n1 = s_n2 = s_w = s_error = 0.0
             sh_sum[:basis_count] = 0.0
             feature_sum[:] = 0.0
             for k in range(starts[segment], starts[segment + 1]):
@@ -139,6 +140,7 @@ def gather_gaussians(
                 s_tau_u += tau * u
                 s_tau_v += tau * v
                 s_w += w
+                s_error += w * ray_errors[r]
                 gr = 0.0 if rays[e] & RED_OFF else w * g_rgb[r, 0]
                 gg = 0.0 if rays[e] & GREEN_OFF else w * g_rgb[r, 1]
                 gb = 0.0 if rays[e] & BLUE_OFF else w * g_rgb[r, 2]
@@ -195,4 +197,5 @@ def gather_gaussians(
                 out_features[segment, f] = feature_sum[f]
             out_ids[segment] = i
             out_weights[segment] = s_w
+            out_errors[segment] = s_error
             out_counts[segment] = starts[segment + 1] - starts[segment]

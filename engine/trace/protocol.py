@@ -95,7 +95,10 @@ class HitLists:
 
 @dataclass
 class TraceGradients:
-    """Gradients of a loss with respect to the outputs of a trace; None means zero."""
+    """Gradients of a loss with respect to the outputs of a trace; None means zero.
+
+    ``ray_errors`` is no gradient: any non-negative number a ray, shared out to its Gaussians by weight.
+    """
 
     rgb_srgb: Float32[np.ndarray, "r 3"]
     transmittance: Float32[np.ndarray, " r"] | None = None
@@ -103,13 +106,15 @@ class TraceGradients:
     depth_median: Float32[np.ndarray, " r"] | None = None
     normal_world: Float32[np.ndarray, "r 3"] | None = None
     features: Float32[np.ndarray, "r f"] | None = None
+    ray_errors: Float32[np.ndarray, " r"] | None = None
 
 
 @dataclass
 class GaussianGradients:
     """Gradients of the raw parameters of the ``u`` Gaussians that were hit, in ascending order of id.
 
-    ``weight_sums`` is the sum of the weights alpha T over all rays, ``hit_counts`` the number of rays.
+    ``weight_sums`` is the sum of the weights alpha T over all rays, ``error_sums`` that of the weights times
+    the rays' errors, ``hit_counts`` the number of rays.
     """
 
     ids: Int32[np.ndarray, " u"]
@@ -120,6 +125,7 @@ class GaussianGradients:
     sh: Float32[np.ndarray, "u k 3"]
     features: Float32[np.ndarray, "u f"]
     weight_sums: Float32[np.ndarray, " u"]
+    error_sums: Float32[np.ndarray, " u"]
     hit_counts: Int32[np.ndarray, " u"]
 
 

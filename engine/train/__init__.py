@@ -1,0 +1,1 @@
+"""Training: initialisation, batches, losses, the optimiser, densification, checkpoints and the loop."""

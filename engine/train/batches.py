@@ -1,0 +1,103 @@
+"""Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+
+class Pixels(Protocol):
+    """What training needs of a dataset (see :class:`engine.scene.Dataset`)."""
+
+    def rays(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, "r 3"]]:
+        """Origins and unit directions, world frame, of pixels."""
+        ...
+
+    def pixels(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"], Float32[np.ndarray, " r"]]:
+        """Straight display colour, alpha, and weight (0 where masked) of pixels."""
+        ...
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays and what the photographs show there.
+
+    The last ``patches * side * side`` rays are patches, row-major one after another.
+    """
+
+    origins_world: Float32[np.ndarray, "r 3"]
+    directions_world: Float32[np.ndarray, "r 3"]
+    rgb_srgb: Float32[np.ndarray, "r 3"]
+    alpha: Float32[np.ndarray, " r"]
+    weight: Float32[np.ndarray, " r"]
+    patches: int
+    side: int
+
+
+class PixelSampler:
+    """Draws pixels uniformly over all pixels of the given views.
+
+    Args:
+        view_indices: the views to draw from.
+        sizes_px: width and height of every view of the dataset, by view index.
+    """
+
+    def __init__(self, view_indices: Int64[np.ndarray, " v"], sizes_px: Int64[np.ndarray, "n 2"]) -> None:
+        self._views = view_indices
+        self._sizes = sizes_px[view_indices]
+        self._ends = np.cumsum(self._sizes[:, 0] * self._sizes[:, 1])
+
+    @property
+    def pixel_count(self) -> int:
+        """Number of pixels in all views."""
+        return int(self._ends[-1])
+
+    @property
+    def smallest_side_px(self) -> int:
+        """Shortest side of any view."""
+        return int(self._sizes.min())
+
+    def pixels(
+        self, rng: np.random.Generator, count: int
+    ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+        """``count`` pixels as (view, y, x), with repetition, sorted by view and row so that neighbours meet."""
+        flat = np.sort(rng.integers(0, self.pixel_count, count))
+        which = np.searchsorted(self._ends, flat, side="right")
+        width, height = self._sizes[which].T
+        local = flat - (self._ends[which] - width * height)
+        return self._views[which], local // width, local % width
+
+    def patches(
+        self, rng: np.random.Generator, count: int, side: int
+    ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+        """``count`` patches of ``side`` x ``side`` pixels as (view, y, x), row-major, wholly inside the views."""
+        areas = np.diff(self._ends, prepend=0)
+        which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
+        width, height = self._sizes[which].T
+        left = rng.integers(0, width - side + 1)
+        top = rng.integers(0, height - side + 1)
+        shape = (count, side, side)
+        rows, columns = np.arange(side)[None, :, None], np.arange(side)[None, None, :]
+        view = np.broadcast_to(self._views[which][:, None, None], shape)
+        y = np.broadcast_to(top[:, None, None] + rows, shape)
+        x = np.broadcast_to(left[:, None, None] + columns, shape)
+        return view.reshape(-1), y.reshape(-1), x.reshape(-1)
+
+
+def draw_batch(
+    dataset: Pixels, sampler: PixelSampler, rng: np.random.Generator, *, rays: int, patch_fraction: float, side: int
+) -> Batch:
+    """``rays`` rays, of which about ``patch_fraction`` come as whole patches (none where a view is too small)."""
+    patches = round(rays * patch_fraction / side**2) if sampler.smallest_side_px >= side else 0
+    view, y, x = sampler.pixels(rng, rays - patches * side**2)
+    if patches:
+        extra = sampler.patches(rng, patches, side)
+        view, y, x = (np.concatenate(pair) for pair in zip((view, y, x), extra, strict=True))
+    origins, directions = dataset.rays(view, y, x)
+    rgb, alpha, weight = dataset.pixels(view, y, x)
+    return Batch(origins, directions, rgb, alpha, weight, patches, side)

@@ -1,0 +1,139 @@
+"""Checkpoints: everything that the rest of a run depends on, in one file, written whole or not at all."""
+
+import json
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from engine.errors import CheckpointError
+from engine.files import replacing
+from engine.gaussians.model import FlatGaussians
+from engine.train.optimiser import Adam
+
+FORMAT = 1
+KEEP = 2
+_PREFIX = "iteration_"
+
+
+@dataclass
+class TrainState:
+    """The state before iteration ``iteration`` (0 at the start).
+
+    Attributes:
+        iteration: iterations done.
+        gaussians: parameters.
+        adam: optimiser state.
+        rng: the generator that draws batches and everything else that is random.
+        densifier: what the densification strategy has observed.
+        seconds: training time so far, evaluation left out.
+        running_mse: smoothed squared error of the training rays.
+        best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
+        best_iteration: when that was.
+    """
+
+    iteration: int
+    gaussians: FlatGaussians
+    adam: Adam
+    rng: np.random.Generator
+    densifier: dict[str, np.ndarray]
+    seconds: float = 0.0
+    running_mse: float = 0.0
+    best_psnr: float = -np.inf
+    best_iteration: int = 0
+
+
+def checkpoint_path(folder: Path, iteration: int) -> Path:
+    """Where the checkpoint of ``iteration`` lies."""
+    return folder / f"{_PREFIX}{iteration:07d}.npz"
+
+
+def latest_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint of a run, or None."""
+    return max(folder.glob(f"{_PREFIX}*.npz"), default=None)
+
+
+def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
+    """Write the state and remove all but the newest checkpoints.
+
+    Args:
+        state: what to keep.
+        folder: the run's checkpoint folder.
+        fingerprint: names the configuration and data that the state belongs to.
+    """
+    path = checkpoint_path(folder, state.iteration)
+    meta = {
+        "format": FORMAT,
+        "fingerprint": fingerprint,
+        "iteration": state.iteration,
+        "rng": state.rng.bit_generator.state,
+        "seconds": state.seconds,
+        "running_mse": state.running_mse,
+        "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
+        "best_iteration": state.best_iteration,
+    }
+    arrays = {f"gaussians.{f.name}": getattr(state.gaussians, f.name) for f in fields(FlatGaussians)}
+    arrays |= {f"adam.{f.name}": getattr(state.adam, f.name) for f in fields(Adam)}
+    arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
+    with replacing(path) as temporary:
+        np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
+    for old in sorted(folder.glob(f"{_PREFIX}*.npz"))[:-KEEP]:
+        old.unlink()
+    return path
+
+
+def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
+    """Read a checkpoint back.
+
+    Raises:
+        CheckpointError: the file is damaged, or belongs to another configuration or other photographs.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            meta = json.loads(str(archive["meta"]))
+            groups: dict[str, dict[str, np.ndarray]] = {"gaussians": {}, "adam": {}, "densifier": {}}
+            for name in archive.files:
+                if name != "meta":
+                    group, _, key = name.partition(".")
+                    groups[group][key] = archive[name]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path} is damaged ({error}); delete it to go on from the one before it.") from None
+    if meta.get("format") != FORMAT or meta["fingerprint"] != fingerprint:
+        raise CheckpointError(
+            f"{path} belongs to other settings or other photographs; "
+            "give the settings it was made with, or choose another output folder."
+        )
+    rng = np.random.Generator(np.random.PCG64())
+    rng.bit_generator.state = meta["rng"]
+    return TrainState(
+        iteration=meta["iteration"],
+        gaussians=FlatGaussians(**groups["gaussians"]),
+        adam=Adam(**groups["adam"]),
+        rng=rng,
+        densifier=groups["densifier"],
+        seconds=meta["seconds"],
+        running_mse=meta["running_mse"],
+        best_psnr=-np.inf if meta["best_psnr"] is None else meta["best_psnr"],
+        best_iteration=meta["best_iteration"],
+    )
+
+
+def save_best(gaussians: FlatGaussians, folder: Path) -> None:
+    """Write the Gaussians that did best so far to ``best.npz``."""
+    with replacing(folder / "best.npz") as temporary:
+        np.savez(temporary, **{f.name: getattr(gaussians, f.name) for f in fields(FlatGaussians)})
+
+
+def load_best(folder: Path) -> FlatGaussians:
+    """Read what :func:`save_best` wrote.
+
+    Raises:
+        CheckpointError: the file is missing or damaged.
+    """
+    path = folder / "best.npz"
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return FlatGaussians(**{f.name: archive[f.name] for f in fields(FlatGaussians)})
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None

@@ -1,0 +1,143 @@
+"""Every knob of training with its default, and the presets.
+
+Lengths marked "of the extent" are relative to the scene's robust extent (from the cameras), so that one
+preset serves a coin and a street.
+"""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from engine.errors import ConfigError
+from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
+from engine.trace.protocol import TraceSettings
+
+PresetName = Literal["fast", "standard", "paper"]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class LearningRates(_Frozen):
+    """Adam steps. Means are of the extent and decay exponentially to ``mean_final``; the others follow
+    ``decay`` down to that fraction of their start."""  # noqa: D205, D209
+
+    mean: float = Field(1.6e-4, gt=0)
+    mean_final: float = Field(1.6e-6, gt=0)
+    quat: float = Field(1e-3, ge=0)
+    log_scale: float = Field(5e-3, ge=0)
+    opacity: float = Field(2.5e-2, ge=0)
+    colour: float = Field(2.5e-3, ge=0, description="of the display colour; harmonics get it over C0")
+    sh_rest_ratio: float = Field(0.05, ge=0, description="of the constant harmonic's step")
+    decay: float = Field(1.0, gt=0, le=1)
+
+
+class LossWeights(_Frozen):
+    """Weights of the loss terms; means over the batch's valid rays and channels.
+
+    The families of the field: 0.8 L1 + 0.2 (1 - SSIM) (GaMeS, 3DGRT) is l1 = 0.8, ssim = 0.2; the paper's
+    authors use 0.8 MSE + 0.2 (1 - SSIM)/2: l2 = 0.8, ssim = 0.1.
+    """
+
+    l1: float = Field(0.8, ge=0)
+    l2: float = Field(0.0, ge=0)
+    ssim: float = Field(0.2, ge=0)
+    opacity: float = Field(0.0, ge=0, description="mean opacity of the Gaussians that were hit")
+    scale: float = Field(0.0, ge=0, description="mean in-plane scale of those, of the extent")
+
+
+class McmcConfig(_Frozen):
+    """Relocation of the dead and growth up to a cap (3DGS-MCMC), on flat Gaussians."""
+
+    kind: Literal["mcmc"] = "mcmc"
+    start: int = Field(200, ge=0)
+    stop_fraction: float = Field(0.85, ge=0, le=1, description="of all iterations")
+    interval: int = Field(100, ge=1)
+    growth: float = Field(0.05, ge=0, description="fraction added at each interval")
+    dead_opacity: float = Field(0.012, gt=0, lt=1)
+    error_power: float = Field(1.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it")
+    noise: float = Field(0.0, ge=0, description="SGLD noise on the means of faint Gaussians, 0 is off")
+
+
+class PaperConfig(_Frozen):
+    """Clone and split by the Adam step of the mean, prune by opacity and size (method section 5)."""
+
+    kind: Literal["paper"] = "paper"
+    start: int = Field(400, ge=0)
+    stop_fraction: float = Field(0.5, ge=0, le=1)
+    interval: int = Field(100, ge=1)
+    step_threshold: float = Field(1.0e-4, gt=0, description="norm of one Adam step of the mean, of the extent")
+    split_scale: float = Field(0.005, gt=0, description="norm of the scales above which to split, of the extent")
+    prune_opacity: float = Field(0.039, gt=0, lt=1)
+    min_scale: float = Field(1e-5, ge=0, description="smallest scale norm kept, of the extent")
+    max_scale: float = Field(0.5, gt=0, description="largest scale norm kept, of the extent")
+    split_shrink: float = Field(1.6, gt=1)
+
+
+class TrainConfig(_Frozen):
+    """One training run, fully resolved; the defaults are the ``standard`` preset."""
+
+    iterations: int = Field(6000, ge=1)
+    rays: int = Field(8192, ge=64, description="rays of one iteration")
+    patch_fraction: float = Field(0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM")
+    patch_side: int = Field(32, ge=16)
+    fit_iterations: int = Field(100, ge=0, description="paper 4.2: fitting before anything is added")
+    sh_degree: int = Field(2, ge=0, le=3)
+    sh_every: int = Field(800, ge=1, description="iterations between raising the degree")
+    max_gaussians: int = Field(60_000, ge=1)
+    initial_points: int = Field(30_000, ge=1, description="most points taken from the sparse model, or random ones made")
+    initial_opacity: float = Field(0.1, gt=0, lt=1)
+    background: Literal["auto", "black", "white", "random"] = Field(
+        "auto", description="behind everything; auto is random for photographs with alpha, else black"
+    )
+    rates: LearningRates = LearningRates()
+    loss: LossWeights = LossWeights()
+    trace: TraceSettings = TraceSettings(t_min=0.0)
+    near: float = Field(0.01, ge=0, description="nearest distance at which a Gaussian is seen, of the extent")
+    densify: McmcConfig | PaperConfig = Field(McmcConfig(), discriminator="kind")
+    rebuild_every: int = Field(25, ge=1, description="iterations between rebuilds of the hierarchy")
+    box_padding: float = Field(0.1, ge=0)
+    checkpoint_every: int = Field(500, ge=1, description="rounded up to a multiple of rebuild_every")
+    probe_rays: int = Field(16_384, ge=256, description="fixed training rays that choose the best checkpoint")
+    seed: int = Field(0, ge=0)
+
+
+def preset(name: str) -> TrainConfig:
+    """The named preset.
+
+    Raises:
+        ConfigError: there is no such preset.
+    """
+    if name == "fast":
+        return TrainConfig(
+            iterations=1500,
+            sh_degree=1,
+            sh_every=600,
+            max_gaussians=40_000,
+            densify=McmcConfig(growth=0.1),
+        )
+    if name == "standard":
+        return TrainConfig()
+    if name == "paper":
+        return TrainConfig(
+            iterations=10_000,
+            sh_degree=0,
+            max_gaussians=350_000,
+            loss=LossWeights(l1=0.0, l2=0.8, ssim=0.1),
+            trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),
+            densify=PaperConfig(),
+        )
+    raise ConfigError(f"There is no preset called {name!r}; choose fast, standard or paper.")
+
+
+__all__ = [
+    "CHI2_2_99",
+    "LearningRates",
+    "LossWeights",
+    "McmcConfig",
+    "PaperConfig",
+    "PresetName",
+    "TrainConfig",
+    "preset",
+]

@@ -1,0 +1,112 @@
+"""Relocation and growth up to a cap, after 3DGS-MCMC (Kheradmand et al. 2024), for flat Gaussians."""
+
+from math import comb
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from engine.gaussians.model import FlatGaussians, concatenate
+from engine.trace.protocol import GaussianGradients
+from engine.train.config import McmcConfig
+from engine.train.optimiser import Adam
+
+MAX_COPIES = 32
+
+
+def shared_opacity(opacity: Float64[np.ndarray, " n"], copies: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Opacity of each of ``copies`` equal Gaussians that together are as opaque as one was: 1-(1-a)^(1/N)."""
+    return 1.0 - (1.0 - opacity) ** (1.0 / copies)
+
+
+def shared_scale(
+    opacity: Float64[np.ndarray, " n"], copies: Int64[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """Factor on the scales of ``copies`` coincident Gaussians that keeps the integral of what they cover.
+
+    a / sum_{i=1..N} sum_{k=0..i-1} C(i-1,k) (-1)^k a'^(k+1) / sqrt(k+1), a' = 1-(1-a)^(1/N)
+    (3DGS-MCMC Eq. 9).
+    """
+    shared = shared_opacity(opacity, copies)
+    factor = np.ones_like(opacity)
+    for n in np.unique(copies):
+        which = copies == n
+        total = np.zeros(int(which.sum()))
+        for i in range(1, int(n) + 1):
+            for k in range(i):
+                total += comb(i - 1, k) * (-1.0) ** k * shared[which] ** (k + 1) / np.sqrt(k + 1)
+        factor[which] = opacity[which] / total
+    return factor
+
+
+class Mcmc:
+    """Moves dead Gaussians to, and adds new ones at, places chosen by opacity and by the error seen there.
+
+    A chosen Gaussian and its copies share its opacity and shrink; copies are scattered inside it. The count
+    grows by a fixed fraction each time and never passes the cap.
+
+    Not done: the paper's noise on the means unless ``noise`` > 0.
+    """
+
+    def __init__(self, config: McmcConfig, *, iterations: int, max_gaussians: int) -> None:
+        self._config = config
+        self._stop = int(config.stop_fraction * iterations)
+        self._cap = max_gaussians
+        self._errors: Float32[np.ndarray, " n"] = np.zeros(0, np.float32)
+
+    def observe(
+        self, count: int, gradients: GaussianGradients, mean_steps_world: Float32[np.ndarray, "u 3"]
+    ) -> None:
+        """Add up the error that is seen through each Gaussian."""
+        if len(self._errors) != count:
+            self._errors = np.zeros(count, np.float32)
+        self._errors[gradients.ids] += gradients.error_sums
+
+    def due(self, iteration: int) -> bool:
+        """Every ``interval`` iterations between the start and the stop."""
+        return self._config.start <= iteration <= self._stop and iteration % self._config.interval == 0
+
+    def apply(
+        self, gaussians: FlatGaussians, adam: Adam, rng: np.random.Generator, *, extent: float
+    ) -> tuple[FlatGaussians, Adam]:
+        """Relocate the dead, then grow."""
+        config = self._config
+        count = len(gaussians)
+        opacities = gaussians.opacities.astype(np.float64)
+        alive = opacities > config.dead_opacity
+        if not alive.any():
+            return gaussians, adam
+        score = np.where(alive, opacities, 0.0)
+        if config.error_power > 0 and len(self._errors) == count and self._errors.max(initial=0.0) > 0:
+            score = np.where(alive, self._errors.astype(np.float64) ** config.error_power, 0.0)
+        self._errors = np.zeros(0, np.float32)
+        dead = np.flatnonzero(~alive)
+        born = max(0, min(self._cap - count, round(config.growth * count)))
+        wanted = len(dead) + born
+        if wanted == 0 or score.sum() <= 0:
+            return gaussians, adam
+        chosen = rng.choice(count, size=wanted, p=score / score.sum())
+        copies = np.minimum(np.bincount(chosen, minlength=count) + 1, MAX_COPIES)
+        sources = np.flatnonzero(copies > 1)
+        a = np.clip(opacities[sources], 1e-4, 1 - 1e-4)
+        new_a = np.maximum(shared_opacity(a, copies[sources]), config.dead_opacity * 1.5)
+        gaussians.opacity_logits[sources] = np.log(new_a / (1 - new_a))
+        gaussians.log_scales[sources] += np.log(shared_scale(a, copies[sources]))[:, None].astype(np.float32)
+        adam.reset(sources)
+        made = gaussians.select(chosen)
+        spread = rng.standard_normal((wanted, 2)) * made.scales
+        made.means_world += np.einsum("nij,nj->ni", made.rotations[:, :, 1:], spread).astype(np.float32)
+        for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):
+            getattr(gaussians, name)[dead] = getattr(made, name)[: len(dead)]
+        adam.reset(dead)
+        if born == 0:
+            return gaussians, adam
+        new = made.select(np.arange(len(dead), wanted))
+        return concatenate([gaussians, new]), adam.append(Adam.fresh(new))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The error sums."""
+        return {"errors": self._errors}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Take the error sums back."""
+        self._errors = state["errors"]

@@ -1,0 +1,38 @@
+"""What a densification strategy is."""
+
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float32
+
+from engine.gaussians.model import FlatGaussians
+from engine.trace.protocol import GaussianGradients
+from engine.train.optimiser import Adam
+
+
+class Densifier(Protocol):
+    """Watches the training and changes the set of Gaussians at some iterations."""
+
+    def observe(
+        self, count: int, gradients: GaussianGradients, mean_steps_world: Float32[np.ndarray, "u 3"]
+    ) -> None:
+        """Take note of one iteration over ``count`` Gaussians."""
+        ...
+
+    def due(self, iteration: int) -> bool:
+        """Whether :meth:`apply` is to be called after this iteration (counted from 1)."""
+        ...
+
+    def apply(
+        self, gaussians: FlatGaussians, adam: Adam, rng: np.random.Generator, *, extent: float
+    ) -> tuple[FlatGaussians, Adam]:
+        """The new set and its optimiser state; may change the old ones in place."""
+        ...
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that was observed, for a checkpoint."""
+        ...
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Take back what :meth:`state` gave."""
+        ...

@@ -1,0 +1,96 @@
+"""The first Gaussians: flat ones on the sparse points, or random ones in the cameras' view (paper 4.2)."""
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.spatial import cKDTree
+
+from engine.gaussians.frames import frames_from_normals, quaternions
+from engine.gaussians.model import SH_C0, FlatGaussians
+
+NEIGHBOURS = 3
+PLANE_NEIGHBOURS = 8
+FARTHEST = 50.0
+"""Points farther from the cameras than this many extents are matching errors."""
+
+
+def from_points(
+    xyz_world: Float32[np.ndarray, "n 3"],
+    rgb_srgb: Float32[np.ndarray, "n 3"],
+    camera_centres_world: Float64[np.ndarray, "c 3"],
+    *,
+    extent: float,
+    limit: int,
+    opacity: float,
+    rng: np.random.Generator,
+) -> FlatGaussians:
+    """Flat Gaussians on sparse points, GaMeS style.
+
+    The scales are the mean distance to the three nearest points; the normal is that of the plane through
+    the eight nearest where they lie on one, else it looks at the cameras. More than ``limit`` points are
+    thinned at random.
+    """
+    centre = np.median(camera_centres_world, axis=0)
+    far = np.linalg.norm(xyz_world - centre, axis=1) > FARTHEST * extent
+    keep = np.flatnonzero(~far & np.isfinite(xyz_world).all(axis=1))
+    if len(keep) > limit:
+        keep = np.sort(rng.choice(keep, limit, replace=False))
+    points = xyz_world[keep].astype(np.float64)
+    count = len(points)
+    if count == 0:
+        raise ValueError("no usable points")
+    tree = cKDTree(points)
+    wanted = min(count, PLANE_NEIGHBOURS + 1)
+    distances, neighbours = tree.query(points, wanted)
+    distances, neighbours = distances.reshape(count, wanted), neighbours.reshape(count, wanted)
+    if wanted > 1:
+        spacing = distances[:, 1 : NEIGHBOURS + 1].mean(axis=1)
+    else:
+        spacing = np.full(count, 0.01 * extent)
+    spacing = np.clip(spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distance(points, centre) / extent))
+    normals = _unit(centre - points)
+    if wanted == PLANE_NEIGHBOURS + 1:
+        around = points[neighbours]
+        around = around - around.mean(axis=1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+        planar = values[:, 0] < 0.1 * values[:, 1]
+        normals[planar] = vectors[planar, :, 0]
+    return _assemble(points, normals, spacing, rgb_srgb[keep], opacity)
+
+
+def from_rays(
+    origins_world: Float32[np.ndarray, "n 3"],
+    directions_world: Float32[np.ndarray, "n 3"],
+    rgb_srgb: Float32[np.ndarray, "n 3"],
+    *,
+    extent: float,
+    opacity: float,
+    rng: np.random.Generator,
+) -> FlatGaussians:
+    """Random flat Gaussians in the cameras' frustums: one on each ray, log-uniform in depth, facing it."""
+    depths = extent * np.exp(rng.uniform(np.log(0.3), np.log(5.0), len(origins_world)))
+    points = origins_world.astype(np.float64) + depths[:, None] * directions_world
+    distances = cKDTree(points).query(points, min(len(points), NEIGHBOURS + 1))[0].reshape(len(points), -1)
+    spacing = np.clip(distances[:, 1:].mean(axis=1) if len(points) > 1 else 0.05 * extent, 1e-4 * extent, extent)
+    return _assemble(points, -directions_world.astype(np.float64), np.broadcast_to(spacing, len(points)), rgb_srgb, opacity)
+
+
+def _assemble(
+    points: np.ndarray, normals: np.ndarray, spacing: np.ndarray, rgb_srgb: np.ndarray, opacity: float
+) -> FlatGaussians:
+    count = len(points)
+    return FlatGaussians(
+        means_world=points.astype(np.float32),
+        quats_wxyz=quaternions(frames_from_normals(normals)).astype(np.float32),
+        log_scales=np.repeat(np.log(spacing)[:, None], 2, axis=1).astype(np.float32),
+        opacity_logits=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
+        sh=((rgb_srgb - 0.5) / SH_C0).astype(np.float32)[:, None, :],
+    )
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), np.array([0.0, 0.0, 1.0]))
+
+
+def _distance(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.norm(points - centre, axis=1))

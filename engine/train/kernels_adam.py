@@ -1,0 +1,75 @@
+"""Adam on the Gaussians that were hit, all parameter groups in one pass."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+
+@njit
+def _update(value, gradient, first, second, row, column, rate, correction1, correction2, beta1, beta2, epsilon):
+    m = beta1 * np.float64(first[row, column]) + (1.0 - beta1) * gradient
+    v = beta2 * np.float64(second[row, column]) + (1.0 - beta2) * gradient * gradient
+    first[row, column] = m
+    second[row, column] = v
+    return value - rate * (m * correction1) / (math.sqrt(v * correction2) + epsilon)
+
+
+@njit(cache=True, parallel=True)
+def adam_step(
+    ids, steps, first, second,
+    means, quats, log_scales, logits, sh,
+    g_means, g_quats, g_log_scales, g_logits, g_sh,
+    rate_mean, rate_quat, rate_log_scale, rate_opacity, rate_sh0, rate_sh_rest,
+    opacity_weight, scale_weight, min_log_scale, max_log_scale,
+    beta1, beta2, epsilon, mean_steps,
+):  # fmt: skip
+    """One step for the Gaussians ``ids``; each has its own step count for the bias correction.
+
+    ``opacity_weight`` and ``scale_weight`` add the gradients of their regularisers. ``mean_steps`` receives
+    each mean's step, world units.
+    """
+    basis_count = sh.shape[1]
+    for k in prange(len(ids)):
+        i = ids[k]
+        steps[i] += 1
+        c1 = 1.0 / (1.0 - beta1 ** steps[i])
+        c2 = 1.0 / (1.0 - beta2 ** steps[i])
+        column = 0
+        for axis in range(3):
+            old = np.float64(means[i, axis])
+            new = _update(
+                old, np.float64(g_means[k, axis]), first, second, i, column, rate_mean, c1, c2, beta1, beta2, epsilon
+            )
+            means[i, axis] = new
+            mean_steps[k, axis] = new - old
+            column += 1
+        for axis in range(4):
+            quats[i, axis] = _update(
+                np.float64(quats[i, axis]), np.float64(g_quats[k, axis]),
+                first, second, i, column, rate_quat, c1, c2, beta1, beta2, epsilon,
+            )  # fmt: skip
+            column += 1
+        for axis in range(2):
+            value = np.float64(log_scales[i, axis])
+            value = _update(
+                value, np.float64(g_log_scales[k, axis]) + scale_weight * math.exp(value),
+                first, second, i, column, rate_log_scale, c1, c2, beta1, beta2, epsilon,
+            )  # fmt: skip
+            log_scales[i, axis] = min(max(value, min_log_scale), max_log_scale)
+            column += 1
+        value = np.float64(logits[i])
+        opacity = 1.0 / (1.0 + math.exp(-value))
+        logits[i] = _update(
+            value, np.float64(g_logits[k]) + opacity_weight * opacity * (1.0 - opacity),
+            first, second, i, column, rate_opacity, c1, c2, beta1, beta2, epsilon,
+        )  # fmt: skip
+        column += 1
+        for j in range(basis_count):
+            rate = rate_sh0 if j == 0 else rate_sh_rest
+            for channel in range(3):
+                sh[i, j, channel] = _update(
+                    np.float64(sh[i, j, channel]), np.float64(g_sh[k, j, channel]),
+                    first, second, i, column, rate, c1, c2, beta1, beta2, epsilon,
+                )  # fmt: skip
+                column += 1

@@ -1,0 +1,87 @@
+"""Losses on a batch of rays, with their gradients written out (no autograd on the hot path)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.ndimage import correlate1d
+
+C1, C2 = 0.01**2, 0.03**2
+WINDOW, SIGMA = 11, 1.5
+
+
+def gaussian_window() -> Float32[np.ndarray, " w"]:
+    """The normalised 11-tap Gaussian window (sigma 1.5) of SSIM."""
+    x = np.arange(WINDOW) - WINDOW // 2
+    window = np.exp(-(x**2) / (2 * SIGMA**2))
+    return (window / window.sum()).astype(np.float32)
+
+
+def _filter(images: Float32[np.ndarray, "p h w c"]) -> Float32[np.ndarray, "p h w c"]:
+    window = gaussian_window()
+    rows = correlate1d(images, window, axis=1, mode="constant")
+    return correlate1d(rows, window, axis=2, mode="constant")
+
+
+def ssim_loss(
+    render: Float32[np.ndarray, "p h w 3"], target: Float32[np.ndarray, "p h w 3"]
+) -> tuple[float, Float32[np.ndarray, "p h w 3"]]:
+    """1 - SSIM over the patches' interior, where windows are whole, and its gradient by ``render``.
+
+    The formula of Wang et al. 2004 with the 11 x 11 Gaussian window; the mean is over patches, interior
+    pixels and channels.
+    """
+    x, y = render, target
+    mu_x, mu_y = _filter(x), _filter(y)
+    var_x = _filter(x * x) - mu_x * mu_x
+    var_y = _filter(y * y) - mu_y * mu_y
+    cov = _filter(x * y) - mu_x * mu_y
+    a1, a2 = 2 * mu_x * mu_y + np.float32(C1), 2 * cov + np.float32(C2)
+    b1, b2 = mu_x * mu_x + mu_y * mu_y + np.float32(C1), var_x + var_y + np.float32(C2)
+    ssim = a1 * a2 / (b1 * b2)
+    edge = WINDOW // 2
+    inner = np.zeros(x.shape[:3] + (1,), np.float32)
+    inner[:, edge:-edge, edge:-edge] = 1.0
+    count = float(inner.sum()) * x.shape[-1]
+    loss = 1.0 - float((ssim * inner).sum(dtype=np.float64)) / count
+    weight = -inner / np.float32(count)
+    # Through the mean, the variance of x and the covariance; the window is symmetric, so it is its own adjoint.
+    d_var = weight * -ssim / b2
+    d_cov = weight * 2 * a1 / (b1 * b2)
+    d_mu = weight * (2 * mu_y * a2 / (b1 * b2) - ssim * 2 * mu_x / b1)
+    gradient = _filter(d_mu - 2 * mu_x * d_var - mu_y * d_cov) + 2 * x * _filter(d_var) + y * _filter(d_cov)
+    return loss, gradient.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class PixelLoss:
+    """Value and gradient of the pixel terms; ``squared_error`` is the mean over valid rays and channels."""
+
+    value: float
+    gradient: Float32[np.ndarray, "r 3"]
+    squared_error: float
+    ray_errors: Float32[np.ndarray, " r"]
+
+
+def pixel_loss(
+    render: Float32[np.ndarray, "r 3"],
+    target: Float32[np.ndarray, "r 3"],
+    weight: Float32[np.ndarray, " r"],
+    *,
+    l1: float,
+    l2: float,
+) -> PixelLoss:
+    """L1 and squared error, averaged over the rays of non-zero weight and the channels.
+
+    ``ray_errors`` is each ray's mean absolute error, for densification.
+    """
+    difference = render - target
+    valid = max(float(weight.sum(dtype=np.float64)), 1.0)
+    per_ray = weight[:, None]
+    absolute = np.abs(difference) * per_ray
+    squared = difference * difference * per_ray
+    mse = float(squared.sum(dtype=np.float64)) / (3 * valid)
+    value = l1 * float(absolute.sum(dtype=np.float64)) / (3 * valid) + l2 * mse
+    gradient = (np.float32(l1) * np.sign(difference) + np.float32(2 * l2) * difference) * per_ray
+    gradient /= np.float32(3 * valid)
+    return PixelLoss(value, gradient.astype(np.float32), mse, absolute.mean(axis=1, dtype=np.float32))

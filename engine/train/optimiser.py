@@ -1,0 +1,98 @@
+"""The optimiser: Adam whose state and work follow the Gaussians that are hit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from engine.gaussians.model import SH_C0, FlatGaussians
+from engine.trace.protocol import GaussianGradients
+from engine.train.config import LearningRates, LossWeights
+from engine.train.kernels_adam import adam_step
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+_GEOMETRY_COLUMNS = 3 + 4 + 2 + 1
+
+
+@dataclass
+class Adam:
+    """First and second moments of every parameter, one row a Gaussian, and each Gaussian's step count.
+
+    Columns: mean 3, quaternion 4, log scales 2, opacity 1, then the harmonics. A Gaussian that no ray of
+    the batch hits is left alone: neither its moments nor its parameters change.
+    """
+
+    first: Float32[np.ndarray, "n p"]
+    second: Float32[np.ndarray, "n p"]
+    steps: Int32[np.ndarray, " n"]
+
+    @classmethod
+    def fresh(cls, gaussians: FlatGaussians) -> "Adam":
+        """Zero moments for ``gaussians``."""
+        count, columns = len(gaussians), _GEOMETRY_COLUMNS + 3 * gaussians.sh.shape[1]
+        return cls(
+            np.zeros((count, columns), np.float32), np.zeros((count, columns), np.float32), np.zeros(count, np.int32)
+        )
+
+    def select(self, index: np.ndarray) -> "Adam":
+        """The state of the Gaussians at ``index``, copied."""
+        return Adam(self.first[index].copy(), self.second[index].copy(), self.steps[index].copy())
+
+    def reset(self, index: np.ndarray) -> None:
+        """Forget the past of the Gaussians at ``index``."""
+        self.first[index] = 0
+        self.second[index] = 0
+        self.steps[index] = 0
+
+    def append(self, other: "Adam") -> "Adam":
+        """This state followed by ``other``."""
+        return Adam(
+            np.concatenate([self.first, other.first]),
+            np.concatenate([self.second, other.second]),
+            np.concatenate([self.steps, other.steps]),
+        )
+
+    def widen(self, basis_count: int) -> "Adam":
+        """Room for ``basis_count`` harmonics; the new ones start with zero moments."""
+        extra = _GEOMETRY_COLUMNS + 3 * basis_count - self.first.shape[1]
+        pad = ((0, 0), (0, extra))
+        return Adam(np.pad(self.first, pad), np.pad(self.second, pad), self.steps)
+
+    def step(
+        self,
+        gaussians: FlatGaussians,
+        gradients: GaussianGradients,
+        rates: LearningRates,
+        loss: LossWeights,
+        *,
+        progress: float,
+        extent: float,
+    ) -> Float32[np.ndarray, "u 3"]:
+        """Change ``gaussians`` in place.
+
+        Args:
+            gaussians: parameters.
+            gradients: of the Gaussians that were hit.
+            rates: learning rates.
+            loss: weights of the regularisers on those Gaussians.
+            progress: 0 at the first iteration, 1 at the last.
+            extent: scene extent, world units.
+
+        Returns:
+            Each hit Gaussian's step of the mean, world units.
+        """
+        moved = np.empty((len(gradients.ids), 3), np.float32)
+        hit = max(1, len(gradients.ids))
+        decay = rates.decay**progress
+        colour = rates.colour / SH_C0 * decay
+        adam_step(
+            gradients.ids, self.steps, self.first, self.second,
+            gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh,
+            gradients.means_world, gradients.quats_wxyz, gradients.log_scales, gradients.opacity_logits, gradients.sh,
+            extent * rates.mean * (rates.mean_final / rates.mean) ** progress,
+            rates.quat * decay, rates.log_scale * decay, rates.opacity * decay, colour, colour * rates.sh_rest_ratio,
+            loss.opacity / hit, loss.scale / (2 * hit * extent),
+            float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
+            BETA1, BETA2, EPSILON, moved,
+        )  # fmt: skip
+        return moved
