@@ -26,7 +26,7 @@ def check_binary_model(folder: Path) -> None:
         try:
             data = path.read_bytes() if path.stat().st_size < 4096 else _mapped(path)
             end = walk(data, path)
-        except struct.error:
+        except (struct.error, OverflowError):
             raise DatasetError(
                 f"{path} is damaged: it ends before all that it announces; copy it anew or run COLMAP again."
             ) from None

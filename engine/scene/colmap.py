@@ -1,5 +1,6 @@
 """Reading a COLMAP model, with or without rigs, binary or text, into plain records."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,6 +139,12 @@ def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> Sp
     rgb = np.array([point.color for point in points], dtype=np.float32).reshape(-1, 3) / np.float32(255)
     tracks = np.array([point.track.length() for point in points], dtype=np.int32)
     errors = np.array([point.error for point in points], dtype=np.float32)
+    announced = _announced_points(folder / "points3D.txt")
+    if not (folder / "points3D.bin").is_file() and announced is not None and announced != len(points):
+        warnings.append(
+            f"{folder / 'points3D.txt'} announces {announced} points but holds {len(points)}; "
+            "it may have been cut short."
+        )
     finite = np.isfinite(xyz).all(axis=1)
     if not finite.all():
         warnings.append(
@@ -146,3 +153,17 @@ def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> Sp
     if not finite.any():
         warnings.append(f"The model in {folder} has no 3D points; the start will be random.")
     return SparsePoints(xyz[finite], rgb[finite], tracks[finite], errors[finite])
+
+
+def _announced_points(path: Path) -> int | None:
+    """The count that COLMAP writes into the comment at the head of a text file, if it is there."""
+    if not path.is_file():
+        return None
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if not line.startswith("#"):
+                break
+            found = re.search(r"Number of points: (\d+)", line)
+            if found:
+                return int(found.group(1))
+    return None

@@ -96,9 +96,10 @@ def read_photo(
         colours = resize(colours, width_px, height_px)
     elif resized and coverage is not None:
         planes = np.concatenate([colours * coverage[..., None], coverage[..., None]], axis=2)
-        planes = np.clip(resize(planes, width_px, height_px), 0.0, 1.0)
-        coverage = planes[..., 3]
-        colours = _divided_by_alpha(planes[..., :3], coverage)
+        planes = resize(planes, width_px, height_px)
+        # Colours are divided before the filter's overshoot is clipped off alpha, as both overshoot alike.
+        colours = _divided_by_alpha(planes[..., :3], planes[..., 3])
+        coverage = np.clip(planes[..., 3], 0.0, 1.0)
     elif not is_float and straight:
         # Nothing was computed, so the stored values pass through exactly.
         assert alpha is not None
