@@ -87,9 +87,7 @@ class EmbreeTracer:
             self._boxes = np.empty((count, 6), np.float32)
         self._gaussians = gaussians
         self._features = np.empty((count, 0), np.float32) if features is None else features
-        write_records(
-            self._records, self._boxes, *_parameters(gaussians), self.settings.q, self._padding
-        )
+        write_records(self._records, self._boxes, *_parameters(gaussians), self.settings.q, self._padding)
         self._scene = None  # free the old hierarchy before the new one is made
         self._scene = BoxScene(
             self._device,

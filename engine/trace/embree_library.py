@@ -54,7 +54,9 @@ def library() -> ctypes.CDLL:
             function = getattr(lib, name)
             function.restype, function.argtypes = result, arguments
     except AttributeError as error:
-        raise EmbreeError(f"embreex carries no usable Embree 4 ({error}); reinstall it with: pip install embreex") from None
+        raise EmbreeError(
+            f"embreex carries no usable Embree 4 ({error}); reinstall it with: pip install embreex"
+        ) from None
     return lib
 
 
@@ -73,7 +75,9 @@ class Device:
         self._lib = library()
         self.handle = self._lib.rtcNewDevice(f"threads={threads}".encode())
         if not self.handle:
-            raise EmbreeError(f"Embree could not start: {_ERROR_NAMES.get(self._lib.rtcGetDeviceError(None), '?')}")
+            raise EmbreeError(
+                f"Embree could not start: {_ERROR_NAMES.get(self._lib.rtcGetDeviceError(None), '?')}"
+            )
 
     def check(self, doing: str) -> None:
         """Raise if the last calls failed.

@@ -105,9 +105,21 @@ def gather_gaussians(
             i = sorted_keys[starts[segment]]
             record = records[i]
             m0, m1, m2 = np.float64(record[MEAN]), np.float64(record[MEAN + 1]), np.float64(record[MEAN + 2])
-            n0, n1, n2 = np.float64(record[NORMAL]), np.float64(record[NORMAL + 1]), np.float64(record[NORMAL + 2])
-            a0, a1, a2 = np.float64(record[AXIS_U]), np.float64(record[AXIS_U + 1]), np.float64(record[AXIS_U + 2])
-            b0, b1, b2 = np.float64(record[AXIS_V]), np.float64(record[AXIS_V + 1]), np.float64(record[AXIS_V + 2])
+            n0, n1, n2 = (
+                np.float64(record[NORMAL]),
+                np.float64(record[NORMAL + 1]),
+                np.float64(record[NORMAL + 2]),
+            )
+            a0, a1, a2 = (
+                np.float64(record[AXIS_U]),
+                np.float64(record[AXIS_U + 1]),
+                np.float64(record[AXIS_U + 2]),
+            )
+            b0, b1, b2 = (
+                np.float64(record[AXIS_V]),
+                np.float64(record[AXIS_V + 1]),
+                np.float64(record[AXIS_V + 2]),
+            )
             s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = 0.0
             s_tau = s_tau_u = s_tau_v = 0.0
             s_n0 = s_n1 = s_n2 = s_w = s_error = 0.0
@@ -118,7 +130,11 @@ def gather_gaussians(
                 r = rays[e] & RAY_BITS
                 h = np.float64(h_alpha[e])
                 w = np.float64(weights[e])
-                d0, d1, d2 = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
+                d0, d1, d2 = (
+                    np.float64(directions[r, 0]),
+                    np.float64(directions[r, 1]),
+                    np.float64(directions[r, 2]),
+                )
                 x, y, z = origins[r, 0] - m0, origins[r, 1] - m1, origins[r, 2] - m2
                 inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
                 t = -(x * n0 + y * n1 + z * n2) * inverse
@@ -128,7 +144,11 @@ def gather_gaussians(
                 u = x * a0 + y * a1 + z * a2
                 v = x * b0 + y * b1 + z * b2
                 hu, hv = h * u, h * v
-                tau = np.float64(g_t[e]) - hu * (a0 * d0 + a1 * d1 + a2 * d2) - hv * (b0 * d0 + b1 * d1 + b2 * d2)
+                tau = (
+                    np.float64(g_t[e])
+                    - hu * (a0 * d0 + a1 * d1 + a2 * d2)
+                    - hv * (b0 * d0 + b1 * d1 + b2 * d2)
+                )
                 tau *= inverse
                 s_h += h
                 s_hu += hu

@@ -82,7 +82,9 @@ def trace_rays(
                 context_i32[0], context_i32[1] = -1, -1
                 context_i32[COUNT], context_i32[BUFFER_FULL] = 0, 0
                 context_f64[TRANSMITTANCE] = t1
-                call_with_three_pointers(intersect1, scene, ray_f32.ctypes.data, call_arguments[chunk].ctypes.data)
+                call_with_three_pointers(
+                    intersect1, scene, ray_f32.ctypes.data, call_arguments[chunk].ctypes.data
+                )
                 gathered = context_i32[COUNT]
                 stop = context_i32[BUFFER_FULL] == 0 or context_f64[TRANSMITTANCE] < prune_below
                 for k in range(gathered):
@@ -125,7 +127,10 @@ def trace_rays(
                 if stop:
                     break
                 last = HIT_T + gathered - 1
-                context_f32[LAST_T], context_i32[LAST_ID] = context_f32[last], context_i32[HIT_ID + gathered - 1]
+                context_f32[LAST_T], context_i32[LAST_ID] = (
+                    context_f32[last],
+                    context_i32[HIT_ID + gathered - 1],
+                )
                 t_near = max(np.float32(t_min), context_f32[last] * np.float32(0.999999))
             counts[r] = hits
             rgb[r, 0], rgb[r, 1], rgb[r, 2] = red, green, blue

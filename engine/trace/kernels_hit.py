@@ -86,7 +86,9 @@ def intersect_octagon(arguments):
     context_f64 = carray(float64_pointer(words[3]), CONTEXT_WORDS // 2)
     context_u64 = carray(uint64_pointer(words[3]), CONTEXT_WORDS // 2)
     ray = carray(float32_pointer(words[4]), RAY_WORDS)
-    record = carray(float32_pointer(context_u64[RECORDS] + np.uint64(gaussian * RECORD_WORDS * 4)), RECORD_WORDS)
+    record = carray(
+        float32_pointer(context_u64[RECORDS] + np.uint64(gaussian * RECORD_WORDS * 4)), RECORD_WORDS
+    )
 
     dx, dy, dz = context_f64[RAY64 + 3], context_f64[RAY64 + 4], context_f64[RAY64 + 5]
     nx, ny, nz = np.float64(record[NORMAL]), np.float64(record[NORMAL + 1]), np.float64(record[NORMAL + 2])

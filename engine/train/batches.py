@@ -90,7 +90,13 @@ class PixelSampler:
 
 
 def draw_batch(
-    dataset: Pixels, sampler: PixelSampler, rng: np.random.Generator, *, rays: int, patch_fraction: float, side: int
+    dataset: Pixels,
+    sampler: PixelSampler,
+    rng: np.random.Generator,
+    *,
+    rays: int,
+    patch_fraction: float,
+    side: int,
 ) -> Batch:
     """``rays`` rays, of which about ``patch_fraction`` come as whole patches (none where a view is too small)."""
     patches = round(rays * patch_fraction / side**2) if sampler.smallest_side_px >= side else 0

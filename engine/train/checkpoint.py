@@ -98,7 +98,9 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
                     group, _, key = name.partition(".")
                     groups[group][key] = archive[name]
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise CheckpointError(f"{path} is damaged ({error}); delete it to go on from the one before it.") from None
+        raise CheckpointError(
+            f"{path} is damaged ({error}); delete it to go on from the one before it."
+        ) from None
     if meta.get("format") != FORMAT or meta["fingerprint"] != fingerprint:
         raise CheckpointError(
             f"{path} belongs to other settings or other photographs; "

@@ -56,7 +56,9 @@ class McmcConfig(_Frozen):
     interval: int = Field(100, ge=1)
     growth: float = Field(0.05, ge=0, description="fraction added at each interval")
     dead_opacity: float = Field(0.012, gt=0, lt=1)
-    error_power: float = Field(1.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it")
+    error_power: float = Field(
+        1.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it"
+    )
     noise: float = Field(0.0, ge=0, description="SGLD noise on the means of faint Gaussians, 0 is off")
 
 
@@ -67,8 +69,12 @@ class PaperConfig(_Frozen):
     start: int = Field(400, ge=0)
     stop_fraction: float = Field(0.5, ge=0, le=1)
     interval: int = Field(100, ge=1)
-    step_threshold: float = Field(1.0e-4, gt=0, description="norm of one Adam step of the mean, of the extent")
-    split_scale: float = Field(0.005, gt=0, description="norm of the scales above which to split, of the extent")
+    step_threshold: float = Field(
+        1.0e-4, gt=0, description="norm of one Adam step of the mean, of the extent"
+    )
+    split_scale: float = Field(
+        0.005, gt=0, description="norm of the scales above which to split, of the extent"
+    )
     prune_opacity: float = Field(0.039, gt=0, lt=1)
     min_scale: float = Field(1e-5, ge=0, description="smallest scale norm kept, of the extent")
     max_scale: float = Field(0.5, gt=0, description="largest scale norm kept, of the extent")
@@ -80,13 +86,17 @@ class TrainConfig(_Frozen):
 
     iterations: int = Field(6000, ge=1)
     rays: int = Field(8192, ge=64, description="rays of one iteration")
-    patch_fraction: float = Field(0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM")
+    patch_fraction: float = Field(
+        0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM"
+    )
     patch_side: int = Field(32, ge=16)
     fit_iterations: int = Field(100, ge=0, description="paper 4.2: fitting before anything is added")
     sh_degree: int = Field(2, ge=0, le=3)
     sh_every: int = Field(800, ge=1, description="iterations between raising the degree")
     max_gaussians: int = Field(60_000, ge=1)
-    initial_points: int = Field(30_000, ge=1, description="most points taken from the sparse model, or random ones made")
+    initial_points: int = Field(
+        30_000, ge=1, description="most points taken from the sparse model, or random ones made"
+    )
     initial_opacity: float = Field(0.1, gt=0, lt=1)
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="behind everything; auto is random for photographs with alpha, else black"

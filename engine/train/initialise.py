@@ -46,7 +46,9 @@ def from_points(
         spacing = distances[:, 1 : NEIGHBOURS + 1].mean(axis=1)
     else:
         spacing = np.full(count, 0.01 * extent)
-    spacing = np.clip(spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distance(points, centre) / extent))
+    spacing = np.clip(
+        spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distance(points, centre) / extent)
+    )
     normals = _unit(centre - points)
     if wanted == PLANE_NEIGHBOURS + 1:
         around = points[neighbours]
@@ -70,8 +72,12 @@ def from_rays(
     depths = extent * np.exp(rng.uniform(np.log(0.3), np.log(5.0), len(origins_world)))
     points = origins_world.astype(np.float64) + depths[:, None] * directions_world
     distances = cKDTree(points).query(points, min(len(points), NEIGHBOURS + 1))[0].reshape(len(points), -1)
-    spacing = np.clip(distances[:, 1:].mean(axis=1) if len(points) > 1 else 0.05 * extent, 1e-4 * extent, extent)
-    return _assemble(points, -directions_world.astype(np.float64), np.broadcast_to(spacing, len(points)), rgb_srgb, opacity)
+    spacing = np.clip(
+        distances[:, 1:].mean(axis=1) if len(points) > 1 else 0.05 * extent, 1e-4 * extent, extent
+    )
+    return _assemble(
+        points, -directions_world.astype(np.float64), np.broadcast_to(spacing, len(points)), rgb_srgb, opacity
+    )
 
 
 def _assemble(

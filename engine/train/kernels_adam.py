@@ -7,7 +7,9 @@ from numba import njit, prange
 
 
 @njit
-def _update(value, gradient, first, second, row, column, rate, correction1, correction2, beta1, beta2, epsilon):
+def _update(
+    value, gradient, first, second, row, column, rate, correction1, correction2, beta1, beta2, epsilon
+):
     m = beta1 * np.float64(first[row, column]) + (1.0 - beta1) * gradient
     v = beta2 * np.float64(second[row, column]) + (1.0 - beta2) * gradient * gradient
     first[row, column] = m
@@ -39,7 +41,18 @@ def adam_step(
         for axis in range(3):
             old = np.float64(means[i, axis])
             new = _update(
-                old, np.float64(g_means[k, axis]), first, second, i, column, rate_mean, c1, c2, beta1, beta2, epsilon
+                old,
+                np.float64(g_means[k, axis]),
+                first,
+                second,
+                i,
+                column,
+                rate_mean,
+                c1,
+                c2,
+                beta1,
+                beta2,
+                epsilon,
             )
             means[i, axis] = new
             mean_steps[k, axis] = new - old

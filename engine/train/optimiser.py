@@ -31,7 +31,9 @@ class Adam:
         """Zero moments for ``gaussians``."""
         count, columns = len(gaussians), _GEOMETRY_COLUMNS + 3 * gaussians.sh.shape[1]
         return cls(
-            np.zeros((count, columns), np.float32), np.zeros((count, columns), np.float32), np.zeros(count, np.int32)
+            np.zeros((count, columns), np.float32),
+            np.zeros((count, columns), np.float32),
+            np.zeros(count, np.int32),
         )
 
     def select(self, index: np.ndarray) -> "Adam":

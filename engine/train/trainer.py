@@ -198,7 +198,9 @@ class Trainer:
             )
         gradients = self._tracer.backward(
             seen.hits,
-            TraceGradients(rgb_srgb=gradient, transmittance=gradient @ background, ray_errors=pixel.ray_errors),
+            TraceGradients(
+                rgb_srgb=gradient, transmittance=gradient @ background, ray_errors=pixel.ray_errors
+            ),
         )
         progress = state.iteration / config.iterations
         moved = state.adam.step(

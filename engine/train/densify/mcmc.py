@@ -13,7 +13,9 @@ from engine.train.optimiser import Adam
 MAX_COPIES = 32
 
 
-def shared_opacity(opacity: Float64[np.ndarray, " n"], copies: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+def shared_opacity(
+    opacity: Float64[np.ndarray, " n"], copies: Int64[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
     """Opacity of each of ``copies`` equal Gaussians that together are as opaque as one was: 1-(1-a)^(1/N)."""
     return 1.0 - (1.0 - opacity) ** (1.0 / copies)
 

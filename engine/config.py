@@ -1,0 +1,113 @@
+"""The settings of a reconstruction, shared by the command line, ``config.json`` and later the API.
+
+Imports neither torch nor numba.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from engine.errors import ConfigError
+from engine.train.config import PresetName, TrainConfig, preset
+
+
+class ReconstructionConfig(BaseModel):
+    """Everything that decides what a reconstruction gives; the number of threads does not.
+
+    Attributes:
+        preset: where the training defaults come from.
+        max_side: cap on the longer side of the photographs, px; None keeps their size.
+        test_every: every how-manieth view by name is held out; 0 holds out none.
+        held_out: names of the views to hold out instead.
+        masks: ``ignore`` leaves masked pixels out of the loss, ``alpha`` takes the mask as the object's alpha.
+        evaluate_background: what lies behind renders and photographs with alpha when they are compared.
+        exports: files to write besides ``scene.ply``; their names say the format.
+        train: the training, fully resolved.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: PresetName = "standard"
+    max_side: int | None = Field(None, ge=16)
+    test_every: int = Field(8, ge=0)
+    held_out: tuple[str, ...] | None = None
+    masks: Literal["ignore", "alpha"] = "ignore"
+    evaluate_background: Literal["black", "white"] = "black"
+    exports: tuple[str, ...] = ("mesh.ply", "mesh.obj", "mesh.glb")
+    train: TrainConfig = TrainConfig()
+
+
+def resolve_config(
+    preset_name: str = "standard",
+    *,
+    settings: Mapping[str, object] | None = None,
+    assignments: Sequence[str] = (),
+) -> ReconstructionConfig:
+    """A configuration from a preset, top-level settings, and ``section.name=value`` assignments.
+
+    Args:
+        preset_name: ``fast``, ``standard`` or ``paper``.
+        settings: fields of :class:`ReconstructionConfig`; None values are left at their defaults.
+        assignments: into the training configuration, values as JSON, e.g. ``rates.mean=2e-4``.
+
+    Raises:
+        ConfigError: an unknown name, a value out of range, or no such preset.
+    """
+    train: dict[str, Any] = preset(preset_name).model_dump()
+    for assignment in assignments:
+        name, equals, text = assignment.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. rates.mean=2e-4.")
+        _assign(train, name.strip(), text.strip())
+    values = {key: value for key, value in (settings or {}).items() if value is not None}
+    try:
+        return ReconstructionConfig.model_validate({"preset": preset_name, "train": train, **values})
+    except ValidationError as error:
+        raise ConfigError(_first_complaint(error)) from None
+
+
+def read_config(path: Path) -> ReconstructionConfig:
+    """The configuration part of a run's ``config.json``.
+
+    Raises:
+        ConfigError: the file is missing, damaged, or of another version.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return ReconstructionConfig.model_validate(content["reconstruction"])
+    except ValidationError as error:
+        raise ConfigError(
+            f"{path} is not a configuration of this version: {_first_complaint(error)}"
+        ) from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{path} cannot be read ({error}); name the folder of a finished or stopped run."
+        ) from None
+
+
+def _assign(target: dict[str, Any], name: str, text: str) -> None:
+    *path, last = name.split(".")
+    section: Any = target
+    for key in path:
+        section = section.get(key) if isinstance(section, dict) else None
+    if not isinstance(section, dict) or (last not in section and last != "kind"):
+        raise ConfigError(
+            f"--set {name}: there is no such setting; see config.json of any run for all names."
+        )
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = text
+    if path == ["densify"] and last == "kind" and section.get("kind") != value:
+        # Another strategy has other settings: begin from its defaults.
+        section.clear()
+    section[last] = value
+
+
+def _first_complaint(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return f"{where}: {first['msg']} (it is {first.get('input')!r})."

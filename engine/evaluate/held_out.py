@@ -1,0 +1,112 @@
+"""Renders the held-out views, measures them, and writes ``renders/``, ``metrics.json`` and the report."""
+
+import json
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from engine.evaluate.gallery import ViewImages, WorstAndBest
+from engine.evaluate.report import write_report
+from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
+from engine.events import Listener, StageProgress
+from engine.files import write_json
+from engine.gaussians.model import FlatGaussians
+from engine.render.images import write_png
+from engine.render.renderer import background_colour, render_rays
+from engine.scene import Dataset
+from engine.trace.embree import EmbreeTracer
+from engine.trace.protocol import TraceSettings
+
+RENDERS, METRICS, REPORT = "renders", "metrics.json", "report.html"
+
+
+def evaluate_held_out(
+    dataset: Dataset,
+    gaussians: FlatGaussians,
+    output: Path,
+    *,
+    settings: TraceSettings,
+    background: str,
+    run: Mapping[str, object],
+    config: Mapping[str, object],
+    threads: int,
+    tell: Listener,
+) -> None:
+    """Measure ``gaussians`` on the held-out views of ``dataset``.
+
+    Args:
+        dataset: photographs and split.
+        gaussians: the scene.
+        output: folder that receives ``renders/<name>.png``, ``metrics.json`` and ``report.html``.
+        settings: where rays end, as in training.
+        background: ``black`` or ``white``, behind renders and behind photographs with alpha.
+        run: facts about the run that join the metrics.
+        config: shown in the report.
+        threads: for rendering and measuring; 0 means all cores.
+        tell: hears the progress.
+    """
+    tracer = EmbreeTracer(settings, threads=threads)
+    tracer.build(gaussians)
+    rows: list[ViewMetrics] = []
+    images = WorstAndBest()
+    total = len(dataset.test_indices)
+    for view, measured in _measured(
+        _rendered(dataset, tracer, background), threads or numba.get_num_threads()
+    ):
+        path = output / RENDERS / Path(view.name).with_suffix(".png")
+        write_png(path, view.render)
+        rows.append(measured.metrics)
+        images.offer(
+            view.name, measured.metrics.psnr, ViewImages(view.reference, view.render, measured.flip_map)
+        )
+        tell(StageProgress("evaluate", len(rows), total))
+    metrics = summarise(rows).as_dict(run)
+    write_json(output / METRICS, metrics)
+    write_report(
+        output / REPORT,
+        title=dataset.root.name,
+        metrics=metrics,
+        events=_read_events(output / "events.jsonl"),
+        config=config,
+        images=images,
+    )
+
+
+def _rendered(dataset: Dataset, tracer: EmbreeTracer, background: str) -> Iterator[RenderedView]:
+    colour = background_colour(background)
+    for index in dataset.test_indices:
+        origin, directions = dataset.view_rays(int(index))
+        rgb, alpha, weight = dataset.view_image(int(index))
+        image = render_rays(tracer, origin, directions, colour)
+        reference = rgb * alpha[..., None] + colour * (np.float32(1) - alpha[..., None])
+        yield RenderedView(
+            dataset.views[index].name, image.rgb_srgb, reference, weight, alpha if dataset.has_alpha else None
+        )
+
+
+def _measured(views: Iterator[RenderedView], workers: int) -> Iterator[tuple[RenderedView, MeasuredView]]:
+    """Measure a few views side by side, in order; numpy and FLIP leave the interpreter free meanwhile."""
+    waiting: list[tuple[RenderedView, Future[MeasuredView]]] = []
+    with ThreadPoolExecutor(workers) as pool:
+        for view in views:
+            waiting.append((view, pool.submit(measure_view, view)))
+            if len(waiting) > workers:
+                first, future = waiting.pop(0)
+                yield first, future.result()
+        for view, future in waiting:
+            yield view, future.result()
+
+
+def _read_events(path: Path) -> list[dict[str, object]]:
+    """Rows of an event file; a last line that a kill cut short is left out."""
+    rows = []
+    if path.exists():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                rows.append(json.loads(line))
+            except ValueError:
+                continue
+    return rows

@@ -1,0 +1,65 @@
+"""Whole images from a tracer, a band of rows at a time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+
+from engine.trace.protocol import Tracer
+
+RAYS_AT_ONCE = 1 << 18
+
+
+@dataclass(frozen=True)
+class RenderedImage:
+    """One rendered image.
+
+    Attributes:
+        rgb_srgb: display values over the background, clipped to [0, 1].
+        alpha: accumulated alpha.
+        depth: expected distance along the ray, world units; 0 where nothing was met.
+        depth_median: distance at which half of the light is gone, 0 where it never is.
+        normal_world: mean normal, turned to the viewer and of unit length; 0 where nothing was met.
+    """
+
+    rgb_srgb: Float32[np.ndarray, "h w 3"]
+    alpha: Float32[np.ndarray, "h w"]
+    depth: Float32[np.ndarray, "h w"]
+    depth_median: Float32[np.ndarray, "h w"]
+    normal_world: Float32[np.ndarray, "h w 3"]
+
+
+def render_rays(
+    tracer: Tracer,
+    origin_world: Float32[np.ndarray, "3"],
+    directions_world: Float32[np.ndarray, "h w 3"],
+    background: Float32[np.ndarray, "3"],
+) -> RenderedImage:
+    """Trace an image whose rays share one origin; directions have unit length."""
+    height, width = directions_world.shape[:2]
+    out = RenderedImage(
+        np.empty((height, width, 3), np.float32),
+        np.empty((height, width), np.float32),
+        np.empty((height, width), np.float32),
+        np.empty((height, width), np.float32),
+        np.empty((height, width, 3), np.float32),
+    )
+    rows = max(1, RAYS_AT_ONCE // width)
+    for top in range(0, height, rows):
+        band = slice(top, min(top + rows, height))
+        directions = directions_world[band].reshape(-1, 3)
+        seen = tracer.trace(np.broadcast_to(origin_world, directions.shape), directions)
+        shape = (-1, width)
+        rgb = seen.rgb_srgb + seen.transmittance[:, None] * background
+        out.rgb_srgb[band] = np.clip(rgb, 0, 1).reshape(*shape, 3)
+        out.alpha[band] = seen.alpha.reshape(shape)
+        out.depth[band] = seen.expected_depth.reshape(shape)
+        out.depth_median[band] = seen.depth_median.reshape(shape)
+        length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
+        out.normal_world[band] = (seen.normal_world / np.maximum(length, 1e-12)).reshape(*shape, 3)
+    return out
+
+
+def background_colour(name: str) -> Float32[np.ndarray, "3"]:
+    """The colour called ``black`` or ``white``."""
+    return np.full(3, 1.0 if name == "white" else 0.0, np.float32)
