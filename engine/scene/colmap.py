@@ -134,7 +134,7 @@ def _cameras(reconstruction: Any, used: set[int], folder: Path, warnings: list[s
 
 
 def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> SparsePoints:
-    points = list(reconstruction.points3D.values())
+    points = [point for _, point in sorted(reconstruction.points3D.items(), key=lambda item: item[0])]
     xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
     rgb = np.array([point.color for point in points], dtype=np.float32).reshape(-1, 3) / np.float32(255)
     tracks = np.array([point.track.length() for point in points], dtype=np.int32)

@@ -84,12 +84,14 @@ class Dataset:
             [camera.pinhole_params if camera.is_pinhole else (1.0, 1.0, 0.0, 0.0) for camera in scene.cameras]
         )
         self._is_direct = tables.offsets == NO_TABLE_DIRECT
-        self._may_lack_rays = np.array(
-            [
-                bool(direct) and not covers_its_image(camera)
-                for direct, camera in zip(self._is_direct, scene.cameras, strict=True)
-            ]
-        )
+        lacks_rays = np.array([not (c.is_pinhole or covers_its_image(c)) for c in scene.cameras])
+        self._may_lack_rays = self._is_direct & lacks_rays
+        if lacks_rays.any():
+            models = sorted({scene.cameras[index].model for index in np.flatnonzero(lacks_rays)})
+            self.warnings.append(
+                f"{int(lacks_rays.sum())} cameras ({', '.join(models)}) cannot un-project parts of their images; "
+                "these pixels do not count."
+            )
         self.extent: float = scene_extent(origins[self.train_indices], scene.points)
         self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
             self._sizes[self.train_indices].prod(axis=1)

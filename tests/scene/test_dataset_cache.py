@@ -121,7 +121,7 @@ def test_a_cache_folder_that_cannot_be_written_is_named(tmp_path, make_scene):
         Dataset.open(root, tmp_path / "file/cache")
 
 
-def test_moving_files_about_does_not_need_a_new_cache_but_another_scene_does(tmp_path, make_scene, coded):
+def test_another_scene_with_equal_names_sizes_and_times_is_not_mistaken(tmp_path, make_scene, coded):
     one = make_scene(tmp_path / "one")
     two = make_scene(tmp_path / "two", images=[(f"view_{i}.png", 0, coded(32, 24, 90 + i)) for i in range(4)])
     for i in range(4):
@@ -148,8 +148,8 @@ def test_photographs_do_not_fill_memory(tmp_path, make_scene):
         from engine.scene import Dataset
 
         def private_mb():
-            line = next(l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("RssAnon"))
-            return int(line.split()[1]) / 1024
+            lines = Path("/proc/self/status").read_text().splitlines()
+            return int(next(line for line in lines if line.startswith("RssAnon")).split()[1]) / 1024
 
         start = private_mb()
         data = Dataset.open(Path(sys.argv[1]), Path(sys.argv[2]), threads=1)

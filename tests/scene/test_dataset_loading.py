@@ -164,7 +164,7 @@ def test_missing_folders_are_named(tmp_path, make_scene):
         load_scene(tmp_path)
     root = make_scene(tmp_path)
     shutil.rmtree(root / "sparse")
-    with pytest.raises(DatasetError, match="no COLMAP model.*sparse/0"):
+    with pytest.raises(DatasetError, match=r"no COLMAP model.*sparse/0"):
         load_scene(root)
 
 
@@ -241,7 +241,7 @@ def test_camera_parameters_must_be_possible(tmp_path, make_scene):
     data = bytearray(path.read_bytes())
     data[32:40] = np.float64(-5).tobytes()
     path.write_bytes(data)
-    with pytest.raises(DatasetError, match="Camera 1 .*impossible"):
+    with pytest.raises(DatasetError, match=r"Camera 1 .*impossible"):
         load_scene(root)
 
 
@@ -275,9 +275,9 @@ def test_sizes_of_another_shape_are_named(tmp_path, make_scene, save_image, code
 
 
 def test_a_turned_photograph_is_explained(tmp_path, make_scene, save_image, coded):
-    root = make_scene(tmp_path)
-    save_image(root / "images/view_2.png", coded(24, 32, 2), Orientation=6)
-    with pytest.raises(DatasetError, match=r"view_2\.png is 24x32"):
+    root = make_scene(tmp_path, images=[(f"{i}.jpg", 0, coded(32, 24, i)) for i in range(3)])
+    save_image(root / "images/2.jpg", coded(24, 32, 2), Orientation=6)
+    with pytest.raises(DatasetError, match=r"2\.jpg is 24x32 .*EXIF orientation"):
         load_scene(root)
 
 
