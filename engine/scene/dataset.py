@@ -89,8 +89,8 @@ class Dataset:
         if lacks_rays.any():
             models = sorted({scene.cameras[index].model for index in np.flatnonzero(lacks_rays)})
             self.warnings.append(
-                f"{int(lacks_rays.sum())} cameras ({', '.join(models)}) cannot un-project parts of their images; "
-                "these pixels do not count."
+                f"{int(lacks_rays.sum())} cameras ({', '.join(models)}) cannot un-project parts of their "
+                "images; these pixels do not count."
             )
         self.extent: float = scene_extent(origins[self.train_indices], scene.points)
         self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
