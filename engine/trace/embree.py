@@ -136,16 +136,15 @@ class EmbreeTracer:
         )
         starts = np.empty(count, np.int64)
         eps2 = settings.second_phase_min
-        with numba.parallel_chunksize(4):
-            trace_rays(
-                intersect1_address(), self._scene.handle, self._scratch, self._arguments, origins, directions,
-                self._records, self._gaussians.sh, features,
-                settings.transmittance_min, 2.0 if eps2 is None else eps2, settings.t_min, settings.alpha_max,
-                settings.max_hits, rays_per_chunk,
-                result.rgb_srgb, result.transmittance, result.depth_sum, result.depth_median,
-                result.normal_world, result.features, result.hit_counts,
-                record, starts, *self._hit_storage,
-            )  # fmt: skip
+        trace_rays(
+            intersect1_address(), self._scene.handle, self._scratch, self._arguments, origins, directions,
+            self._records, self._gaussians.sh, features,
+            settings.transmittance_min, 2.0 if eps2 is None else eps2, settings.t_min, settings.alpha_max,
+            settings.max_hits, rays_per_chunk, self.threads, np.zeros(1, np.int64),
+            result.rgb_srgb, result.transmittance, result.depth_sum, result.depth_median,
+            result.normal_world, result.features, result.hit_counts,
+            record, starts, *self._hit_storage,
+        )  # fmt: skip
         if record:
             result.hits = HitLists(origins, directions, starts, result.hit_counts, *self._hit_storage)
             self._recorded = result
@@ -192,14 +191,13 @@ class EmbreeTracer:
             error_sums=np.empty(segments, np.float32),
             hit_counts=np.empty(segments, np.int32),
         )
-        with numba.parallel_chunksize(1):
-            gather_gaussians(
-                hits.origins_world, hits.directions_world, self._records, gaussians.quats_wxyz,
-                order, sorted_keys, starts, bounds,
-                flags, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, _or_zeros(g.ray_errors, (rays,)), with_geometry,
-                out.ids, out.means_world, out.quats_wxyz, out.log_scales, out.opacity_logits, out.sh,
-                out.features, out.weight_sums, out.error_sums, out.hit_counts,
-            )  # fmt: skip
+        gather_gaussians(
+            hits.origins_world, hits.directions_world, self._records, gaussians.quats_wxyz,
+            order, sorted_keys, starts, bounds, self.threads, np.zeros(1, np.int64),
+            flags, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, _or_zeros(g.ray_errors, (rays,)), with_geometry,
+            out.ids, out.means_world, out.quats_wxyz, out.log_scales, out.opacity_logits, out.sh,
+            out.features, out.weight_sums, out.error_sums, out.hit_counts,
+        )  # fmt: skip
         return out
 
     def _use_threads(self) -> None:

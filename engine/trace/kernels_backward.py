@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit, prange
 
 from engine.trace.kernels_hit import AXIS_U, AXIS_V, MEAN, NORMAL, OPACITY
+from engine.trace.kernels_native import next_from_counter
 from engine.trace.kernels_records import rotation_columns
 from engine.trace.kernels_sh import write_basis
 
@@ -82,14 +83,15 @@ def replay_rays(
             t *= 1.0 - alpha
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
-def gather_gaussians(
-    origins, directions, records, quats, order, sorted_keys, starts, chunk_bounds,
+@njit(fastmath={"contract"})
+def gather_chunk(
+    first, last, basis, sh_sum, feature_sum,
+    origins, directions, records, quats, order, sorted_keys, starts,
     rays, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, ray_errors, with_geometry,
     out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features,
     out_weights, out_errors, out_counts,
 ):  # fmt: skip
-    """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters.
+    """Gradients of the Gaussians ``first`` to ``last`` of the sorted hits.
 
     In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point and
     c = <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau/c) r1, dL/dln s = S(h u^2), S(h v^2), and the
@@ -97,125 +99,141 @@ def gather_gaussians(
     """
     basis_count = out_sh.shape[1]
     feature_count = out_features.shape[1]
-    for chunk in prange(len(chunk_bounds) - 1):
+    for segment in range(first, last):
+        i = sorted_keys[starts[segment]]
+        record = records[i]
+        m0, m1, m2 = np.float64(record[MEAN]), np.float64(record[MEAN + 1]), np.float64(record[MEAN + 2])
+        n0, n1, n2 = (
+            np.float64(record[NORMAL]),
+            np.float64(record[NORMAL + 1]),
+            np.float64(record[NORMAL + 2]),
+        )
+        a0, a1, a2 = (
+            np.float64(record[AXIS_U]),
+            np.float64(record[AXIS_U + 1]),
+            np.float64(record[AXIS_U + 2]),
+        )
+        b0, b1, b2 = (
+            np.float64(record[AXIS_V]),
+            np.float64(record[AXIS_V + 1]),
+            np.float64(record[AXIS_V + 2]),
+        )
+        s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = 0.0
+        s_tau = s_tau_u = s_tau_v = 0.0
+        s_n0 = s_n1 = s_n2 = s_w = s_error = 0.0
+        sh_sum[:basis_count] = 0.0
+        feature_sum[:] = 0.0
+        for k in range(starts[segment], starts[segment + 1]):
+            e = order[k]
+            r = rays[e] & RAY_BITS
+            h = np.float64(h_alpha[e])
+            w = np.float64(weights[e])
+            d0, d1, d2 = (
+                np.float64(directions[r, 0]),
+                np.float64(directions[r, 1]),
+                np.float64(directions[r, 2]),
+            )
+            x, y, z = origins[r, 0] - m0, origins[r, 1] - m1, origins[r, 2] - m2
+            inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
+            t = -(x * n0 + y * n1 + z * n2) * inverse
+            x += t * d0
+            y += t * d1
+            z += t * d2
+            u = x * a0 + y * a1 + z * a2
+            v = x * b0 + y * b1 + z * b2
+            hu, hv = h * u, h * v
+            tau = np.float64(g_t[e]) - hu * (a0 * d0 + a1 * d1 + a2 * d2) - hv * (b0 * d0 + b1 * d1 + b2 * d2)
+            tau *= inverse
+            s_h += h
+            s_hu += hu
+            s_hv += hv
+            s_huu += hu * u
+            s_hvv += hv * v
+            s_huv += hu * v
+            s_tau += tau
+            s_tau_u += tau * u
+            s_tau_v += tau * v
+            s_w += w
+            s_error += w * ray_errors[r]
+            gr = 0.0 if rays[e] & RED_OFF else w * g_rgb[r, 0]
+            gg = 0.0 if rays[e] & GREEN_OFF else w * g_rgb[r, 1]
+            gb = 0.0 if rays[e] & BLUE_OFF else w * g_rgb[r, 2]
+            if basis_count == 1:
+                sh_sum[0, 0] += gr
+                sh_sum[0, 1] += gg
+                sh_sum[0, 2] += gb
+            else:
+                write_basis(basis, basis_count, d0, d1, d2)
+                for j in range(basis_count):
+                    sh_sum[j, 0] += basis[j] * gr
+                    sh_sum[j, 1] += basis[j] * gg
+                    sh_sum[j, 2] += basis[j] * gb
+            if with_geometry:
+                facing = -w if inverse > 0.0 else w
+                s_n0 += facing * g_normal[r, 0]
+                s_n1 += facing * g_normal[r, 1]
+                s_n2 += facing * g_normal[r, 2]
+            for f in range(feature_count):
+                feature_sum[f] += w * g_feature[r, f]
+        q0, q1, q2, q3 = (
+            np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        )  # fmt: skip
+        r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
+        # record axes are r/s, so 1/s is their length
+        inv_s2, inv_s3 = math.sqrt(a0 * a0 + a1 * a1 + a2 * a2), math.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
+        s2, s3 = 1.0 / inv_s2, 1.0 / inv_s3
+        # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(s_tau_u s2 r2 + s_tau_v s3 r3) + normal channel
+        on_r3, on_r2 = -s_tau_u * s2, s_tau_v * s3
+        on_r1 = -s_huv * s3 * inv_s2 + s_huv * s2 * inv_s3
+        w0 = on_r1 * r1[0] + on_r2 * r2[0] + on_r3 * r3[0] + r1[1] * s_n2 - r1[2] * s_n1
+        w1 = on_r1 * r1[1] + on_r2 * r2[1] + on_r3 * r3[1] + r1[2] * s_n0 - r1[0] * s_n2
+        w2 = on_r1 * r1[2] + on_r2 * r2[2] + on_r3 * r3[2] + r1[0] * s_n1 - r1[1] * s_n0
+        # dL/dq = 2 (0, w) q / |q|^2: the rotation depends on the direction of q only
+        factor = 2.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+        out_quats[segment, 0] = factor * (-w0 * q1 - w1 * q2 - w2 * q3)
+        out_quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
+        out_quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
+        out_quats[segment, 3] = factor * (w2 * q0 + w0 * q2 - w1 * q1)
+        for axis in range(3):
+            out_means[segment, axis] = s_hu * inv_s2 * r2[axis] + s_hv * inv_s3 * r3[axis] + s_tau * r1[axis]
+        out_log_scales[segment, 0] = s_huu
+        out_log_scales[segment, 1] = s_hvv
+        out_logits[segment] = s_h * (1.0 - np.float64(record[OPACITY]))
+        for j in range(basis_count):
+            for channel in range(3):
+                # degree 0 skips the basis in the loop above
+                out_sh[segment, j, channel] = sh_sum[j, channel] * (
+                    0.28209479177387814 if basis_count == 1 else 1.0
+                )
+        for f in range(feature_count):
+            out_features[segment, f] = feature_sum[f]
+        out_ids[segment] = i
+        out_weights[segment] = s_w
+        out_errors[segment] = s_error
+        out_counts[segment] = starts[segment + 1] - starts[segment]
+
+
+@njit(cache=True, parallel=True, fastmath={"contract"})
+def gather_gaussians(
+    origins, directions, records, quats, order, sorted_keys, starts, chunk_bounds, workers, counter,
+    rays, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, ray_errors, with_geometry,
+    out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features,
+    out_weights, out_errors, out_counts,
+):  # fmt: skip
+    """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters."""
+    feature_count = out_features.shape[1]
+    for _worker in prange(workers):
         basis = np.empty(16, np.float64)
         sh_sum = np.empty((16, 3), np.float64)
         feature_sum = np.empty(max(feature_count, 1), np.float64)
-        for segment in range(chunk_bounds[chunk], chunk_bounds[chunk + 1]):
-            i = sorted_keys[starts[segment]]
-            record = records[i]
-            m0, m1, m2 = np.float64(record[MEAN]), np.float64(record[MEAN + 1]), np.float64(record[MEAN + 2])
-            n0, n1, n2 = (
-                np.float64(record[NORMAL]),
-                np.float64(record[NORMAL + 1]),
-                np.float64(record[NORMAL + 2]),
-            )
-            a0, a1, a2 = (
-                np.float64(record[AXIS_U]),
-                np.float64(record[AXIS_U + 1]),
-                np.float64(record[AXIS_U + 2]),
-            )
-            b0, b1, b2 = (
-                np.float64(record[AXIS_V]),
-                np.float64(record[AXIS_V + 1]),
-                np.float64(record[AXIS_V + 2]),
-            )
-            s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = 0.0
-            s_tau = s_tau_u = s_tau_v = 0.0
-            s_n0 = s_n1 = s_n2 = s_w = s_error = 0.0
-            sh_sum[:basis_count] = 0.0
-            feature_sum[:] = 0.0
-            for k in range(starts[segment], starts[segment + 1]):
-                e = order[k]
-                r = rays[e] & RAY_BITS
-                h = np.float64(h_alpha[e])
-                w = np.float64(weights[e])
-                d0, d1, d2 = (
-                    np.float64(directions[r, 0]),
-                    np.float64(directions[r, 1]),
-                    np.float64(directions[r, 2]),
-                )
-                x, y, z = origins[r, 0] - m0, origins[r, 1] - m1, origins[r, 2] - m2
-                inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
-                t = -(x * n0 + y * n1 + z * n2) * inverse
-                x += t * d0
-                y += t * d1
-                z += t * d2
-                u = x * a0 + y * a1 + z * a2
-                v = x * b0 + y * b1 + z * b2
-                hu, hv = h * u, h * v
-                tau = (
-                    np.float64(g_t[e])
-                    - hu * (a0 * d0 + a1 * d1 + a2 * d2)
-                    - hv * (b0 * d0 + b1 * d1 + b2 * d2)
-                )
-                tau *= inverse
-                s_h += h
-                s_hu += hu
-                s_hv += hv
-                s_huu += hu * u
-                s_hvv += hv * v
-                s_huv += hu * v
-                s_tau += tau
-                s_tau_u += tau * u
-                s_tau_v += tau * v
-                s_w += w
-                s_error += w * ray_errors[r]
-                gr = 0.0 if rays[e] & RED_OFF else w * g_rgb[r, 0]
-                gg = 0.0 if rays[e] & GREEN_OFF else w * g_rgb[r, 1]
-                gb = 0.0 if rays[e] & BLUE_OFF else w * g_rgb[r, 2]
-                if basis_count == 1:
-                    sh_sum[0, 0] += gr
-                    sh_sum[0, 1] += gg
-                    sh_sum[0, 2] += gb
-                else:
-                    write_basis(basis, basis_count, d0, d1, d2)
-                    for j in range(basis_count):
-                        sh_sum[j, 0] += basis[j] * gr
-                        sh_sum[j, 1] += basis[j] * gg
-                        sh_sum[j, 2] += basis[j] * gb
-                if with_geometry:
-                    facing = -w if inverse > 0.0 else w
-                    s_n0 += facing * g_normal[r, 0]
-                    s_n1 += facing * g_normal[r, 1]
-                    s_n2 += facing * g_normal[r, 2]
-                for f in range(feature_count):
-                    feature_sum[f] += w * g_feature[r, f]
-            q0, q1, q2, q3 = (
-                np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        while True:
+            chunk = next_from_counter(counter.ctypes.data)
+            if chunk >= len(chunk_bounds) - 1:
+                break
+            gather_chunk(
+                chunk_bounds[chunk], chunk_bounds[chunk + 1], basis, sh_sum, feature_sum,
+                origins, directions, records, quats, order, sorted_keys, starts,
+                rays, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, ray_errors, with_geometry,
+                out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features,
+                out_weights, out_errors, out_counts,
             )  # fmt: skip
-            r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
-            # record axes are r/s, so 1/s is their length
-            inv_s2, inv_s3 = math.sqrt(a0 * a0 + a1 * a1 + a2 * a2), math.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
-            s2, s3 = 1.0 / inv_s2, 1.0 / inv_s3
-            # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(s_tau_u s2 r2 + s_tau_v s3 r3) + normal channel
-            on_r3, on_r2 = -s_tau_u * s2, s_tau_v * s3
-            on_r1 = -s_huv * s3 * inv_s2 + s_huv * s2 * inv_s3
-            w0 = on_r1 * r1[0] + on_r2 * r2[0] + on_r3 * r3[0] + r1[1] * s_n2 - r1[2] * s_n1
-            w1 = on_r1 * r1[1] + on_r2 * r2[1] + on_r3 * r3[1] + r1[2] * s_n0 - r1[0] * s_n2
-            w2 = on_r1 * r1[2] + on_r2 * r2[2] + on_r3 * r3[2] + r1[0] * s_n1 - r1[1] * s_n0
-            # dL/dq = 2 (0, w) q / |q|^2: the rotation depends on the direction of q only
-            factor = 2.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-            out_quats[segment, 0] = factor * (-w0 * q1 - w1 * q2 - w2 * q3)
-            out_quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
-            out_quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
-            out_quats[segment, 3] = factor * (w2 * q0 + w0 * q2 - w1 * q1)
-            for axis in range(3):
-                out_means[segment, axis] = (
-                    s_hu * inv_s2 * r2[axis] + s_hv * inv_s3 * r3[axis] + s_tau * r1[axis]
-                )
-            out_log_scales[segment, 0] = s_huu
-            out_log_scales[segment, 1] = s_hvv
-            out_logits[segment] = s_h * (1.0 - np.float64(record[OPACITY]))
-            for j in range(basis_count):
-                for channel in range(3):
-                    # degree 0 skips the basis in the loop above
-                    out_sh[segment, j, channel] = sh_sum[j, channel] * (
-                        0.28209479177387814 if basis_count == 1 else 1.0
-                    )
-            for f in range(feature_count):
-                out_features[segment, f] = feature_sum[f]
-            out_ids[segment] = i
-            out_weights[segment] = s_w
-            out_errors[segment] = s_error
-            out_counts[segment] = starts[segment + 1] - starts[segment]

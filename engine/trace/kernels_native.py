@@ -1,4 +1,4 @@
-"""Numba intrinsics that read raw memory and call a native function by its address."""
+"""Numba intrinsics: raw memory, a native function by its address, and a shared counter."""
 
 import llvmlite.ir as ir
 from numba import types
@@ -35,5 +35,20 @@ def call_with_three_pointers(typingctx, function, first, second, third):
         address = builder.inttoptr(args[0], function_type.as_pointer())
         builder.call(address, [builder.inttoptr(argument, pointer) for argument in args[1:]])
         return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@intrinsic
+def next_from_counter(typingctx, address):
+    """Add one to the int64 at ``address`` as one indivisible step and return its value before.
+
+    Threads take their chunks of work from such a counter, so that none waits while there is work left.
+    """
+    signature = types.int64(types.uintp)
+
+    def codegen(context, builder, sig, args):
+        pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
+        return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "monotonic")
 
     return signature, codegen

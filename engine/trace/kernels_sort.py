@@ -42,7 +42,9 @@ def _segment_starts(keys, starts):
     return segments
 
 
-def sort_by_gaussian(keys, gaussian_count, threads):
+def sort_by_gaussian(
+    keys: np.ndarray, gaussian_count: int, threads: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stable order of ``keys`` and where each key begins.
 
     The result does not depend on ``threads``. Returns (order, sorted keys, starts) with one more start

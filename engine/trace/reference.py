@@ -158,7 +158,8 @@ def trace_reference(
                 weight @ p.features[ids],
             ]
         )
-    return ReferenceResult(*(torch.stack(column) for column in zip(*out, strict=True)), hit_ids)
+    rgb, through, depth, median, normal, extra = (torch.stack(column) for column in zip(*out, strict=True))
+    return ReferenceResult(rgb, through, depth, median, normal, extra, hit_ids)
 
 
 def _stop(alphas: Tensor, settings: TraceSettings) -> int:
