@@ -1,0 +1,208 @@
+"""Series of images of a scene: its photographs' views, turntables and paths, to image files or a video."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from engine.gaussians.model import FlatGaussians
+from engine.render.cameras import RenderCamera, focal_from_fov, fov_from_focal
+from engine.render.images import exr_layers, write_exr, write_png
+from engine.render.paths import Turntable, fit_turntable
+from engine.render.renderer import RenderedImage, render_rays
+from engine.render.video import VideoWriter
+from engine.scene import Camera, SceneModel, View
+from engine.trace.protocol import Tracer
+
+Rays = tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]
+Progress = Callable[[int, int], None]
+
+DEFAULT_FOV_Y_DEGREES = 50.0
+_FOV_RANGE_DEGREES = (20.0, 90.0)
+_ROWS_OF_RAYS = 1 << 18
+_SPREAD_QUANTILE = 0.8
+_ELEVATION_DEGREES = 20.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image to render.
+
+    Attributes:
+        name: relative path of its file, without a suffix.
+        rays: makes the common origin and the unit directions of its pixels, in world coordinates.
+    """
+
+    name: str
+    rays: Callable[[], Rays]
+
+
+def view_shots(scene: SceneModel, indices: Int64[np.ndarray, " n"]) -> tuple[Shot, ...]:
+    """The views of photographs, with their lenses, named like them."""
+    views = [scene.views[index] for index in indices]
+    return tuple(
+        Shot(
+            str(Path(view.name).with_suffix("")), partial(_view_rays, view, scene.cameras[view.camera_index])
+        )
+        for view in views
+    )
+
+
+def camera_shots(cameras: Sequence[RenderCamera]) -> tuple[Shot, ...]:
+    """Views of cameras one after another, named ``frame_0000`` and so on."""
+    return tuple(Shot(f"frame_{number:04d}", camera.rays) for number, camera in enumerate(cameras))
+
+
+def turntable_cameras(
+    table: Turntable, frames: int, width_px: int, height_px: int, fov_y_degrees: float = DEFAULT_FOV_Y_DEGREES
+) -> tuple[RenderCamera, ...]:
+    """One turn of a turntable as cameras.
+
+    Raises:
+        ConfigError: there are no frames.
+    """
+    focal_px = focal_from_fov(fov_y_degrees, height_px)
+    return tuple(
+        RenderCamera.from_pose(pose, width_px, height_px, fy_px=focal_px) for pose in table.poses(frames)
+    )
+
+
+def scene_turntable(scene: SceneModel) -> Turntable:
+    """The turntable that fits where the photographs were taken.
+
+    Raises:
+        ConfigError: the cameras share no centre or no up direction.
+    """
+    rotations = np.stack([view.rotation_cam_from_world for view in scene.views])
+    centres = np.stack([view.origin_world for view in scene.views])
+    return fit_turntable(centres, rotations[:, 2], -rotations[:, 1])
+
+
+def scene_fov_y_degrees(scene: SceneModel) -> float:
+    """The angle from the top to the bottom of the first photograph, kept within what a pinhole shows well."""
+    camera = scene.cameras[scene.views[0].camera_index]
+    middle = camera.width_px / 2
+    edges = camera.directions_cam(np.array([[middle, 0.0], [middle, float(camera.height_px)]]))
+    slopes = edges[:, 1] / edges[:, 2]
+    # Half an opening of a fisheye lens may be a right angle or more, where there is no slope.
+    if not (np.isfinite(slopes).all() and (edges[:, 2] > 0).all()):
+        return _FOV_RANGE_DEGREES[1]
+    return float(np.clip(fov_from_focal(1.0, slopes[1] - slopes[0]), *_FOV_RANGE_DEGREES))
+
+
+def gaussian_turntable(
+    gaussians: FlatGaussians,
+    *,
+    up_world: Float64[np.ndarray, "3"] | None = None,
+    fov_y_degrees: float = DEFAULT_FOV_Y_DEGREES,
+) -> Turntable:
+    """A turntable for a scene of which nothing but its Gaussians is known.
+
+    The centre is their median weighted by opacity; the camera looks down on it by 20 degrees from where four
+    fifths of all opacity fit into the image.
+
+    Args:
+        gaussians: the scene.
+        up_world: up; by default -y, as in most scenes that COLMAP made.
+        fov_y_degrees: of the camera.
+    """
+    up = np.array([0.0, -1.0, 0.0]) if up_world is None else up_world / np.linalg.norm(up_world)
+    points, weights = gaussians.means_world.astype(np.float64), gaussians.opacities
+    centre = np.array([_weighted_quantile(points[:, axis], weights, 0.5) for axis in range(3)])
+    spread = _weighted_quantile(np.linalg.norm(points - centre, axis=1), weights, _SPREAD_QUANTILE)
+    if not spread > 0:  # a single Gaussian, or all in one place
+        spread = float(np.median(gaussians.scales.max(axis=1)))
+    distance = spread / np.sin(np.radians(fov_y_degrees) / 2)
+    elevation = np.radians(_ELEVATION_DEGREES)
+    return Turntable(centre, up, float(distance * np.cos(elevation)), float(distance * np.sin(elevation)))
+
+
+def render_images(
+    tracer: Tracer,
+    shots: Sequence[Shot],
+    file_of: Callable[[int, Shot], Path],
+    background: Float32[np.ndarray, "3"],
+    progress: Progress = lambda _done, _total: None,
+) -> tuple[Path, ...]:
+    """Render each shot to a file of its own.
+
+    Args:
+        tracer: with the scene built.
+        shots: what to render.
+        file_of: the file of a shot, given its number and itself. ``.exr`` gets linear R, G, B, alpha A, the
+            expected distance Z (0 where nothing is) and the world normal N.x, N.y, N.z; anything else gets
+            8-bit display colours.
+        background: display colour behind the scene.
+        progress: told (images done, images in all).
+
+    Returns:
+        The files.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    paths = []
+    for number, shot, image in _rendered(tracer, shots, background, progress):
+        path = file_of(number, shot)
+        if path.suffix.lower() == ".exr":
+            layers = exr_layers(
+                image.rgb_srgb, alpha=image.alpha, depth=image.depth, normals_world=image.normal_world
+            )
+            write_exr(path, layers)
+        else:
+            write_png(path, image.rgb_srgb)
+        paths.append(path)
+    return tuple(paths)
+
+
+def render_video(
+    tracer: Tracer,
+    cameras: Sequence[RenderCamera],
+    path: Path,
+    fps: float,
+    background: Float32[np.ndarray, "3"],
+    progress: Progress = lambda _done, _total: None,
+) -> None:
+    """Render cameras of one image size as the frames of a video.
+
+    Raises:
+        OutputError: the video cannot be written.
+    """
+    first = cameras[0]
+    with VideoWriter(path, fps, first.width_px, first.height_px) as video:
+        for _, _, image in _rendered(tracer, camera_shots(cameras), background, progress):
+            video.write(image.rgb_srgb)
+
+
+def _rendered(
+    tracer: Tracer, shots: Sequence[Shot], background: Float32[np.ndarray, "3"], progress: Progress
+) -> Iterator[tuple[int, Shot, RenderedImage]]:
+    progress(0, len(shots))
+    for number, shot in enumerate(shots):
+        yield number, shot, render_rays(tracer, *shot.rays(), background)
+        progress(number + 1, len(shots))
+
+
+def _view_rays(view: View, camera: Camera) -> Rays:
+    """All rays of a view; pixels that the camera cannot un-project look along its axis."""
+    width, height = view.width_px, view.height_px
+    directions_world = np.empty((height, width, 3), np.float32)
+    rows = max(1, _ROWS_OF_RAYS // width)
+    for top in range(0, height, rows):
+        y, x = np.mgrid[top : min(top + rows, height), 0:width] + 0.5
+        directions = camera.directions_cam(np.stack([x.ravel(), y.ravel()], axis=1))
+        directions[np.isnan(directions).any(axis=1)] = (0.0, 0.0, 1.0)
+        world = directions @ view.rotation_cam_from_world
+        directions_world[top : top + rows] = world.reshape(-1, width, 3)
+    return view.origin_world.astype(np.float32), directions_world
+
+
+def _weighted_quantile(
+    values: Float64[np.ndarray, " n"], weights: Float32[np.ndarray, " n"], quantile: float
+) -> float:
+    order = np.argsort(values)
+    sums = np.cumsum(weights[order], dtype=np.float64)
+    return float(values[order[np.searchsorted(sums, quantile * sums[-1])]])

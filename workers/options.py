@@ -1,0 +1,43 @@
+"""Options that several commands share, and what they mean."""
+
+import os
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def available_threads() -> int:
+    """Most threads that can be used: ``NUMBA_NUM_THREADS``, or the cores this process may run on."""
+    limit = os.environ.get("NUMBA_NUM_THREADS", "")
+    if limit.isdigit() and int(limit) > 0:
+        return int(limit)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _cap(_context: click.Context, _parameter: click.Parameter, value: int) -> int:
+    return min(value, available_threads())
+
+
+def threads_option(command: F) -> F:
+    """``--threads``; the command gets no more than there are cores."""
+    return click.option(
+        "--threads",
+        type=click.IntRange(min=0),
+        default=0,
+        callback=_cap,
+        metavar="N",
+        help="Threads to use; 0 (the default) takes all cores.",
+    )(command)
+
+
+def quiet_option(command: F) -> F:
+    """``--quiet``."""
+    return click.option("--quiet", "-q", is_flag=True, help="Show warnings and errors only.")(command)
+
+
+def background_option(help_text: str) -> Callable[[F], F]:
+    """``--background black|white``."""
+    return click.option("--background", type=click.Choice(["black", "white"]), default=None, help=help_text)

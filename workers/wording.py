@@ -1,0 +1,70 @@
+"""Numbers and results in the words in which they are shown."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from engine.events import HeldOutMeasured, TrainingProgress
+
+_METRICS = (
+    ("psnr", "PSNR {:.2f} dB"),
+    ("ssim", "SSIM {:.3f}"),
+    ("ms_ssim", "MS-SSIM {:.3f}"),
+    ("flip", "FLIP {:.3f}"),
+    ("psnr_foreground", "PSNR of the foreground {:.2f} dB"),
+)
+
+
+def clock(seconds: float) -> str:
+    """A duration as ``1:23`` or ``1:02:03``."""
+    minutes, rest = divmod(max(0, round(seconds)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def duration(seconds: float) -> str:
+    """A duration in words: ``0.8 s``, ``42 s``, ``3:05 min``, ``1:02:03 h``."""
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    return f"{clock(seconds)} {'h' if seconds >= 3600 else 'min'}"
+
+
+def rate(per_second: float) -> str:
+    """A rate with its thousands shortened: ``870``, ``310k``, ``1.25M``."""
+    if per_second >= 999_500:
+        return f"{per_second / 1e6:.2f}M"
+    return f"{per_second / 1e3:.0f}k" if per_second >= 1000 else f"{per_second:.0f}"
+
+
+def training_state(event: TrainingProgress, held_out: HeldOutMeasured | None) -> str:
+    """How far the training has come, but for its iterations and the time left."""
+    parts = [f"{event.psnr:.1f} dB"]
+    if held_out is not None:
+        parts.append(f"held out {held_out.psnr:.1f} dB")
+    parts += [f"{event.gaussians:,} Gaussians", f"{rate(event.rays_per_second)} rays/s"]
+    return ", ".join(parts)
+
+
+def mean_metrics(metrics: dict[str, Any]) -> str:
+    """One line on the held-out views from the content of ``metrics.json``."""
+    count = len(metrics["views"])
+    if count == 0:
+        return "No views were held out, so nothing was measured."
+    mean = metrics["mean"]
+    known = [form.format(mean[key]) for key, form in _METRICS if mean.get(key) is not None]
+    return f"Mean over {count} held-out view{'s' if count > 1 else ''}: {', '.join(known)}"
+
+
+def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
+    """What a finished run in ``output`` reached and where its files are."""
+    metrics: dict[str, Any] = json.loads((output / "metrics.json").read_text(encoding="utf-8"))
+    files = [("Report", "report.html"), ("Scene", "scene.ply"), *(("Mesh", name) for name in exports)]
+    return [
+        mean_metrics(metrics),
+        f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
+        f"trained in {duration(metrics['seconds'])}",
+        *(f"{label + ':':8}{output / name}" for label, name in files),
+    ]
