@@ -12,6 +12,7 @@ from jaxtyping import Float32, Int64
 from engine.errors import Cancelled, TrainingFailure
 from engine.events import CheckpointWritten, HeldOutMeasured, Listener, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.order import morton_order
 from engine.scene import View
 from engine.trace.embree import EmbreeTracer
 from engine.trace.protocol import TraceGradients, Tracer, TraceSettings
@@ -149,6 +150,9 @@ class Trainer:
                     state.gaussians, state.adam, state.rng, extent=self._extent
                 )
                 self._check_not_empty()
+                # Neighbours in space become neighbours in memory, which the tracer's caches like.
+                order = morton_order(state.gaussians.means_world)
+                state.gaussians, state.adam = state.gaussians.select(order), state.adam.select(order)
                 rebuild = True
             if state.iteration % EVENT_EVERY == 0 or state.iteration == total:
                 seconds = state.seconds + time.perf_counter() - began
