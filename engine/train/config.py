@@ -23,14 +23,14 @@ class LearningRates(_Frozen):
     """Adam steps. Means are of the extent and decay exponentially to ``mean_final``; the others follow
     ``decay`` down to that fraction of their start."""  # noqa: D205, D209
 
-    mean: float = Field(1.6e-4, gt=0)
-    mean_final: float = Field(1.6e-6, gt=0)
-    quat: float = Field(1e-3, ge=0)
-    log_scale: float = Field(5e-3, ge=0)
-    opacity: float = Field(2.5e-2, ge=0)
+    mean: float = Field(1e-3, gt=0)
+    mean_final: float = Field(1e-5, gt=0)
+    quat: float = Field(8e-3, ge=0)
+    log_scale: float = Field(2e-2, ge=0)
+    opacity: float = Field(0.1, ge=0)
     colour: float = Field(2.5e-3, ge=0, description="of the display colour; harmonics get it over C0")
     sh_rest_ratio: float = Field(0.05, ge=0, description="of the constant harmonic's step")
-    decay: float = Field(1.0, gt=0, le=1)
+    decay: float = Field(0.1, gt=0, le=1)
 
 
 class LossWeights(_Frozen):
@@ -41,8 +41,8 @@ class LossWeights(_Frozen):
     """
 
     l1: float = Field(0.8, ge=0)
-    l2: float = Field(0.0, ge=0)
-    ssim: float = Field(0.2, ge=0)
+    l2: float = Field(1.0, ge=0)
+    ssim: float = Field(0.0, ge=0)
     opacity: float = Field(0.0, ge=0, description="mean opacity of the Gaussians that were hit")
     scale: float = Field(0.0, ge=0, description="mean in-plane scale of those, of the extent")
 
@@ -51,13 +51,13 @@ class McmcConfig(_Frozen):
     """Relocation of the dead and growth up to a cap (3DGS-MCMC), on flat Gaussians."""
 
     kind: Literal["mcmc"] = "mcmc"
-    start: int = Field(200, ge=0)
+    start: int = Field(100, ge=0)
     stop_fraction: float = Field(0.85, ge=0, le=1, description="of all iterations")
     interval: int = Field(100, ge=1)
-    growth: float = Field(0.05, ge=0, description="fraction added at each interval")
+    growth: float = Field(0.2, ge=0, description="fraction added at each interval")
     dead_opacity: float = Field(0.012, gt=0, lt=1)
     error_power: float = Field(
-        1.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it"
+        0.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it"
     )
     noise: float = Field(0.0, ge=0, description="SGLD noise on the means of faint Gaussians, 0 is off")
 
@@ -84,7 +84,7 @@ class PaperConfig(_Frozen):
 class TrainConfig(_Frozen):
     """One training run, fully resolved; the defaults are the ``standard`` preset."""
 
-    iterations: int = Field(6000, ge=1)
+    iterations: int = Field(4000, ge=1)
     rays: int = Field(8192, ge=64, description="rays of one iteration")
     patch_fraction: float = Field(
         0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM"
@@ -92,12 +92,12 @@ class TrainConfig(_Frozen):
     patch_side: int = Field(32, ge=16)
     fit_iterations: int = Field(100, ge=0, description="paper 4.2: fitting before anything is added")
     sh_degree: int = Field(2, ge=0, le=3)
-    sh_every: int = Field(800, ge=1, description="iterations between raising the degree")
+    sh_every: int = Field(400, ge=1, description="iterations between raising the degree")
     max_gaussians: int = Field(60_000, ge=1)
     initial_points: int = Field(
         30_000, ge=1, description="most points taken from the sparse model, or random ones made"
     )
-    initial_opacity: float = Field(0.1, gt=0, lt=1)
+    initial_opacity: float = Field(0.5, gt=0, lt=1)
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="behind everything; auto is random for photographs with alpha, else black"
     )
@@ -123,9 +123,9 @@ def preset(name: str) -> TrainConfig:
         return TrainConfig(
             iterations=1500,
             sh_degree=1,
-            sh_every=600,
+            sh_every=300,
             max_gaussians=40_000,
-            densify=McmcConfig(growth=0.1),
+            rates=LearningRates(decay=0.3),
         )
     if name == "standard":
         return TrainConfig()
@@ -134,6 +134,10 @@ def preset(name: str) -> TrainConfig:
             iterations=10_000,
             sh_degree=0,
             max_gaussians=350_000,
+            initial_opacity=0.1,
+            rates=LearningRates(
+                mean=5e-4, mean_final=3e-6, quat=0.01, log_scale=5e-3, opacity=0.05, colour=1.4e-3, decay=0.1
+            ),
             loss=LossWeights(l1=0.0, l2=0.8, ssim=0.1),
             trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),
             densify=PaperConfig(),
