@@ -1,7 +1,9 @@
 """Checkpoints: everything that the rest of a run depends on, in one file, written whole or not at all."""
 
 import json
+import struct
 import zipfile
+import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -15,6 +17,11 @@ from engine.train.optimiser import Adam
 FORMAT = 1
 KEEP = 2
 _PREFIX = "iteration_"
+# What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array.
+_DAMAGE = (
+    OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
+    OverflowError, struct.error, zlib.error, zipfile.BadZipFile,
+)  # fmt: skip
 
 
 @dataclass
@@ -76,8 +83,11 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     arrays = {f"gaussians.{f.name}": getattr(state.gaussians, f.name) for f in fields(FlatGaussians)}
     arrays |= {f"adam.{f.name}": getattr(state.adam, f.name) for f in fields(Adam)}
     arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
+    meta["arrays"] = sorted(arrays)
     with replacing(path) as temporary:
         np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
+    for left in folder.glob(".*.partial.npz"):  # of runs that were killed while they wrote
+        left.unlink()
     for old in sorted(folder.glob(f"{_PREFIX}*.npz"))[:-KEEP]:
         old.unlink()
     return path
@@ -90,14 +100,15 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         CheckpointError: the file is damaged, or belongs to another configuration or other photographs.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            meta = json.loads(str(archive["meta"]))
-            groups: dict[str, dict[str, np.ndarray]] = {"gaussians": {}, "adam": {}, "densifier": {}}
-            for name in archive.files:
-                if name != "meta":
-                    group, _, key = name.partition(".")
-                    groups[group][key] = archive[name]
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        arrays = _read_arrays(path)
+        meta = json.loads(str(arrays.pop("meta")))
+        if sorted(arrays) != meta.get("arrays", sorted(arrays)):
+            raise ValueError("arrays are missing")
+        groups: dict[str, dict[str, np.ndarray]] = {"gaussians": {}, "adam": {}, "densifier": {}}
+        for name, array in arrays.items():
+            group, _, key = name.partition(".")
+            groups[group][key] = array
+    except _DAMAGE as error:
         raise CheckpointError(
             f"{path} is damaged ({error}); delete it to go on from the one before it."
         ) from None
@@ -135,7 +146,12 @@ def load_best(folder: Path) -> FlatGaussians:
     """
     path = folder / "best.npz"
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return FlatGaussians(**{f.name: archive[f.name] for f in fields(FlatGaussians)})
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        return FlatGaussians(**_read_arrays(path))
+    except _DAMAGE as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    # Opened here, because numpy leaves a file open that turns out to be no archive.
+    with path.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
