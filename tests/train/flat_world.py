@@ -1,0 +1,87 @@
+"""A painted plane and a few cameras in front of it: the smallest data that can be trained on."""
+
+from pathlib import Path
+
+import numpy as np
+
+from engine.gaussians.model import FlatGaussians
+from engine.scene import View
+from engine.train.config import McmcConfig, TrainConfig
+from engine.train.initialise import from_points
+
+EXTENT = 1.0
+
+
+def paint(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Colour of the plane z = 0 at a point, in [0.1, 0.9]."""
+    waves = np.stack([np.sin(4 * x), np.sin(4 * y + 1), np.sin(3 * x - 2 * y)], axis=-1)
+    return (0.5 + 0.4 * waves).astype(np.float32)
+
+
+class FlatWorld:
+    """Pinhole cameras in the plane z = -2 that look straight at the painted plane; follows TrainingData."""
+
+    def __init__(self, count: int = 7, side_px: int = 40, held_out: int = 1) -> None:
+        rng = np.random.default_rng(0)
+        self.origins = np.concatenate([rng.uniform(-0.5, 0.5, (count, 2)), np.full((count, 1), -2.0)], axis=1)
+        self.side_px = side_px
+        self.views = tuple(
+            View(f"{k}.png", Path(f"{k}.png"), None, 0, np.eye(3), -origin, side_px, side_px)
+            for k, origin in enumerate(self.origins)
+        )
+        self.train_indices = np.arange(held_out, count)
+        self.test_indices = np.arange(held_out)
+        self.has_alpha = False
+        self.extent = EXTENT
+        self.poison = False
+
+    def rays(self, view: np.ndarray, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        half = self.side_px / 2
+        directions = np.stack(
+            [(x + 0.5 - half) / half, (y + 0.5 - half) / half, np.full(len(x), 2.0)], axis=-1
+        )
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        return self.origins[view].astype(np.float32), directions.astype(np.float32)
+
+    def pixels(
+        self, view: np.ndarray, y: np.ndarray, x: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        origins, directions = self.rays(view, y, x)
+        points = origins - directions * (origins[:, 2:] / directions[:, 2:])
+        rgb = paint(points[:, 0], points[:, 1])
+        if self.poison:
+            rgb[:] = np.nan
+        ones = np.ones(len(view), np.float32)
+        return rgb, ones, ones.copy()
+
+    def start(self, count: int = 300, opacity: float = 0.1) -> FlatGaussians:
+        """Grey Gaussians on random points of the plane."""
+        rng = np.random.default_rng(1)
+        xyz = np.concatenate([rng.uniform(-1.6, 1.6, (count, 2)), np.zeros((count, 1))], axis=1)
+        return from_points(
+            xyz.astype(np.float32),
+            np.full((count, 3), 0.5, np.float32),
+            self.origins,
+            extent=self.extent,
+            limit=count,
+            opacity=opacity,
+            rng=rng,
+        )
+
+
+def small_config(**changes: object) -> TrainConfig:
+    """A run of seconds in which everything happens: growth, a higher degree, checkpoints."""
+    values: dict[str, object] = {
+        "iterations": 120,
+        "rays": 1024,
+        "patch_fraction": 0.5,
+        "patch_side": 16,
+        "sh_degree": 1,
+        "sh_every": 60,
+        "max_gaussians": 400,
+        "densify": McmcConfig(start=20, interval=20, growth=0.1),
+        "rebuild_every": 10,
+        "checkpoint_every": 20,
+        "probe_rays": 512,
+    }
+    return TrainConfig.model_validate({**TrainConfig().model_dump(), **values, **changes})

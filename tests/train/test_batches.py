@@ -1,0 +1,63 @@
+"""Batches: uniform over the pixels of the training views, with whole patches."""
+
+import numpy as np
+import pytest
+from flat_world import FlatWorld
+
+from engine.train.batches import PixelSampler, draw_batch
+
+SIZES = np.array([[8, 6], [20, 10], [16, 16], [5, 3]], np.int64)
+
+
+def test_pixels_are_uniform_over_the_given_views() -> None:
+    sampler = PixelSampler(np.array([0, 1, 3]), SIZES)
+    assert sampler.pixel_count == 48 + 200 + 15
+    count = 263 * 400
+    view, y, x = sampler.pixels(np.random.default_rng(0), count)
+    tally = np.zeros((4, 10, 20))
+    np.add.at(tally, (view, y, x), 1)
+    for index in (0, 1, 3):
+        width, height = SIZES[index]
+        inside = tally[index, :height, :width]
+        # 400 a pixel, give or take 20: 6 sigma.
+        assert np.abs(inside - 400).max() < 120
+        assert inside.sum() == tally[index].sum()
+    assert tally[2].sum() == 0
+
+
+def test_patches_are_whole_and_in_rows() -> None:
+    sampler = PixelSampler(np.array([1, 2]), SIZES)
+    view, y, x = (a.reshape(500, 4, 4) for a in sampler.patches(np.random.default_rng(0), 500, 4))
+    assert (view == view[:, :1, :1]).all()
+    assert (np.diff(y, axis=1) == 1).all() and (np.diff(y, axis=2) == 0).all()
+    assert (np.diff(x, axis=2) == 1).all() and (np.diff(x, axis=1) == 0).all()
+    width, height = SIZES[view[:, 0, 0]].T
+    assert (x[:, 0, 0] >= 0).all() and (x[:, 0, -1] < width).all() and (y[:, -1, 0] < height).all()
+    corners = set(zip(view[:, 0, 0].tolist(), y[:, 0, 0].tolist(), x[:, 0, 0].tolist(), strict=True))
+    assert {(1, 0, 0), (1, 6, 16), (2, 0, 0)} & corners
+    # Views are drawn by their area.
+    assert (view[:, 0, 0] == 2).mean() == pytest.approx(256 / 456, abs=0.1)
+
+
+def test_patch_as_large_as_the_view() -> None:
+    _, y, x = PixelSampler(np.array([2]), SIZES).patches(np.random.default_rng(0), 1, 16)
+    assert y.tolist() == np.repeat(np.arange(16), 16).tolist()
+    assert x.tolist() == np.tile(np.arange(16), 16).tolist()
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 0.5, 1.0])
+@pytest.mark.parametrize("rays", [256, 1000, 1024])
+def test_batch_has_its_rays(fraction: float, rays: int) -> None:
+    world = FlatWorld(side_px=40)
+    sampler = PixelSampler(world.train_indices, np.full((7, 2), 40))
+    batch = draw_batch(world, sampler, np.random.default_rng(0), rays=rays, patch_fraction=fraction, side=16)
+    assert len(batch.rgb_srgb) == len(batch.origins_world) == len(batch.alpha) == len(batch.weight) == rays
+    assert abs(batch.patches * 256 - fraction * rays) <= 256
+    np.testing.assert_allclose(np.linalg.norm(batch.directions_world, axis=1), 1, atol=1e-6)
+
+
+def test_views_too_small_for_patches_give_none() -> None:
+    world = FlatWorld(side_px=12)
+    sampler = PixelSampler(world.train_indices, np.full((7, 2), 12))
+    batch = draw_batch(world, sampler, np.random.default_rng(0), rays=600, patch_fraction=0.5, side=16)
+    assert batch.patches == 0 and len(batch.rgb_srgb) == 600

@@ -1,0 +1,113 @@
+"""Checkpoints: all of the state, whole or refused."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flat_world import FlatWorld
+
+from engine.errors import CheckpointError
+from engine.gaussians.model import FlatGaussians
+from engine.train.checkpoint import (
+    TrainState,
+    latest_checkpoint,
+    load_best,
+    load_checkpoint,
+    save_best,
+    save_checkpoint,
+)
+from engine.train.optimiser import Adam
+
+
+def make_state(iteration: int = 30, count: int = 12) -> TrainState:
+    rng = np.random.default_rng(iteration)
+    gaussians = FlatWorld().start(count)
+    adam = Adam.fresh(gaussians)
+    adam.first[:] = rng.normal(size=adam.first.shape)
+    adam.steps[:] = 7
+    return TrainState(
+        iteration=iteration, gaussians=gaussians, adam=adam, rng=rng, densifier={"errors": np.arange(5.0)},
+        seconds=1.25, running_mse=0.01, best_psnr=20.5, best_iteration=20,
+    )  # fmt: skip
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    state = make_state()
+    path = save_checkpoint(state, tmp_path, "abc")
+    back = load_checkpoint(path, "abc")
+    for group in ("gaussians", "adam"):
+        for field in fields(getattr(state, group)):
+            np.testing.assert_array_equal(
+                getattr(getattr(back, group), field.name), getattr(getattr(state, group), field.name)
+            )
+    for name in ("iteration", "seconds", "running_mse", "best_psnr", "best_iteration"):
+        assert getattr(back, name) == getattr(state, name)
+    np.testing.assert_array_equal(back.densifier["errors"], np.arange(5.0))
+    np.testing.assert_array_equal(back.rng.random(9), state.rng.random(9))
+
+
+def test_without_a_best_yet(tmp_path: Path) -> None:
+    state = make_state(0)
+    state.best_psnr, state.densifier = -np.inf, {}
+    back = load_checkpoint(save_checkpoint(state, tmp_path, "abc"), "abc")
+    assert back.best_psnr == -np.inf and back.densifier == {}
+
+
+def test_newest_is_found_and_old_ones_go(tmp_path: Path) -> None:
+    assert latest_checkpoint(tmp_path) is None
+    for iteration in (5, 100, 20_000):
+        path = save_checkpoint(make_state(iteration), tmp_path, "abc")
+        assert latest_checkpoint(tmp_path) == path
+    assert len(list(tmp_path.glob("*.npz"))) == 2
+
+
+def test_other_settings_are_refused(tmp_path: Path) -> None:
+    path = save_checkpoint(make_state(), tmp_path, "abc")
+    with pytest.raises(CheckpointError, match="other settings"):
+        load_checkpoint(path, "abd")
+
+
+def test_damage_is_refused_or_harmless(tmp_path: Path) -> None:
+    state = make_state()
+    path = save_checkpoint(state, tmp_path, "abc")
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    damaged = [b"", b"no archive", whole[:100], whole[: len(whole) // 2], whole[:-1]]
+    for place in rng.integers(0, len(whole), 300):
+        damaged.append(
+            whole[:place] + bytes([whole[place] ^ (1 << int(rng.integers(8)))]) + whole[place + 1 :]
+        )
+    refused = 0
+    for content in damaged:
+        path.write_bytes(content)
+        try:
+            back = load_checkpoint(path, "abc")
+        except CheckpointError as error:
+            assert str(path) in str(error)
+            refused += 1
+            continue
+        for field in fields(FlatGaussians):
+            np.testing.assert_array_equal(
+                getattr(back.gaussians, field.name), getattr(state.gaussians, field.name)
+            )
+        np.testing.assert_array_equal(back.adam.first, state.adam.first)
+        np.testing.assert_array_equal(
+            back.rng.bit_generator.state["state"], state.rng.bit_generator.state["state"]
+        )
+    assert refused > 100
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"iteration_0000001\.npz"):
+        load_checkpoint(tmp_path / "iteration_0000001.npz", "abc")
+
+
+def test_best(tmp_path: Path) -> None:
+    gaussians = FlatWorld().start(20)
+    save_best(gaussians, tmp_path)
+    np.testing.assert_array_equal(load_best(tmp_path).means_world, gaussians.means_world)
+    assert latest_checkpoint(tmp_path) is None
+    (tmp_path / "best.npz").write_bytes(b"xx")
+    with pytest.raises(CheckpointError, match=r"best\.npz"):
+        load_best(tmp_path)

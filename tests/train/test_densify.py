@@ -1,0 +1,243 @@
+"""Densification: counts, opacities and places after one application, and what a checkpoint keeps."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from engine.gaussians.model import FlatGaussians
+from engine.trace.protocol import GaussianGradients
+from engine.train.config import McmcConfig, PaperConfig
+from engine.train.densify import Densifier, Mcmc, Paper, make_densifier
+from engine.train.densify.mcmc import shared_opacity, shared_scale
+from engine.train.optimiser import Adam
+
+
+def make(opacities: object, scale: float = 0.1) -> FlatGaussians:
+    a = np.asarray(opacities, np.float64)
+    rng = np.random.default_rng(0)
+    count = len(a)
+    return FlatGaussians(
+        means_world=rng.normal(size=(count, 3)).astype(np.float32),
+        quats_wxyz=rng.normal(size=(count, 4)).astype(np.float32),
+        log_scales=np.full((count, 2), np.log(scale), np.float32),
+        opacity_logits=np.log(a / (1 - a)).astype(np.float32),
+        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
+    )
+
+
+def seen(count: int, errors: object, steps: object = 0.0) -> tuple[GaussianGradients, np.ndarray]:
+    """What a densifier observes: an error for every Gaussian, and every mean's step."""
+    empty = FlatGaussians(*(np.zeros((count, *s), np.float32) for s in ((3,), (4,), (2,), (), (1, 3))))
+    zeros = np.zeros(count, np.float32)
+    gradients = GaussianGradients(
+        ids=np.arange(count, dtype=np.int32), means_world=empty.means_world, quats_wxyz=empty.quats_wxyz,
+        log_scales=empty.log_scales, opacity_logits=zeros, sh=empty.sh,
+        features=np.zeros((count, 0), np.float32), weight_sums=zeros,
+        error_sums=np.broadcast_to(np.asarray(errors, np.float32), count).copy(),
+        hit_counts=np.ones(count, np.int32),
+    )  # fmt: skip
+    return gradients, np.broadcast_to(np.asarray(steps, np.float32), (count, 3)).copy()
+
+
+def mcmc(cap: int = 1000, **changes: object) -> Mcmc:
+    return Mcmc(McmcConfig(**changes), iterations=1000, max_gaussians=cap)
+
+
+def apply(
+    densifier: Densifier, gaussians: FlatGaussians, seed: int = 0, extent: float = 1.0
+) -> tuple[FlatGaussians, Adam]:
+    after, adam = densifier.apply(
+        gaussians, Adam.fresh(gaussians), np.random.default_rng(seed), extent=extent
+    )
+    assert after.is_finite()
+    assert len(adam.steps) == len(adam.first) == len(adam.second) == len(after)
+    return after, adam
+
+
+@pytest.mark.parametrize("copies", [1, 2, 5, 32])
+def test_copies_share_the_opacity_and_the_coverage(copies: int) -> None:
+    opacity = np.array([0.05, 0.5, 0.95])
+    shared = shared_opacity(opacity, np.full(3, copies))
+    np.testing.assert_allclose(1 - (1 - shared) ** copies, opacity, rtol=1e-12)
+    factors = shared_scale(opacity, np.full(3, copies))
+    for a, one, factor in zip(opacity, shared, factors, strict=True):
+        before = quad(lambda x, a=a: a * np.exp(-0.5 * x * x), -12, 12)[0]
+        after = quad(
+            lambda x, one=one, factor=factor: 1 - (1 - one * np.exp(-0.5 * (x / factor) ** 2)) ** copies,
+            -12,
+            12,
+        )[0]
+        assert after == pytest.approx(before, rel=1e-6)
+
+
+def test_growth_stops_at_the_cap() -> None:
+    assert len(apply(mcmc(growth=0.25), make([0.5] * 40))[0]) == 50
+    assert len(apply(mcmc(45, growth=0.25), make([0.5] * 40))[0]) == 45
+    assert len(apply(mcmc(40, growth=0.25), make([0.5] * 40))[0]) == 40
+    assert len(apply(mcmc(10, growth=0.25), make([0.5] * 40))[0]) == 40
+
+
+def test_dead_ones_move_into_a_living_one_and_share_its_opacity() -> None:
+    dead = 1e-4
+    before = make([dead, 0.9, dead, dead])
+    source = before.select(np.array([1]))
+    after, adam = apply(mcmc(growth=0.0, dead_opacity=0.01), before.copy())
+    assert len(after) == 4
+    assert 1 - (1 - after.opacities.astype(np.float64)).prod() == pytest.approx(0.9, rel=1e-5)
+    assert np.ptp(after.opacities) < 1e-6
+    np.testing.assert_array_equal(after.sh, np.repeat(source.sh, 4, axis=0))
+    np.testing.assert_array_equal(after.quats_wxyz, np.repeat(source.quats_wxyz, 4, axis=0))
+    assert np.ptp(after.log_scales, axis=0).max() == 0 and (after.scales < source.scales).all()
+    # Scattered inside the source's plane and extent; the source itself stays.
+    np.testing.assert_array_equal(after.means_world[1], source.means_world[0])
+    local = (after.means_world - source.means_world) @ source.rotations[0]
+    assert np.abs(local[:, 0]).max() < 1e-6
+    assert 0 < np.abs(local[[0, 2, 3], 1:]).max() < 5 * 0.1
+    assert not adam.steps.any()
+
+
+def test_new_ones_come_where_the_error_is() -> None:
+    densifier = mcmc(growth=0.5, error_power=1.0)
+    gaussians = make([0.5] * 40)
+    errors = np.zeros(40)
+    errors[7] = 3.0
+    densifier.observe(40, *seen(40, errors))
+    after, _ = apply(densifier, gaussians.copy())
+    assert len(after) == 60
+    np.testing.assert_array_equal(after.sh[40:], np.repeat(gaussians.sh[[7]], 20, axis=0))
+    assert densifier.state()["errors"].sum() == 0
+
+
+def test_moments_of_the_untouched_stay() -> None:
+    gaussians = make([0.5] * 10)
+    adam = Adam.fresh(gaussians)
+    adam.first[:], adam.steps[:] = 1.0, 5
+    densifier = mcmc(growth=0.3, error_power=1.0)
+    errors = np.zeros(10)
+    errors[2] = 1.0
+    densifier.observe(10, *seen(10, errors))
+    after, adam = densifier.apply(gaussians, adam, np.random.default_rng(0), extent=1.0)
+    assert len(after) == 13
+    assert adam.steps.tolist() == [5, 5, 0, 5, 5, 5, 5, 5, 5, 5, 0, 0, 0]
+    assert (adam.first[[0, 1, 3]] == 1).all() and not adam.first[10:].any()
+
+
+def test_nothing_to_do() -> None:
+    all_dead = make([1e-4] * 5)
+    after, _ = apply(mcmc(), all_dead.copy())
+    np.testing.assert_array_equal(after.opacity_logits, all_dead.opacity_logits)
+    full = make([0.5] * 5)
+    after, _ = apply(mcmc(5), full.copy())
+    np.testing.assert_array_equal(after.means_world, full.means_world)
+
+
+def test_same_seed_same_result() -> None:
+    results = []
+    for seed in (1, 1, 2):
+        densifier = mcmc(growth=0.2)
+        densifier.observe(50, *seen(50, np.arange(50)))
+        results.append(apply(densifier, make(np.linspace(0.001, 0.9, 50)), seed)[0].means_world.tobytes())
+    assert results[0] == results[1] != results[2]
+
+
+def test_many_rounds_stay_finite() -> None:
+    gaussians, rng = make(np.random.default_rng(0).uniform(1e-3, 0.999, 30)), np.random.default_rng(3)
+    densifier = mcmc(200, growth=0.3)
+    adam = Adam.fresh(gaussians)
+    for _ in range(30):
+        densifier.observe(len(gaussians), *seen(len(gaussians), rng.random(len(gaussians)) ** 8))
+        gaussians, adam = densifier.apply(gaussians, adam, rng, extent=1.0)
+        gaussians.opacity_logits += rng.normal(size=len(gaussians)).astype(np.float32)
+        assert gaussians.is_finite()
+    assert len(gaussians) == 200 == len(adam.steps)
+
+
+@pytest.mark.parametrize("config", [McmcConfig(start=20, interval=10, stop_fraction=0.5),
+                                    PaperConfig(start=20, interval=10, stop_fraction=0.5)])  # fmt: skip
+def test_when_it_is_due(config: McmcConfig | PaperConfig) -> None:
+    densifier = make_densifier(config, iterations=100, max_gaussians=10)
+    assert [k for k in range(1, 101) if densifier.due(k)] == [20, 30, 40, 50]
+
+
+@pytest.mark.parametrize(
+    "config", [McmcConfig(growth=0.1), PaperConfig(step_threshold=0.01, prune_opacity=0.01)]
+)
+def test_state_travels_through_a_checkpoint(config: McmcConfig | PaperConfig) -> None:
+    rng = np.random.default_rng(0)
+    first, second = (make_densifier(config, iterations=100, max_gaussians=100) for _ in range(2))
+    first.observe(40, *seen(40, rng.random(40), 0.02 * rng.normal(size=(40, 3))))
+    second.restore({name: array.copy() for name, array in first.state().items()})
+    results = [apply(densifier, make([0.5] * 40))[0] for densifier in (first, second)]
+    assert len(results[0]) > 40
+    np.testing.assert_array_equal(results[0].means_world, results[1].means_world)
+
+
+PAPER = PaperConfig(
+    step_threshold=0.01, split_scale=0.05, prune_opacity=0.1, min_scale=1e-3, max_scale=2.0, split_shrink=1.6
+)
+
+
+def paper(cap: int = 1000) -> Paper:
+    return Paper(PAPER, iterations=1000, max_gaussians=cap)
+
+
+def test_clone_split_and_prune_counts() -> None:
+    gaussians = make([0.5] * 10)
+    gaussians.log_scales[:5] = np.log(0.02)  # small ones: 0.028 by norm
+    gaussians.opacity_logits[9] = -5.0
+    gaussians.log_scales[8] = np.log(1e-5)
+    gaussians.log_scales[7] = np.log(3.0)
+    steps = np.zeros((10, 3))
+    steps[[0, 1]] = [0.02, 0, 0]  # small and moving: cloned
+    steps[[5]] = [0, 0.02, 0]  # large and moving: split
+    steps[[3]] = [0, 0.009, 0]  # too slow
+    densifier = paper()
+    densifier.observe(10, *seen(10, 0.0, steps))
+    before = gaussians.copy()
+    after, _ = apply(densifier, gaussians)
+    assert len(after) == 10 + 2 + 1 - 3
+    np.testing.assert_array_equal(after.means_world[:5], before.means_world[:5])
+    # Clones lie where the means were before the step.
+    np.testing.assert_allclose(after.means_world[7:9], before.means_world[:2] - [[0.02, 0, 0]] * 2, atol=1e-6)
+    np.testing.assert_array_equal(after.log_scales[7:9], before.log_scales[:2])
+    # Halves are smaller, inside the plane, and leave the mother's place.
+    for half in (5, 9):
+        np.testing.assert_allclose(after.scales[half], before.scales[5] / 1.6, rtol=1e-5)
+        local = (after.means_world[half] - before.means_world[5]) @ before.rotations[5]
+        assert abs(local[0]) < 1e-6 and 0 < np.abs(local[1:]).max() < 0.6
+    assert not np.array_equal(after.means_world[5], after.means_world[9])
+
+
+def test_cap_takes_the_longest_steps() -> None:
+    gaussians = make([0.5] * 6, scale=0.02)
+    steps = np.zeros((6, 3))
+    steps[:, 0] = [0.02, 0.05, 0.0, 0.03, 0.04, 0.02]
+    densifier = paper(cap=8)
+    densifier.observe(6, *seen(6, 0.0, steps))
+    before = gaussians.copy()
+    after, _ = apply(densifier, gaussians)
+    assert len(after) == 8
+    np.testing.assert_array_equal(after.sh[6:], before.sh[[1, 4]])
+
+
+def test_thresholds_follow_the_extent() -> None:
+    for extent, count in ((1.0, 12), (10.0, 6)):
+        densifier = paper()
+        densifier.observe(6, *seen(6, 0.0, [0.02, 0, 0]))
+        assert len(apply(densifier, make([0.5] * 6, scale=0.02), extent=extent)[0]) == count
+
+
+def test_pruning_can_empty_the_scene() -> None:
+    assert len(apply(paper(), make([0.01] * 5))[0]) == 0
+
+
+def test_moments_are_copied_to_both() -> None:
+    gaussians = make([0.5] * 4, scale=0.02)
+    adam = Adam.fresh(gaussians)
+    adam.first[:] = np.arange(4)[:, None]
+    steps = np.zeros((4, 3))
+    steps[2] = 0.1
+    densifier = paper()
+    densifier.observe(4, *seen(4, 0.0, steps))
+    _, adam = densifier.apply(gaussians, adam, np.random.default_rng(0), extent=1.0)
+    assert adam.first[:, 0].tolist() == [0, 1, 2, 3, 2]

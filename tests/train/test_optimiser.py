@@ -1,0 +1,166 @@
+"""Adam: that of torch where every Gaussian is hit, and hands off the others."""
+
+import numpy as np
+import pytest
+import torch
+
+from engine.gaussians.model import SH_C0, FlatGaussians
+from engine.trace.protocol import GaussianGradients
+from engine.train.config import LearningRates, LossWeights
+from engine.train.optimiser import Adam
+
+NAMES = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh")
+NO_LOSS = LossWeights(opacity=0.0, scale=0.0)
+
+
+def gaussians(count: int, degree: int = 1) -> FlatGaussians:
+    rng = np.random.default_rng(0)
+    shapes = {
+        "means_world": (3,),
+        "quats_wxyz": (4,),
+        "log_scales": (2,),
+        "opacity_logits": (),
+        "sh": ((degree + 1) ** 2, 3),
+    }
+    return FlatGaussians(**{k: rng.normal(size=(count, *s)).astype(np.float32) for k, s in shapes.items()})
+
+
+def gradients(of: FlatGaussians, ids: np.ndarray, rng: np.random.Generator) -> GaussianGradients:
+    ids = ids.astype(np.int32)
+    parts = {name: rng.normal(size=getattr(of, name)[ids].shape).astype(np.float32) for name in NAMES}
+    zeros = np.zeros(len(ids), np.float32)
+    return GaussianGradients(
+        ids=ids, features=np.zeros((len(ids), 0), np.float32), weight_sums=zeros, error_sums=zeros,
+        hit_counts=np.ones(len(ids), np.int32), **parts,
+    )  # fmt: skip
+
+
+def test_like_torch_when_all_are_hit() -> None:
+    rng = np.random.default_rng(1)
+    ours, extent = gaussians(50), 2.0
+    rates = LearningRates(mean=1e-3, mean_final=1e-3, quat=2e-3, log_scale=3e-3, opacity=4e-2, colour=5e-3,
+                          sh_rest_ratio=0.1, decay=1.0)  # fmt: skip
+    colour = rates.colour / SH_C0
+    leaves = {name: torch.tensor(getattr(ours, name), dtype=torch.float64) for name in NAMES}
+    leaves["sh0"], leaves["sh_rest"] = leaves["sh"][:, :1].clone(), leaves.pop("sh")[:, 1:].clone()
+    steps = {"means_world": rates.mean * extent, "quats_wxyz": rates.quat, "log_scales": rates.log_scale,
+             "opacity_logits": rates.opacity, "sh0": colour, "sh_rest": 0.1 * colour}  # fmt: skip
+    judge = torch.optim.Adam([{"params": [leaves[name]], "lr": lr} for name, lr in steps.items()], eps=1e-15)
+    adam = Adam.fresh(ours)
+    for _ in range(30):
+        given = gradients(ours, np.arange(50), rng)
+        before = ours.means_world.copy()
+        moved = adam.step(ours, given, rates, NO_LOSS, progress=0.5, extent=extent)
+        np.testing.assert_allclose(moved, ours.means_world - before, atol=1e-6)
+        for name, leaf in leaves.items():
+            whole = torch.tensor(
+                given.sh if name.startswith("sh") else getattr(given, name), dtype=torch.float64
+            )
+            leaf.grad = (
+                {"sh0": whole[:, :1], "sh_rest": whole[:, 1:]}.get(name, whole) if "sh" in name else whole
+            )
+        judge.step()
+    leaves["sh"] = torch.cat([leaves["sh0"], leaves["sh_rest"]], dim=1)
+    assert (adam.steps == 30).all()
+    for name in NAMES:
+        np.testing.assert_allclose(getattr(ours, name), leaves[name].numpy(), atol=2e-6)
+
+
+def test_gaussians_that_are_not_hit_stay_as_they_are() -> None:
+    rng = np.random.default_rng(1)
+    ours = gaussians(20)
+    before, adam = ours.copy(), Adam.fresh(ours)
+    hit = np.array([1, 4, 7, 19])
+    rest = np.setdiff1d(np.arange(20), hit)
+    adam.step(
+        ours,
+        gradients(ours, hit, rng),
+        LearningRates(),
+        LossWeights(opacity=1.0, scale=1.0),
+        progress=0,
+        extent=1,
+    )
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(ours, name)[rest], getattr(before, name)[rest])
+        assert (getattr(ours, name)[hit] != getattr(before, name)[hit]).all()
+    assert not adam.first[rest].any() and not adam.second[rest].any()
+    assert adam.steps[hit].tolist() == [1] * 4 and not adam.steps[rest].any()
+
+
+def test_first_step_is_the_rate_whatever_the_gradient() -> None:
+    rates, ours = LearningRates(), gaussians(10)
+    before, adam = ours.copy(), Adam.fresh(ours)
+    # Each Gaussian has its own count of steps: one that is hit late begins as one that is hit at once.
+    for _ in range(5):
+        adam.step(
+            ours,
+            gradients(ours, np.arange(9), np.random.default_rng(0)),
+            rates,
+            NO_LOSS,
+            progress=0,
+            extent=3,
+        )
+    adam.step(
+        ours, gradients(ours, np.array([9]), np.random.default_rng(0)), rates, NO_LOSS, progress=0, extent=3
+    )
+    step = np.abs(ours.means_world[9] - before.means_world[9])
+    np.testing.assert_allclose(step, 3 * rates.mean, rtol=1e-2)
+
+
+def test_rate_of_the_means_falls_exponentially() -> None:
+    rates = LearningRates()
+    for progress in (0.0, 0.5, 1.0):
+        ours = gaussians(5)
+        adam = Adam.fresh(ours)
+        moved = adam.step(
+            ours,
+            gradients(ours, np.arange(5), np.random.default_rng(0)),
+            rates,
+            NO_LOSS,
+            progress=progress,
+            extent=1,
+        )
+        expected = rates.mean * (rates.mean_final / rates.mean) ** progress
+        np.testing.assert_allclose(np.abs(moved), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("term", ["opacity", "scale"])
+def test_regularisers_push_down(term: str) -> None:
+    ours = gaussians(10)
+    before, adam = ours.copy(), Adam.fresh(ours)
+    none = gradients(ours, np.arange(10), np.random.default_rng(0))
+    for name in NAMES:
+        getattr(none, name)[:] = 0
+    adam.step(
+        ours,
+        none,
+        LearningRates(),
+        LossWeights(**{"opacity": 0, "scale": 0, term: 0.1}),
+        progress=0,
+        extent=1,
+    )
+    changed = {"opacity": "opacity_logits", "scale": "log_scales"}[term]
+    for name in NAMES:
+        difference = getattr(ours, name) - getattr(before, name)
+        assert (difference < 0).all() if name == changed else not difference.any()
+
+
+def test_select_append_reset_widen() -> None:
+    ours = gaussians(6, degree=0)
+    adam = Adam.fresh(ours)
+    adam.step(
+        ours,
+        gradients(ours, np.arange(6), np.random.default_rng(0)),
+        LearningRates(),
+        NO_LOSS,
+        progress=0,
+        extent=1,
+    )
+    both = adam.select(np.array([4, 1])).append(adam)
+    np.testing.assert_array_equal(both.first, adam.first[[4, 1, 0, 1, 2, 3, 4, 5]])
+    wide = adam.widen(9)
+    assert wide.first.shape == (6, 10 + 27)
+    np.testing.assert_array_equal(wide.second[:, :13], adam.second)
+    assert not wide.second[:, 13:].any()
+    adam.reset(np.array([2]))
+    assert not adam.first[2].any() and adam.steps.tolist() == [1, 1, 0, 1, 1, 1]

@@ -1,0 +1,180 @@
+"""The loop on a painted plane: it learns, it stops and goes on, it fails in words."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flat_world import FlatWorld, small_config
+
+from engine.errors import Cancelled, TrainingFailure
+from engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
+from engine.gaussians.model import FlatGaussians
+from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint, save_best
+from engine.train.config import PaperConfig, TrainConfig
+from engine.train.trainer import Trainer, fresh_state
+
+
+def train(
+    folder: Path,
+    config: TrainConfig,
+    *,
+    world: FlatWorld | None = None,
+    state: TrainState | None = None,
+    threads: int = 1,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[FlatGaussians, list[Event]]:
+    world = world or FlatWorld()
+    events: list[Event] = []
+    trainer = Trainer(
+        world,
+        config,
+        state or fresh_state(world.start(), config.seed),
+        folder=folder,
+        fingerprint="test",
+        listener=events.append,
+        threads=threads,
+        should_stop=should_stop,
+    )
+    return trainer.run(), events
+
+
+def content(gaussians: FlatGaussians) -> list[bytes]:
+    return [getattr(gaussians, field.name).tobytes() for field in fields(FlatGaussians)]
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlatGaussians, list[Event]]:
+    return train(tmp_path_factory.mktemp("whole"), small_config())
+
+
+def test_it_learns_the_plane(whole_run: tuple[FlatGaussians, list[Event]]) -> None:
+    gaussians, events = whole_run
+    held_out = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
+    assert held_out[-1] > held_out[0] + 8
+    assert gaussians.is_finite()
+    assert gaussians.sh_degree == 1
+    assert 300 < len(gaussians) <= 400
+
+
+def test_events_tell_of_the_progress(whole_run: tuple[FlatGaussians, list[Event]]) -> None:
+    gaussians, events = whole_run
+    progress = [event for event in events if isinstance(event, TrainingProgress)]
+    assert [event.iteration for event in progress] == list(range(10, 121, 10))
+    assert progress[-1].gaussians == len(gaussians)
+    assert progress[-1].seconds_left == 0 < progress[0].seconds_left
+    assert all(event.rays_per_second > 0 and event.hits_per_ray > 0 for event in progress)
+    assert [e.iteration for e in events if isinstance(e, CheckpointWritten)] == list(range(0, 121, 20))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_same_bits_on_any_number_of_threads(
+    whole_run: tuple[FlatGaussians, list[Event]], tmp_path: Path, threads: int
+) -> None:
+    assert content(train(tmp_path, small_config(), threads=threads)[0]) == content(whole_run[0])
+
+
+def test_another_seed_gives_another_scene(
+    whole_run: tuple[FlatGaussians, list[Event]], tmp_path: Path
+) -> None:
+    assert content(train(tmp_path, small_config(seed=1))[0]) != content(whole_run[0])
+
+
+@pytest.mark.parametrize("paper", [False, True])
+def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, paper: bool) -> None:
+    changes = {}
+    if paper:
+        strategy = PaperConfig(start=20, interval=20, stop_fraction=0.9, step_threshold=1e-5)
+        changes = {"densify": strategy.model_dump()}
+    config = small_config(**changes)
+    expected, _ = train(tmp_path / "whole", config)
+    assert len(expected) != 300
+    asked = 0
+
+    def stop_now_and_then() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked % 4 == 0
+
+    folder, state, rounds = tmp_path / "stopped", None, 0
+    while True:
+        try:
+            found, _ = train(folder, config, state=state, should_stop=stop_now_and_then)
+            break
+        except Cancelled as stop:
+            assert "--resume" in str(stop)
+        path = latest_checkpoint(folder)
+        assert path is not None
+        state = load_checkpoint(path, "test")
+        rounds += 1
+    assert rounds >= 2
+    assert content(found) == content(expected)
+
+
+def test_resuming_a_finished_run_gives_its_result(tmp_path: Path) -> None:
+    config = small_config(iterations=40)
+    expected, _ = train(tmp_path, config)
+    path = latest_checkpoint(tmp_path)
+    assert path is not None
+    found, _ = train(tmp_path, config, state=load_checkpoint(path, "test"))
+    assert content(found) == content(expected)
+
+
+def test_damaged_photographs_fail_in_words(tmp_path: Path) -> None:
+    world = FlatWorld()
+    config = small_config()
+    state = fresh_state(world.start(), 0)
+    world.poison = True
+    with pytest.raises(TrainingFailure, match="damaged photographs"):
+        train(tmp_path, config, world=world, state=state)
+
+
+def test_parameters_that_are_no_numbers_fail_in_words(tmp_path: Path) -> None:
+    world = FlatWorld()
+    state = fresh_state(world.start(), 0)
+    state.gaussians.sh[:] = np.nan
+    with pytest.raises(TrainingFailure):
+        train(tmp_path, small_config(), world=world, state=state)
+
+
+def test_learning_rates_that_scatter_the_scene_fail_in_words(tmp_path: Path) -> None:
+    config = small_config(rates={"mean": 1e6, "mean_final": 1e6})
+    with pytest.raises(TrainingFailure, match="nothing is exported"):
+        train(tmp_path, config)
+
+
+def test_pruning_everything_fails_in_words(tmp_path: Path) -> None:
+    strategy = PaperConfig(start=20, interval=20, prune_opacity=0.999)
+    with pytest.raises(TrainingFailure, match="removed every Gaussian"):
+        train(tmp_path, small_config(densify=strategy.model_dump()))
+
+
+def test_collapsed_end_gives_the_best_state(tmp_path: Path) -> None:
+    config = small_config(iterations=40)
+    train(tmp_path, config)
+    path = latest_checkpoint(tmp_path)
+    assert path is not None
+    state = load_checkpoint(path, "test")
+    best = FlatWorld().start(50)
+    save_best(best, tmp_path)
+    state.best_psnr = 90.0
+    found, events = train(tmp_path, config, state=state)
+    assert content(found) == content(best)
+    assert any(isinstance(event, Warned) for event in events)
+
+
+def test_white_background_and_alpha(tmp_path: Path) -> None:
+    world = FlatWorld()
+    world.has_alpha = True
+    for background in ("white", "auto"):
+        gaussians, events = train(
+            tmp_path / background, small_config(iterations=40, background=background), world=world
+        )
+        assert gaussians.is_finite()
+        assert any(isinstance(event, HeldOutMeasured) for event in events)
+
+
+def test_no_held_out_views(tmp_path: Path) -> None:
+    _, events = train(tmp_path, small_config(iterations=20), world=FlatWorld(held_out=0))
+    assert not any(isinstance(event, HeldOutMeasured) for event in events)
