@@ -19,7 +19,7 @@ def checked_modules() -> list[str]:
     return [".".join(file.parts) for file in files if not file.name.startswith(("__init__", "kernels"))]
 
 
-jaxtyping.install_import_hook(checked_modules(), "beartype.beartype")
+jaxtyping.install_import_hook(checked_modules(), "shape_checks.check")
 
 
 @pytest.fixture(scope="session")

@@ -164,6 +164,7 @@ class Bars:
         if self._task is not None:
             self.bars.remove_task(self._task)
             self._task = None
+            self.bars.refresh()  # lest the next printed line brings the old bar back for a moment
 
     def _print(self, text: str, style: str = "") -> None:
         self._console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)

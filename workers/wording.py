@@ -25,11 +25,11 @@ def clock(seconds: float) -> str:
 
 def duration(seconds: float) -> str:
     """A duration in words: ``0.8 s``, ``42 s``, ``3:05 min``, ``1:02:03 h``."""
-    if seconds < 10:
+    if seconds < 9.95:
         return f"{seconds:.1f} s"
-    if seconds < 60:
+    if seconds < 59.5:
         return f"{seconds:.0f} s"
-    return f"{clock(seconds)} {'h' if seconds >= 3600 else 'min'}"
+    return f"{clock(seconds)} {'h' if seconds >= 3599.5 else 'min'}"
 
 
 def rate(per_second: float) -> str:

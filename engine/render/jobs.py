@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from engine.gaussians.model import FlatGaussians
-from engine.render.cameras import RenderCamera, focal_from_fov, fov_from_focal
+from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.images import exr_layers, write_exr, write_png
 from engine.render.paths import Turntable, fit_turntable
 from engine.render.renderer import RenderedImage, render_rays
@@ -90,7 +90,8 @@ def scene_fov_y_degrees(scene: SceneModel) -> float:
     # Half an opening of a fisheye lens may be a right angle or more, where there is no slope.
     if not (np.isfinite(slopes).all() and (edges[:, 2] > 0).all()):
         return _FOV_RANGE_DEGREES[1]
-    return float(np.clip(fov_from_focal(1.0, slopes[1] - slopes[0]), *_FOV_RANGE_DEGREES))
+    fov_degrees = 2 * np.degrees(np.arctan((slopes[1] - slopes[0]) / 2))
+    return float(np.clip(fov_degrees, *_FOV_RANGE_DEGREES))
 
 
 def gaussian_turntable(

@@ -1,7 +1,7 @@
 """What a tracer is: settings, what it returns, and the small protocol that every tracer follows."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
@@ -129,6 +129,7 @@ class GaussianGradients:
     hit_counts: Int32[np.ndarray, " u"]
 
 
+@runtime_checkable
 class Tracer(Protocol):
     """Traces rays through a set of flat Gaussians and differentiates what they see."""
 

@@ -1,12 +1,13 @@
 """Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
 
+@runtime_checkable
 class Pixels(Protocol):
     """What training needs of a dataset (see :class:`engine.scene.Dataset`)."""
 
@@ -99,7 +100,9 @@ def draw_batch(
     side: int,
 ) -> Batch:
     """``rays`` rays, of which about ``patch_fraction`` come as whole patches (none where a view is too small)."""
-    patches = round(rays * patch_fraction / side**2) if sampler.smallest_side_px >= side else 0
+    patches = min(round(rays * patch_fraction / side**2), rays // side**2)
+    if sampler.smallest_side_px < side:
+        patches = 0
     view, y, x = sampler.pixels(rng, rays - patches * side**2)
     if patches:
         extra = sampler.patches(rng, patches, side)

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -30,6 +30,7 @@ COLLAPSE_DB = 3.0
 EMPTY_ALPHA = 0.01
 
 
+@runtime_checkable
 class TrainingData(Pixels, Protocol):
     """The photographs: pixel access, the views and the split (see :class:`engine.scene.Dataset`)."""
 

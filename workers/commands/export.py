@@ -39,7 +39,8 @@ def export(
 ) -> None:
     """Write the Gaussians of IN.ply, any PLY in the layout of 3DGS, to OUT in another format.
 
-    OUT's name says the format: *.glb, *.obj, *.mesh.ply (octagon meshes) or any other *.ply (Gaussians).
+    OUT's name says the format: glb for *.glb, obj for *.obj, mesh-ply for mesh.ply and *.mesh.ply (these are
+    octagon meshes), gaussians for any other *.ply.
     """
     from engine.export.options import ExportOptions
     from engine.export.registry import export_scene, exporter_for

@@ -1,6 +1,6 @@
 """What a densification strategy is."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -10,6 +10,7 @@ from engine.trace.protocol import GaussianGradients
 from engine.train.optimiser import Adam
 
 
+@runtime_checkable
 class Densifier(Protocol):
     """Watches the training and changes the set of Gaussians at some iterations."""
 

@@ -1,0 +1,98 @@
+"""Cameras for series of images, from photographs or from nothing but Gaussians."""
+
+import math
+
+import numpy as np
+import pytest
+
+from engine.gaussians.model import FlatGaussians
+from engine.render.jobs import (
+    camera_shots,
+    gaussian_turntable,
+    scene_fov_y_degrees,
+    scene_turntable,
+    turntable_cameras,
+    view_shots,
+)
+from engine.scene import Dataset, load_scene
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+
+
+@pytest.fixture(scope="module", params=["PINHOLE", "OPENCV_FISHEYE"])
+def scene_folder(request, tmp_path_factory):
+    root = tmp_path_factory.mktemp("jobs") / "scene"
+    config = GeneratedSceneConfig(
+        views=6, width_px=32, height_px=24, samples_per_side=1, points=100, camera_model=request.param
+    )
+    write_generated_scene(root, config)
+    return root
+
+
+def test_rays_of_views_are_those_of_training(scene_folder, tmp_path):
+    scene = load_scene(scene_folder)
+    data = Dataset.open(scene_folder, tmp_path)
+    shots = view_shots(scene, np.array([1, 4]))
+    assert [shot.name for shot in shots] == ["view_001", "view_004"]
+    for index, shot in zip((1, 4), shots, strict=True):
+        for made, expected in zip(shot.rays(), data.view_rays(index), strict=True):
+            np.testing.assert_allclose(made, expected, atol=2e-4)  # tables of rays are rounded
+
+
+def test_turntable_of_a_scene_goes_round_its_table(scene_folder):
+    scene = load_scene(scene_folder)
+    table = scene_turntable(scene)
+    np.testing.assert_allclose(table.up_world, [0, 0, 1], atol=0.1)
+    assert np.linalg.norm(table.centre_world) < table.radius / 2
+
+
+def test_field_of_view_of_a_scene(scene_folder):
+    scene = load_scene(scene_folder)
+    camera = scene.cameras[0]
+    expected = math.degrees(2 * math.atan(camera.height_px / 2 / camera.params[1]))
+    assert scene_fov_y_degrees(scene) == pytest.approx(expected, rel=0.15)
+
+
+def cloud(means, opacity_logits):
+    count = len(means)
+    return FlatGaussians(
+        means_world=means.astype(np.float32),
+        quats_wxyz=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 2), -3, np.float32),
+        opacity_logits=np.full(count, opacity_logits, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+    )
+
+
+@pytest.mark.parametrize("up", [None, np.array([0.0, 0.0, 2.0])])
+def test_turntable_of_gaussians_shows_most_of_them(up):
+    middle = np.array([3.0, -2.0, 7.0])
+    means = middle + np.random.default_rng(3).standard_normal((2000, 3))
+    gaussians = cloud(means, 2.0)
+    table = gaussian_turntable(gaussians, up_world=up, fov_y_degrees=40)
+    np.testing.assert_allclose(table.centre_world, middle, atol=0.1)
+    np.testing.assert_allclose(table.up_world, [0, -1, 0] if up is None else [0, 0, 1])
+    assert table.height > 0
+    for camera in turntable_cameras(table, 3, 64, 64, 40):
+        pixels = camera.project(means)
+        assert ((pixels > 0) & (pixels < 64)).all(axis=1).mean() > 0.7
+
+
+def test_faint_gaussians_do_not_move_the_turntable():
+    rng = np.random.default_rng(4)
+    solid, haze = rng.standard_normal((300, 3)), 50 + rng.standard_normal((300, 3))
+    gaussians = cloud(np.concatenate([solid, haze]), 3.0)
+    gaussians.opacity_logits[300:] = -6
+    assert np.linalg.norm(gaussian_turntable(gaussians).centre_world) < 0.5
+
+
+def test_a_single_gaussian_has_a_turntable():
+    table = gaussian_turntable(cloud(np.array([[1.0, 2.0, 3.0]]), 1.0))
+    np.testing.assert_allclose(table.centre_world, [1, 2, 3])
+    assert table.radius > 0
+
+
+def test_names_of_frames():
+    table = gaussian_turntable(cloud(np.eye(3), 1.0))
+    shots = camera_shots(turntable_cameras(table, 2, 8, 6))
+    assert [shot.name for shot in shots] == ["frame_0000", "frame_0001"]
+    assert shots[0].rays()[1].shape == (6, 8, 3)

@@ -1,0 +1,84 @@
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from workers.cli import cli
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY = (
+    "--preset", "fast", "--iterations", "60", "--rays", "256", "--max-gaussians", "600",
+    "--set", "initial_points=300", "--set", "probe_rays=256", "--set", "patch_side=16",
+    "--test-every", "4", "--threads", "2",
+)  # fmt: skip
+"""Settings of a run of a second."""
+
+Octasplat = Callable[..., Result]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run."""
+
+    scene: Path
+    output: Path
+    stdout: str
+
+    def metrics(self) -> dict:
+        return json.loads((self.output / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="session")
+def octasplat() -> Octasplat:
+    """Runs the command line in this process."""
+
+    def run(*arguments: object) -> Result:
+        return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def start_octasplat() -> Callable[..., subprocess.Popen[str]]:
+    """Starts the command line as a program."""
+
+    def start(*arguments: object) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-c", "from workers.cli import main; main()", *map(str, arguments)],
+            cwd=ROOT,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    return start
+
+
+@pytest.fixture(scope="session")
+def tiny() -> tuple[str, ...]:
+    return TINY
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("generated") / "scene"
+    write_generated_scene(
+        root, GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=400)
+    )
+    return root
+
+
+@pytest.fixture(scope="session")
+def run(scene: Path, octasplat: Octasplat, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    output = tmp_path_factory.mktemp("finished") / "run"
+    result = octasplat("reconstruct", scene, "-o", output, *TINY)
+    assert result.exit_code == 0, result.output
+    return Run(scene, output, result.stdout)

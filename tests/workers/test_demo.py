@@ -1,0 +1,56 @@
+"""``octasplat demo``, made tiny."""
+
+import webbrowser
+
+import pytest
+
+import workers.demo_jobs
+
+SIZE = ("--views", 4, "--width", 32, "--height", 24)
+
+
+@pytest.fixture
+def tiny_demo(monkeypatch):
+    settings = ("iterations=3", "rays=64", "initial_points=100", "probe_rays=256", "patch_side=16")
+    monkeypatch.setattr(workers.demo_jobs, "DEMO_ASSIGNMENTS", {"fast": settings})
+
+
+def test_scene_only(octasplat, tmp_path):
+    result = octasplat("demo", "-o", tmp_path / "still", "--scene-only", *SIZE)
+    assert result.exit_code == 0, result.output
+    assert len(list((tmp_path / "still" / "images").iterdir())) == 4
+    assert str(tmp_path / "still") in result.stdout
+
+
+def test_demo_is_made_once_and_names_its_report(octasplat, tmp_path, tiny_demo, monkeypatch):
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    first = octasplat("demo", "-o", tmp_path, *SIZE)
+    assert first.exit_code == 0, first.output
+    report = tmp_path / "result" / "report.html"
+    assert report.exists()
+    assert str(report) in first.stdout.splitlines()[-1]
+    assert opened == [], "opened without a terminal"
+
+    second = octasplat("demo", "-o", tmp_path, *SIZE, "--open")
+    assert second.exit_code == 0, second.output
+    assert second.stdout.splitlines() == first.stdout.splitlines()[-1:]
+    assert opened == [report.as_uri()]
+
+
+def test_demo_goes_on_by_itself(octasplat, tmp_path, tiny_demo):
+    assert octasplat("demo", "-o", tmp_path, *SIZE).exit_code == 0
+    for name in ("report.html", "mesh.glb"):
+        (tmp_path / "result" / name).unlink()
+    again = octasplat("demo", "-o", tmp_path, *SIZE)
+    assert again.exit_code == 0, again.output
+    assert "Training" not in again.stdout
+    assert (tmp_path / "result" / "mesh.glb").exists()
+
+
+def test_demo_with_other_settings_is_refused(octasplat, tmp_path, tiny_demo):
+    assert octasplat("demo", "-o", tmp_path, *SIZE).exit_code == 0
+    other_size = octasplat("demo", "-o", tmp_path, "--views", 5)
+    assert other_size.exit_code == 1 and other_size.stderr.count("\n") == 1
+    other_preset = octasplat("demo", "-o", tmp_path, *SIZE, "--preset", "standard")
+    assert other_preset.exit_code == 1 and "-o" in other_preset.stderr

@@ -1,0 +1,74 @@
+"""``octasplat export``."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from engine.gaussians.ply import read_gaussian_ply
+from engine.gaussians.ply_format import PlyWriteElement, write_ply
+
+
+def test_scene_to_glb(run, octasplat, tmp_path):
+    target = tmp_path / "scene.glb"
+    result = octasplat("export", run.output / "scene.ply", target)
+    assert result.exit_code == 0, result.output
+    assert str(target) in result.stdout
+    content = target.read_bytes()
+    length, kind = struct.unpack("<I4s", content[12:20])
+    assert (content[:4], kind) == (b"glTF", b"JSON")
+    assert json.loads(content[20 : 20 + length])["meshes"]
+
+
+def test_all_files_of_an_obj_are_named(run, octasplat, tmp_path):
+    result = octasplat("export", run.output / "scene.ply", tmp_path / "scene.obj", "--q", 4)
+    assert result.exit_code == 0, result.output
+    for path in tmp_path.iterdir():
+        assert str(path) in result.stdout
+
+
+def test_options_reach_a_gaussian_ply(run, octasplat, tmp_path):
+    target = tmp_path / "padded.ply"
+    result = octasplat("export", run.output / "scene.ply", target, "--sh-pad", 3, "--min-opacity", 0.1)
+    assert result.exit_code == 0, result.output
+    gaussians, _ = read_gaussian_ply(target)
+    assert gaussians.sh_degree == 3
+    assert gaussians.opacities.min() >= 0.1
+    assert "not flat" not in result.stderr
+
+
+@pytest.mark.parametrize(("thickness", "warns"), [(0.1, False), (0.9, True)])
+def test_what_flattening_loses_is_told(octasplat, tmp_path, thickness, warns):
+    source = tmp_path / "thick.ply"
+    write_thick_gaussians(source, thickness)
+    result = octasplat("export", source, tmp_path / "flat.ply")
+    assert result.exit_code == 0, result.output
+    assert "20 of 20 Gaussians were not flat" in result.stderr and f"{thickness:.2g}" in result.stderr
+    assert result.stderr.startswith("Warning: ") == warns
+
+
+def test_format_by_name(run, octasplat, tmp_path):
+    target = tmp_path / "mesh.data"
+    assert octasplat("export", run.output / "scene.ply", target).exit_code == 1
+    assert octasplat("export", run.output / "scene.ply", target, "--format", "glb").exit_code == 0
+    assert target.read_bytes()[:4] == b"glTF"
+
+
+def test_missing_and_wrong_input(octasplat, tmp_path):
+    (tmp_path / "text.ply").write_text("hello")
+    for name in ("none.ply", "text.ply"):
+        result = octasplat("export", tmp_path / name, tmp_path / "out.glb")
+        assert result.exit_code == 1
+        assert result.stderr.startswith("Error: ") and name in result.stderr
+        assert result.stderr.count("\n") == 1
+
+
+def write_thick_gaussians(path, thickness):
+    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{k}" for k in range(3))]
+    names += [f"rot_{k}" for k in range(4)]
+    rows = np.zeros(20, dtype=[(name, "<f4") for name in names])
+    rows["x"] = np.arange(20)
+    rows["scale_0"] = np.log(thickness)
+    rows["rot_0"] = 1
+    write_ply(path, [PlyWriteElement("vertex", len(rows), rows.dtype, iter([rows]))])

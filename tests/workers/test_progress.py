@@ -1,0 +1,120 @@
+"""What the displays show of the engine's events."""
+
+import io
+import re
+import time
+
+import pytest
+from rich.console import Console
+
+from engine.errors import Cancelled
+from engine.events import (
+    HeldOutMeasured,
+    StageFinished,
+    StageProgress,
+    StageStarted,
+    TrainingProgress,
+    Warned,
+)
+from workers.progress import Bars, PlainLines, stopping
+from workers.wording import clock, duration, rate
+
+TRAINING = TrainingProgress(
+    iteration=310, total_iterations=1500, loss=0.1, psnr=24.13, gaussians=32000, rays_per_second=310_400,
+    hits_per_ray=9.0, seconds=20.0, seconds_left=83.2,
+)  # fmt: skip
+HELD_OUT = HeldOutMeasured(iteration=250, psnr=23.04, gaussians=30000, seconds=17.0)
+
+
+def test_plain_lines_tell_the_state_of_the_training():
+    lines = []
+    show = PlainLines(lines.append, every_seconds=0.0)
+    for event in (StageStarted("train", 1500), HELD_OUT, TRAINING, StageFinished("train", 83.4)):
+        show(event)
+    assert lines == [
+        "Training",
+        "  310/1500: 24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s, 1:23 left",
+        "Trained 310 iterations in 1:23 min: 24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s",
+    ]
+
+
+def test_plain_lines_come_at_intervals():
+    lines = []
+    show = PlainLines(lines.append, every_seconds=0.2)
+    show(StageStarted("load", 100))
+    end = time.monotonic() + 0.5
+    while time.monotonic() < end:
+        show(StageProgress("load", 7, 100))
+    assert lines == ["Loading", "  7/100", "  7/100"]
+
+
+def test_warnings_go_to_stderr(capsys):
+    PlainLines(lambda _line: None)(Warned("The sky is green."))
+    assert capsys.readouterr().err == "Warning: The sky is green.\n"
+
+
+@pytest.fixture
+def terminal():
+    """A terminal of 80 columns and what was written to it."""
+    written = io.StringIO()
+    return Console(file=written, force_terminal=True, width=80, _environ={}), written
+
+
+def test_bar_fits_a_narrow_terminal_and_shows_everything(terminal):
+    console, written = terminal
+    display = Bars(console, lambda: False)
+    with display.bars:
+        for event in (StageStarted("train", 1500), HELD_OUT, TRAINING):
+            display(event)
+        display.bars.refresh()
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue())
+    assert "310/1500" in text and "1:23 left" in text
+    assert "24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s" in text
+    assert max(map(len, re.split(r"[\r\n]+", text))) <= 80
+
+
+def test_bar_leaves_one_line_a_stage_and_acknowledges_a_stop(terminal):
+    console, written = terminal
+    stop = []
+    display = Bars(console, lambda: bool(stop))
+    with display.bars:
+        for event in (StageStarted("load"), StageProgress("load", 4, 4), StageFinished("load", 0.25)):
+            display(event)
+        assert "Loaded 4 photographs in 0.2 s\n" in written.getvalue()
+        display(Warned("[red]The sky is green."))
+        assert "Warning: [red]The sky is green." in written.getvalue()
+        assert "Stopping" not in written.getvalue()
+        stop.append(1)
+        display.bars.refresh()
+    assert "Stopping" in written.getvalue()
+
+
+def test_work_outside_of_training_stops_at_its_next_step():
+    heard, stop = [], []
+    listen = stopping(heard.append, lambda: bool(stop))
+    listen(StageProgress("export", 1, 3))
+    stop.append(1)
+    listen(TRAINING)  # training writes a checkpoint and stops by itself
+    with pytest.raises(Cancelled, match="exporting"):
+        listen(StageProgress("export", 2, 3))
+    assert len(heard) == 3
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (clock(83.2), "1:23"),
+        (clock(3723), "1:02:03"),
+        (clock(-0.3), "0:00"),
+        (duration(0.84), "0.8 s"),
+        (duration(42.3), "42 s"),
+        (duration(59.7), "1:00 min"),
+        (duration(185), "3:05 min"),
+        (duration(3723), "1:02:03 h"),
+        (rate(870), "870"),
+        (rate(310_400), "310k"),
+        (rate(1_254_000), "1.25M"),
+    ],
+)
+def test_numbers_in_words(shown, expected):
+    assert shown == expected

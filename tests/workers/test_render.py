@@ -1,0 +1,129 @@
+"""``octasplat render``."""
+
+import json
+import subprocess
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from engine.render.images import read_channels, read_image
+
+SIZE = ("--width", 32, "--height", 24)
+
+
+def test_held_out_views_are_those_of_the_evaluation(run, octasplat, tmp_path):
+    result = octasplat("render", run.output, "-o", tmp_path / "new")
+    assert result.exit_code == 0, result.output
+    for old in (run.output / "renders").iterdir():
+        again = read_image(tmp_path / "new" / old.name)
+        assert np.abs(again - read_image(old)).max() <= 2 / 255, old.name
+
+
+@pytest.mark.parametrize(("which", "count"), [("held-out", 2), ("train", 6), ("all", 8)])
+def test_views_and_their_size(run, octasplat, tmp_path, which, count):
+    result = octasplat("render", run.output, "-o", tmp_path, "--views", which, "--max-side", 32)
+    assert result.exit_code == 0, result.output
+    files = list(tmp_path.glob("*.png"))
+    assert len(files) == count
+    assert read_image(files[0]).shape == (24, 32, 3)
+
+
+def test_views_of_a_run_whose_photographs_moved(run, octasplat, tmp_path):
+    moved = tmp_path / "moved"
+    moved.symlink_to(run.scene)
+    result = octasplat("render", run.output, "-o", tmp_path / "out", "--scene", moved, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert result.output == ""
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_turntable_as_video(run, octasplat, tmp_path, bare):
+    source = run.output / "scene.ply" if bare else run.output
+    video = tmp_path / "turn.mp4"
+    result = octasplat("render", source, "-o", video, "--turntable", "--frames", 4, *SIZE)
+    assert result.exit_code == 0, result.output
+    frames = decode(video, 32, 24)
+    assert len(frames) == 4
+    assert frames.std() > 1, "the images are empty"
+
+
+def test_seconds_and_fps_give_the_number_of_frames(run, octasplat, tmp_path):
+    result = octasplat(
+        "render", run.output / "scene.ply", "-o", tmp_path / "f%02d.png", "--seconds", 0.5, "--fps", 6,
+        "--up", "z", *SIZE,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["f00.png", "f01.png", "f02.png"]
+
+
+def test_exr_has_depth_and_normals(run, octasplat, tmp_path):
+    result = octasplat("render", run.output, "-o", tmp_path, "--turntable", "--frames", 1, "--exr", *SIZE)
+    assert result.exit_code == 0, result.output
+    layers = read_channels(tmp_path / "frame_0000.exr")
+    assert set(layers) == {"R", "G", "B", "A", "Z", "N.x", "N.y", "N.z"}
+    seen = layers["A"] > 0.5
+    assert seen.any()
+    assert (layers["Z"][seen] > 0).all()
+    length = np.sqrt(sum(layers[f"N.{axis}"] ** 2 for axis in "xyz"))
+    np.testing.assert_allclose(length[seen], 1, atol=1e-3)
+
+
+def test_background(run, octasplat, tmp_path):
+    up = np.eye(4)
+    up[:3, 3] = (0, 0, 50)  # above everything, looking up
+    path = write_path(tmp_path / "cameras.json", up)
+    for name, value in (("white", 1), ("black", 0)):
+        result = octasplat(
+            "render", run.output / "scene.ply", "-o", tmp_path / name, "--path", path, "--background", name
+        )
+        assert result.exit_code == 0, result.output
+        assert (read_image(tmp_path / name / "frame_0000.png") == value).all()
+
+
+def test_camera_path_as_video(run, octasplat, tmp_path):
+    path = write_path(tmp_path / "cameras.json", np.eye(4), frames=3)
+    result = octasplat("render", run.output, "-o", tmp_path / "fly.mp4", "--path", path)
+    assert result.exit_code == 0, result.output
+    assert len(decode(tmp_path / "fly.mp4", 32, 24)) == 3
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["-o", "turn.mp4", "--views", "all"],
+        ["-o", "turn.mp4", "--turntable", "--exr"],
+        ["-o", "one.png", "--turntable"],
+        ["-o", "some_%d.png", "--exr"],
+        ["-o", "out", "--turntable", "--views", "all"],
+        ["-o", "out", "--turntable", "--frames", "3", "--seconds", "3"],
+    ],
+)
+def test_contradictions_are_usage_errors(run, octasplat, arguments):
+    assert octasplat("render", run.output, *arguments).exit_code == 2
+
+
+def test_views_of_a_bare_ply_are_refused(run, octasplat, tmp_path):
+    result = octasplat("render", run.output / "scene.ply", "-o", tmp_path / "out", "--views", "all")
+    assert result.exit_code == 2
+
+
+@pytest.mark.parametrize("source", ["none.ply", "."])
+def test_what_is_no_scene(octasplat, tmp_path, source):
+    result = octasplat("render", tmp_path / source, "-o", tmp_path / "out")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("Error: ") and result.stderr.count("\n") == 1
+
+
+def write_path(path, pose, frames=1):
+    frame = {"camera_to_world": pose.tolist(), "fov_y_degrees": 40}
+    path.write_text(json.dumps({"width": 32, "height": 24, "frames": [frame] * frames}))
+    return path
+
+
+def decode(video, width, height):
+    """All frames of a video as bytes."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(video)]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run(command, capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
