@@ -46,7 +46,7 @@ class EmbreeTracer:
 
     Args:
         settings: where rays are cut off.
-        threads: threads for building and tracing; 0 takes numba's current number.
+        threads: threads for building and tracing; 0 takes all that numba has.
         box_padding: fraction by which boxes are enlarged, so that parameters may change between builds.
         build_quality: Embree's: 0 low, 1 medium, 2 high.
     """
@@ -60,7 +60,7 @@ class EmbreeTracer:
         build_quality: int = 1,
     ) -> None:
         self.settings = settings or TraceSettings()
-        self.threads = threads or numba.get_num_threads()
+        self.threads = threads or numba.config.NUMBA_NUM_THREADS
         self._padding = box_padding
         self._quality = build_quality
         self._device = Device(self.threads)

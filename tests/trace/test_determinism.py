@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from trace_scenes import (
@@ -162,3 +163,10 @@ def test_rebuilding_with_another_count(rng: np.random.Generator) -> None:
     for cloud in (large, small, large):
         tracer.build(cloud)
         same_bits(tracer.trace(*rays), make_tracer(cloud).trace(*rays))
+
+
+def test_a_tracer_of_one_thread_does_not_hold_back_the_next(rng: np.random.Generator) -> None:
+    cloud, rays = make_cloud(rng, 20), rays_inwards(rng, 5)
+    everything = make_tracer(cloud).threads
+    make_tracer(cloud, threads=1).trace(*rays)
+    assert make_tracer(cloud).threads == everything == numba.config.NUMBA_NUM_THREADS
