@@ -17,7 +17,7 @@ from workers.commands.evaluate import evaluate
 from workers.commands.export import export
 from workers.commands.reconstruct import reconstruct
 from workers.commands.render import render
-from workers.signals import Stopped, orderly_termination
+from workers.signals import Stopped
 
 DEBUG = "OCTASPLAT_DEBUG"
 EXIT_UNEXPECTED = 70
@@ -30,8 +30,7 @@ class _Commands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the chosen command."""
         try:
-            with orderly_termination():
-                return super().invoke(ctx)
+            return super().invoke(ctx)
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except Stopped as error:

@@ -10,6 +10,7 @@ from engine.pipeline import CONFIG
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from workers.jobs import run_reconstruction
 from workers.progress import show_progress, staged
+from workers.signals import orderly_termination
 
 DEMO_ASSIGNMENTS: dict[str, tuple[str, ...]] = {"fast": ()}
 """Training settings by preset, chosen so that the demo takes less than three minutes on two cores."""
@@ -31,7 +32,11 @@ def make_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) -> No
     if (root / "generated.json").exists():
         write_generated_scene(root, config)  # only makes sure that it is the same
         return
-    with show_progress(quiet=quiet) as listener, staged("generate", listener, config.views) as progress:
+    with (
+        orderly_termination(),
+        show_progress(quiet=quiet) as listener,
+        staged("generate", listener, config.views) as progress,
+    ):
         write_generated_scene(root, config, progress)
 
 

@@ -40,7 +40,8 @@ class StopFlag:
 def stop_on_signals() -> Iterator[StopFlag]:
     """Inside the block, a first SIGINT or SIGTERM only sets the flag; a second one kills at once.
 
-    Outside of the main thread, where Python allows no handlers, the flag just stays unset.
+    To be entered after all imports, as :func:`orderly_termination`. Outside of the main thread,
+    where Python allows no handlers, the flag just stays unset.
     """
     flag = StopFlag()
     if threading.current_thread() is not threading.main_thread():
@@ -66,7 +67,10 @@ def stop_on_signals() -> Iterator[StopFlag]:
 
 @contextmanager
 def orderly_termination() -> Iterator[None]:
-    """Inside the block, SIGTERM unwinds the program (exit code 143), so that unfinished files are removed."""
+    """Inside the block, SIGTERM unwinds the program (exit code 143), so that unfinished files are removed.
+
+    To be entered after all imports: pycolmap takes SIGTERM for itself, to print a stack trace.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

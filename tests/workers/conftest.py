@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TINY = (
     "--preset", "fast", "--iterations", "60", "--rays", "256", "--max-gaussians", "600",
     "--set", "initial_points=300", "--set", "probe_rays=256", "--set", "patch_side=16",
-    "--test-every", "4", "--threads", "2",
+    "--test-every", "4", "--threads", "1",
 )  # fmt: skip
 """Settings of a run of a second."""
 

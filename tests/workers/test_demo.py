@@ -1,5 +1,7 @@
 """``octasplat demo``, made tiny."""
 
+import signal
+import time
 import webbrowser
 
 import pytest
@@ -20,6 +22,20 @@ def test_scene_only(octasplat, tmp_path):
     assert result.exit_code == 0, result.output
     assert len(list((tmp_path / "still" / "images").iterdir())) == 4
     assert str(tmp_path / "still") in result.stdout
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_leaves_no_half_of_a_scene(start_octasplat, tmp_path, number, code):
+    process = start_octasplat("demo", "-o", tmp_path / "still", "--scene-only", "--views", 500)
+    deadline = time.monotonic() + 60
+    while not any(path.name.endswith(".partial") for path in tmp_path.iterdir()):
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == code, stderr
+    assert len(stderr.splitlines()) <= 1, stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_demo_is_made_once_and_names_its_report(octasplat, tmp_path, tiny_demo, monkeypatch):

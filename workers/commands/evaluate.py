@@ -19,9 +19,10 @@ def evaluate(output: Path, scene: Path | None, threads: int, quiet: bool) -> Non
     from engine import pipeline
     from engine.config import read_config
     from workers.progress import show_progress
+    from workers.signals import orderly_termination
     from workers.wording import run_summary
 
-    with show_progress(quiet=quiet) as listener:
+    with orderly_termination(), show_progress(quiet=quiet) as listener:
         pipeline.evaluate(output, scene=scene, threads=threads, listener=listener)
     if not quiet:
         for line in run_summary(output, read_config(output / pipeline.CONFIG).exports):

@@ -46,12 +46,15 @@ def export(
     from engine.export.registry import export_scene, exporter_for
     from engine.gaussians.octagon import CHI2_2_99
     from engine.gaussians.ply import read_gaussian_ply
+    from workers.signals import orderly_termination
 
     exporter = exporter_for(target, format_name)  # complain before the long work
     gaussians, report = read_gaussian_ply(source)
     _tell_of_losses(source, report)
     options = ExportOptions(q=CHI2_2_99 if q is None else q, min_opacity=min_opacity, sh_pad_degree=sh_pad)
-    for path in export_scene(gaussians, target, options, exporter.name):
+    with orderly_termination():
+        files = export_scene(gaussians, target, options, exporter.name)
+    for path in files:
         click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")
 
 

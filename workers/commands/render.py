@@ -64,8 +64,10 @@ def render(**options: Any) -> None:
     _check_output(options["output"], options["exr"])
 
     from workers.render_jobs import run_render
+    from workers.signals import orderly_termination
 
-    run_render(mode, options)
+    with orderly_termination():
+        run_render(mode, options)
 
 
 def _check_output(output: Path, exr: bool) -> None:
