@@ -22,7 +22,7 @@ class ReconstructionConfig(BaseModel):
         max_side: cap on the longer side of the photographs, px; None keeps their size.
         test_every: every how-manieth view by name is held out; 0 holds out none.
         held_out: names of the views to hold out instead.
-        masks: ``ignore`` leaves masked pixels out of the loss, ``alpha`` takes the mask as the object's alpha.
+        masks: ``ignore`` leaves masked pixels out of the loss, ``alpha`` takes the mask as the alpha.
         evaluate_background: what lies behind renders and photographs with alpha when they are compared.
         exports: files to write besides ``scene.ply``; their names say the format.
         train: the training, fully resolved.

@@ -25,6 +25,10 @@ class CheckpointError(OctasplatError):
     """A checkpoint is missing, damaged or belongs to another configuration."""
 
 
+class DamagedCheckpoint(CheckpointError):
+    """A checkpoint file cannot be read; the one before it may be sound."""
+
+
 class TrainingFailure(OctasplatError):
     """Training collapsed (not-a-number, an empty scene, a scene that covers nothing); nothing is exported."""
 

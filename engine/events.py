@@ -128,6 +128,8 @@ class JsonLinesListener:
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file: IO[str] = path.open("a", encoding="utf-8")
+        if self._file.tell() and not path.read_bytes().endswith(b"\n"):
+            self._file.write("\n")  # a kill cut the last line short; the next event begins a new one
 
     def __call__(self, event: Event) -> None:
         """Write ``event`` and flush, so that a reader beside the run sees whole lines."""

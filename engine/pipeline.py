@@ -18,7 +18,7 @@ import numpy as np
 
 import engine
 from engine.config import ReconstructionConfig, read_config
-from engine.errors import CheckpointError, ConfigError, OutputError
+from engine.errors import ConfigError, DamagedCheckpoint, DatasetError, OutputError
 from engine.evaluate.held_out import evaluate_held_out
 from engine.events import (
     JsonLinesListener,
@@ -81,12 +81,18 @@ def reconstruct(
         Cancelled: stopped as asked.
     """
     began = time.perf_counter()
-    _claim_output(scene, output, config, resume)
+    is_new = _claim_output(scene, output, config, resume)
     events = JsonLinesListener(output / EVENTS)
     tell = broadcast([events, listener])
     try:
         with _stage("load", tell):
-            dataset = _open_dataset(scene, output, config, threads, tell)
+            try:
+                dataset = _open_dataset(scene, output, config, threads, tell)
+            except DatasetError:
+                if is_new:  # so that the corrected command finds the folder free
+                    (output / CONFIG).unlink()
+                    (output / EVENTS).unlink()
+                raise
             write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
         if not (output / SCENE).exists():
             with _stage("train", tell, config.train.iterations):
@@ -169,8 +175,12 @@ def _stage(name: str, tell: Listener, steps: int = 0) -> Iterator[None]:
     tell(StageFinished(name, time.perf_counter() - began))
 
 
-def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> None:
-    """Create the folder and its ``config.json``, or make sure that it is the run to go on with."""
+def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
+    """Create the folder and its ``config.json``, or make sure that it is the run to go on with.
+
+    Returns:
+        Whether the run is new.
+    """
     content = {
         "scene": str(scene.resolve()),
         "reconstruction": config.model_dump(mode="json"),
@@ -188,16 +198,21 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
                 f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
                 "or name another folder."
             )
-        return
-    if output.is_dir() and any(output.iterdir()):
+        if run_scene(output) != scene.resolve():  # the photographs have moved
+            write_json(output / CONFIG, content)
+        return False
+    if output.is_dir() and any(not path.name.startswith(".") for path in output.iterdir()):
         raise OutputError(f"{output} is not empty and holds no run; name an empty or a new folder.")
     try:
         output.mkdir(parents=True, exist_ok=True)
+        for left in output.glob(".*.partial.*"):  # by a run that was killed while it wrote
+            left.unlink()
         write_json(output / CONFIG, content)
     except OSError as error:
         raise OutputError(
             f"{output} cannot be written to ({error.strerror or error}); name another folder."
         ) from None
+    return True
 
 
 def _open_dataset(
@@ -256,9 +271,7 @@ def _resume(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None
     while (path := latest_checkpoint(folder)) is not None:
         try:
             return load_checkpoint(path, fingerprint)
-        except CheckpointError as error:
-            if "damaged" not in str(error):
-                raise
+        except DamagedCheckpoint as error:
             tell(Warned(str(error)))
             path.unlink()
     return None

@@ -245,10 +245,7 @@ def test_resume_refuses_what_is_not_the_same_run(scene: Path, whole_run: Path, t
     "folder",
     [
         "plain",
-        pytest.param(
-            "damaged",
-            marks=pytest.mark.xfail(reason="the pipeline looks for the word in the message, path included"),
-        ),
+        "damaged",
     ],
 )
 def test_checkpoints_of_other_photographs_are_refused_and_kept(

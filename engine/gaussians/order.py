@@ -7,7 +7,7 @@ _BITS = 21
 
 
 def morton_codes(points: Float[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
-    """63-bit Z-order codes of points within the box of their central 98 %; points outside are clamped to it."""
+    """63-bit Z-order codes of points in the box of their central 98 %; points outside are clamped to it."""
     if len(points) == 0:
         return np.zeros(0, np.uint64)
     low, high = np.quantile(points, [0.01, 0.99], axis=0)

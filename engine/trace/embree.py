@@ -165,11 +165,11 @@ class EmbreeTracer:
         g_rgb = _contiguous(g.rgb_srgb)
         g_normal = _or_zeros(g.normal_world, (rays, 3))
         g_feature = _or_zeros(g.features, (rays, self._features.shape[1]))
+        ray_errors = _or_zeros(g.ray_errors, (rays,))
         alpha_max = self.settings.alpha_max
         replay_rays(
             hits.directions_world, self._records, self._features, hits.starts, hits.counts, offsets,
             hits.ids, hits.alphas, hits.distances, hits.rgb_srgb, alpha_max,
-            result.rgb_srgb, result.transmittance, result.depth_sum, result.normal_world, result.features,
             g_rgb, _or_zeros(g.transmittance, (rays,)), _or_zeros(g.depth_sum, (rays,)),
             _or_zeros(g.depth_median, (rays,)), g_normal, g_feature, with_geometry,
             keys, flags, weights, h_alpha, g_t,
@@ -192,9 +192,10 @@ class EmbreeTracer:
             hit_counts=np.empty(segments, np.int32),
         )
         gather_gaussians(
-            hits.origins_world, hits.directions_world, self._records, gaussians.quats_wxyz,
+            hits.origins_world, hits.directions_world, self._records,
+            gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales,
             order, sorted_keys, starts, bounds, self.threads, np.zeros(1, np.int64),
-            flags, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, _or_zeros(g.ray_errors, (rays,)), with_geometry,
+            flags, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, ray_errors, with_geometry,
             out.ids, out.means_world, out.quats_wxyz, out.log_scales, out.opacity_logits, out.sh,
             out.features, out.weight_sums, out.error_sums, out.hit_counts,
         )  # fmt: skip

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_hit import AXIS_U, AXIS_V, MEAN, NORMAL, OPACITY
+from engine.trace.kernels_hit import NORMAL, OPACITY
 from engine.trace.kernels_native import next_from_counter
 from engine.trace.kernels_records import rotation_columns
 from engine.trace.kernels_sh import write_basis
@@ -23,7 +23,6 @@ RAY_BITS = (1 << 28) - 1
 @njit(cache=True, parallel=True, fastmath={"contract"})
 def replay_rays(
     directions, records, features, starts, counts, offsets, ids, alphas, ts, hit_rgb, alpha_max,
-    rgb, transmittance, depth_sum, normal_sum, feature_sum,
     g_rgb, g_transmittance, g_depth, g_median, g_normal, g_feature, with_geometry,
     keys, rays, weights, h_alpha, g_t,
 ):  # fmt: skip
@@ -34,40 +33,43 @@ def replay_rays(
     feature_count = features.shape[1]
     for r in prange(len(counts)):
         t = 1.0
+        median = -1
+        for k in range(counts[r]):
+            alpha = np.float64(alphas[starts[r] + k])
+            weights[offsets[r] + k] = alpha * t
+            if t > 0.5 and t * (1.0 - alpha) <= 0.5:
+                median = k
+            t *= 1.0 - alpha
         g0, g1, g2 = np.float64(g_rgb[r, 0]), np.float64(g_rgb[r, 1]), np.float64(g_rgb[r, 2])
-        # What lies behind the current hit, as seen through the gradient: <g, C - prefix>, all channels at once.
-        behind = g0 * rgb[r, 0] + g1 * rgb[r, 1] + g2 * rgb[r, 2]
         gn0 = gn1 = gn2 = gd = gm = 0.0
         dx, dy, dz = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
         if with_geometry:
             gd, gm = np.float64(g_depth[r]), np.float64(g_median[r])
             gn0, gn1, gn2 = np.float64(g_normal[r, 0]), np.float64(g_normal[r, 1]), np.float64(g_normal[r, 2])
-            behind += gd * depth_sum[r]
-            behind += gn0 * normal_sum[r, 0] + gn1 * normal_sum[r, 1] + gn2 * normal_sum[r, 2]
-        for f in range(feature_count):
-            behind += np.float64(g_feature[r, f]) * feature_sum[r, f]
-        g_end = np.float64(g_transmittance[r]) * transmittance[r]
-        for k in range(counts[r]):
+        # What lies behind the current hit, as the gradient sees it: <g, C - prefix> over all channels. It is
+        # summed from the back in float64: as a difference of sums it would drown behind opaque surfaces.
+        behind = np.float64(g_transmittance[r]) * t
+        for k in range(counts[r] - 1, -1, -1):
             e = starts[r] + k
             out = offsets[r] + k
             i = ids[e]
             alpha = np.float64(alphas[e])
-            weight = alpha * t
+            weight = np.float64(weights[out])
             value = g0 * hit_rgb[e, 0] + g1 * hit_rgb[e, 1] + g2 * hit_rgb[e, 2]
             gt = 0.0
+            through = weight / alpha
             if with_geometry:
                 value += gd * ts[e]
                 gt = gd * weight
                 n0, n1, n2 = records[i, NORMAL], records[i, NORMAL + 1], records[i, NORMAL + 2]
                 along = gn0 * n0 + gn1 * n1 + gn2 * n2
                 value += -along if dx * n0 + dy * n1 + dz * n2 > 0.0 else along
-                if t > 0.5 and t * (1.0 - alpha) <= 0.5:
+                if k == median:
                     gt += gm
             for f in range(feature_count):
                 value += np.float64(g_feature[r, f]) * features[i, f]
-            behind -= weight * value
-            g_alpha = t * value - (behind + g_end) / (1.0 - alpha)
-            clamped = alphas[e] >= np.float32(alpha_max)
+            g_alpha = through * value - behind / (1.0 - alpha)
+            behind += weight * value
             keys[out] = i
             flags = np.int64(r)
             if hit_rgb[e, 0] <= 0.0:
@@ -77,16 +79,14 @@ def replay_rays(
             if hit_rgb[e, 2] <= 0.0:
                 flags |= BLUE_OFF
             rays[out] = flags
-            weights[out] = weight
-            h_alpha[out] = 0.0 if clamped else g_alpha * alpha
+            h_alpha[out] = 0.0 if alphas[e] >= np.float32(alpha_max) else g_alpha * alpha
             g_t[out] = gt
-            t *= 1.0 - alpha
 
 
 @njit(fastmath={"contract"})
 def gather_chunk(
     first, last, basis, sh_sum, feature_sum,
-    origins, directions, records, quats, order, sorted_keys, starts,
+    origins, directions, records, means, quats, log_scales, order, sorted_keys, starts,
     rays, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, ray_errors, with_geometry,
     out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features,
     out_weights, out_errors, out_counts,
@@ -101,23 +101,17 @@ def gather_chunk(
     feature_count = out_features.shape[1]
     for segment in range(first, last):
         i = sorted_keys[starts[segment]]
-        record = records[i]
-        m0, m1, m2 = np.float64(record[MEAN]), np.float64(record[MEAN + 1]), np.float64(record[MEAN + 2])
-        n0, n1, n2 = (
-            np.float64(record[NORMAL]),
-            np.float64(record[NORMAL + 1]),
-            np.float64(record[NORMAL + 2]),
-        )
-        a0, a1, a2 = (
-            np.float64(record[AXIS_U]),
-            np.float64(record[AXIS_U + 1]),
-            np.float64(record[AXIS_U + 2]),
-        )
-        b0, b1, b2 = (
-            np.float64(record[AXIS_V]),
-            np.float64(record[AXIS_V + 1]),
-            np.float64(record[AXIS_V + 2]),
-        )
+        # The frame in float64 from the raw parameters: the record's float32 axes would cost needles digits.
+        q0, q1, q2, q3 = (
+            np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+        )  # fmt: skip
+        r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
+        s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+        inv_s2, inv_s3 = 1.0 / s2, 1.0 / s3
+        m0, m1, m2 = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        n0, n1, n2 = r1
+        a0, a1, a2 = r2[0] * inv_s2, r2[1] * inv_s2, r2[2] * inv_s2
+        b0, b1, b2 = r3[0] * inv_s3, r3[1] * inv_s3, r3[2] * inv_s3
         s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = 0.0
         s_tau = s_tau_u = s_tau_v = 0.0
         s_n0 = s_n1 = s_n2 = s_w = s_error = 0.0
@@ -175,13 +169,6 @@ def gather_chunk(
                 s_n2 += facing * g_normal[r, 2]
             for f in range(feature_count):
                 feature_sum[f] += w * g_feature[r, f]
-        q0, q1, q2, q3 = (
-            np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
-        )  # fmt: skip
-        r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
-        # record axes are r/s, so 1/s is their length
-        inv_s2, inv_s3 = math.sqrt(a0 * a0 + a1 * a1 + a2 * a2), math.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
-        s2, s3 = 1.0 / inv_s2, 1.0 / inv_s3
         # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(s_tau_u s2 r2 + s_tau_v s3 r3) + normal channel
         on_r3, on_r2 = -s_tau_u * s2, s_tau_v * s3
         on_r1 = -s_huv * s3 * inv_s2 + s_huv * s2 * inv_s3
@@ -198,7 +185,7 @@ def gather_chunk(
             out_means[segment, axis] = s_hu * inv_s2 * r2[axis] + s_hv * inv_s3 * r3[axis] + s_tau * r1[axis]
         out_log_scales[segment, 0] = s_huu
         out_log_scales[segment, 1] = s_hvv
-        out_logits[segment] = s_h * (1.0 - np.float64(record[OPACITY]))
+        out_logits[segment] = s_h * (1.0 - np.float64(records[i, OPACITY]))
         for j in range(basis_count):
             for channel in range(3):
                 # degree 0 skips the basis in the loop above
@@ -215,7 +202,8 @@ def gather_chunk(
 
 @njit(cache=True, parallel=True, fastmath={"contract"})
 def gather_gaussians(
-    origins, directions, records, quats, order, sorted_keys, starts, chunk_bounds, workers, counter,
+    origins, directions, records, means, quats, log_scales,
+    order, sorted_keys, starts, chunk_bounds, workers, counter,
     rays, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, ray_errors, with_geometry,
     out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features,
     out_weights, out_errors, out_counts,
@@ -232,7 +220,7 @@ def gather_gaussians(
                 break
             gather_chunk(
                 chunk_bounds[chunk], chunk_bounds[chunk + 1], basis, sh_sum, feature_sum,
-                origins, directions, records, quats, order, sorted_keys, starts,
+                origins, directions, records, means, quats, log_scales, order, sorted_keys, starts,
                 rays, weights, h_alpha, g_t, g_rgb, g_normal, g_feature, ray_errors, with_geometry,
                 out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features,
                 out_weights, out_errors, out_counts,

@@ -32,7 +32,7 @@ class TraceSettings(BaseModel):
     second_phase_min: float | None = Field(None, gt=0, lt=1)
     t_min: float = Field(0.0, ge=0)
     max_hits: int = Field(512, ge=1, le=4096)
-    alpha_max: float = Field(0.999, gt=0, lt=1)
+    alpha_max: float = Field(0.999, gt=0, le=0.9999)
 
 
 @dataclass

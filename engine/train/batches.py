@@ -66,7 +66,7 @@ class PixelSampler:
     def pixels(
         self, rng: np.random.Generator, count: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-        """``count`` pixels as (view, y, x), with repetition, sorted by view and row so that neighbours meet."""
+        """``count`` pixels as (view, y, x), repeated ones too, sorted by view and row."""
         flat = np.sort(rng.integers(0, self.pixel_count, count))
         which = np.searchsorted(self._ends, flat, side="right")
         width, height = self._sizes[which].T
@@ -76,7 +76,7 @@ class PixelSampler:
     def patches(
         self, rng: np.random.Generator, count: int, side: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-        """``count`` patches of ``side`` x ``side`` pixels as (view, y, x), row-major, wholly inside the views."""
+        """``count`` patches of ``side`` x ``side`` pixels as (view, y, x), row-major, inside the views."""
         areas = np.diff(self._ends, prepend=0)
         which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
         width, height = self._sizes[which].T
@@ -99,7 +99,7 @@ def draw_batch(
     patch_fraction: float,
     side: int,
 ) -> Batch:
-    """``rays`` rays, of which about ``patch_fraction`` come as whole patches (none where a view is too small)."""
+    """``rays`` rays, of which about ``patch_fraction`` come as patches (none where a view is too small)."""
     patches = min(round(rays * patch_fraction / side**2), rays // side**2)
     if sampler.smallest_side_px < side:
         patches = 0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.errors import CheckpointError
+from engine.errors import CheckpointError, DamagedCheckpoint
 from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
 from engine.train.optimiser import Adam
@@ -97,7 +97,8 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
     """Read a checkpoint back.
 
     Raises:
-        CheckpointError: the file is damaged, or belongs to another configuration or other photographs.
+        DamagedCheckpoint: the file cannot be read.
+        CheckpointError: it belongs to another configuration or other photographs.
     """
     try:
         arrays = _read_arrays(path)
@@ -109,7 +110,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
             group, _, key = name.partition(".")
             groups[group][key] = array
     except _DAMAGE as error:
-        raise CheckpointError(
+        raise DamagedCheckpoint(
             f"{path} is damaged ({error}); delete it to go on from the one before it."
         ) from None
     if meta.get("format") != FORMAT or meta["fingerprint"] != fingerprint:

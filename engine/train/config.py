@@ -59,7 +59,6 @@ class McmcConfig(_Frozen):
     error_power: float = Field(
         0.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it"
     )
-    noise: float = Field(0.0, ge=0, description="SGLD noise on the means of faint Gaussians, 0 is off")
 
 
 class PaperConfig(_Frozen):

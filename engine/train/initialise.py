@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
+from engine.errors import DatasetError
 from engine.gaussians.frames import frames_from_normals, quaternions
 from engine.gaussians.model import SH_C0, FlatGaussians
 
@@ -37,15 +38,15 @@ def from_points(
     points = xyz_world[keep].astype(np.float64)
     count = len(points)
     if count == 0:
-        raise ValueError("no usable points")
+        raise DatasetError(
+            "No point of the sparse model lies near the cameras; check the model, or delete its points."
+        )
     tree = cKDTree(points)
     wanted = min(count, PLANE_NEIGHBOURS + 1)
     distances, neighbours = tree.query(points, wanted)
     distances, neighbours = distances.reshape(count, wanted), neighbours.reshape(count, wanted)
-    if wanted > 1:
-        spacing = distances[:, 1 : NEIGHBOURS + 1].mean(axis=1)
-    else:
-        spacing = np.full(count, 0.01 * extent)
+    nearest = distances[:, 1 : NEIGHBOURS + 1] if wanted > 1 else np.full((count, 1), 0.01 * extent)
+    spacing = nearest.mean(axis=1)
     spacing = np.clip(
         spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distance(points, centre) / extent)
     )
@@ -69,6 +70,8 @@ def from_rays(
     rng: np.random.Generator,
 ) -> FlatGaussians:
     """Random flat Gaussians in the cameras' frustums: one on each ray, log-uniform in depth, facing it."""
+    if len(origins_world) == 0:
+        raise DatasetError("The masks or the alpha leave no pixel to begin from; check masks/ and --masks.")
     depths = extent * np.exp(rng.uniform(np.log(0.3), np.log(5.0), len(origins_world)))
     points = origins_world.astype(np.float64) + depths[:, None] * directions_world
     distances = cKDTree(points).query(points, min(len(points), NEIGHBOURS + 1))[0].reshape(len(points), -1)

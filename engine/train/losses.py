@@ -40,12 +40,12 @@ def ssim_loss(
     b1, b2 = mu_x * mu_x + mu_y * mu_y + np.float32(C1), var_x + var_y + np.float32(C2)
     ssim = a1 * a2 / (b1 * b2)
     edge = WINDOW // 2
-    inner = np.zeros(x.shape[:3] + (1,), np.float32)
+    inner = np.zeros((*x.shape[:3], 1), np.float32)
     inner[:, edge:-edge, edge:-edge] = 1.0
     count = float(inner.sum()) * x.shape[-1]
     loss = 1.0 - float((ssim * inner).sum(dtype=np.float64)) / count
     weight = -inner / np.float32(count)
-    # Through the mean, the variance of x and the covariance; the window is symmetric, so it is its own adjoint.
+    # Through the mean, the variance of x and the covariance; a symmetric window is its own adjoint.
     d_var = weight * -ssim / b2
     d_cov = weight * 2 * a1 / (b1 * b2)
     d_mu = weight * (2 * mu_y * a2 / (b1 * b2) - ssim * 2 * mu_x / b1)

@@ -89,10 +89,13 @@ class Adam:
         colour = rates.colour / SH_C0 * decay
         adam_step(
             gradients.ids, self.steps, self.first, self.second,
-            gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh,
-            gradients.means_world, gradients.quats_wxyz, gradients.log_scales, gradients.opacity_logits, gradients.sh,
+            gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales,
+            gaussians.opacity_logits, gaussians.sh,
+            gradients.means_world, gradients.quats_wxyz, gradients.log_scales,
+            gradients.opacity_logits, gradients.sh,
             extent * rates.mean * (rates.mean_final / rates.mean) ** progress,
-            rates.quat * decay, rates.log_scale * decay, rates.opacity * decay, colour, colour * rates.sh_rest_ratio,
+            rates.quat * decay, rates.log_scale * decay, rates.opacity * decay,
+            colour, colour * rates.sh_rest_ratio,
             loss.opacity / hit, loss.scale / (2 * hit * extent),
             float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
             BETA1, BETA2, EPSILON, moved,

@@ -131,14 +131,19 @@ class Trainer:
                 self._tracer.build(state.gaussians)
                 rebuild = False
                 stop = self._should_stop() and state.iteration < total
-                if stop or state.iteration % self._every == 0 or state.iteration == total:
+                scheduled = state.iteration % self._every == 0 or state.iteration == total
+                if stop or scheduled:
                     state.seconds += time.perf_counter() - began
                     if state.iteration > started_at or state.iteration == 0:
-                        self._measure_and_save()
+                        # Probes only where an uninterrupted run has them, so that the best is the same one.
+                        if scheduled:
+                            self._measure_state()
+                        self._save()
                     began = time.perf_counter()
                 if stop:
                     raise Cancelled(
-                        f"Stopped after iteration {state.iteration} of {total}; the same command with --resume goes on."
+                        f"Stopped after iteration {state.iteration} of {total}; "
+                        "the same command with --resume goes on."
                     )
                 if state.iteration == total:
                     break
@@ -255,7 +260,8 @@ class Trainer:
         psnr = float(np.mean([_psnr(value) for value in sums[used] / counts[used]])) if used.any() else 0.0
         return psnr, float(seen.alpha.mean())
 
-    def _measure_and_save(self) -> None:
+    def _measure_state(self) -> None:
+        """Refuse a broken state, keep the best one, and tell of the held-out views."""
         state = self.state
         if not state.gaussians.is_finite():
             raise TrainingFailure(
@@ -265,8 +271,8 @@ class Trainer:
         psnr, alpha = self._measure(self._probe)
         if alpha < EMPTY_ALPHA and state.iteration > 0:
             raise TrainingFailure(
-                f"After iteration {state.iteration} the scene covers only {100 * alpha:.2f} % of the photographs; "
-                "nothing is exported. Check that poses and photographs belong together."
+                f"After iteration {state.iteration} the scene covers only {100 * alpha:.2f} % of the "
+                "photographs; nothing is exported. Check that poses and photographs belong together."
             )
         if psnr > state.best_psnr:
             state.best_psnr, state.best_iteration = psnr, state.iteration
@@ -274,16 +280,18 @@ class Trainer:
         if self._held_out is not None:
             held_out, _ = self._measure(self._held_out)
             self._tell(HeldOutMeasured(state.iteration, held_out, len(state.gaussians), state.seconds))
+
+    def _save(self) -> None:
+        state = self.state
         state.densifier = self._densifier.state()
         path = save_checkpoint(state, self._folder, self._fingerprint)
         self._tell(CheckpointWritten(state.iteration, str(path)))
-        self._last_psnr = psnr
 
     def _check_not_empty(self) -> None:
         if len(self.state.gaussians) == 0:
             raise TrainingFailure(
-                f"Densification removed every Gaussian at iteration {self.state.iteration}; nothing is exported. "
-                "Lower the pruning thresholds (--set densify.prune_opacity=...)."
+                f"Densification removed every Gaussian at iteration {self.state.iteration}; "
+                "nothing is exported. Lower the pruning thresholds (--set densify.prune_opacity=...)."
             )
 
     def _choose_result(self) -> FlatGaussians:

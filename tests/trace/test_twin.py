@@ -53,7 +53,7 @@ def test_quaternions_of_any_length(rng: np.random.Generator) -> None:
     assert np.abs(along).max() < 1e-5 * np.abs(found["quats_wxyz"] * length).max()
 
 
-@pytest.mark.parametrize(("stretch", "gradient_tolerance"), [(0.7, 1e-3), (2.0, 3e-2)])
+@pytest.mark.parametrize(("stretch", "gradient_tolerance"), [(0.7, 1e-3), (2.0, 1e-3)])
 def test_needles(rng: np.random.Generator, stretch: float, gradient_tolerance: float) -> None:
     # Axes are kept in 24 bits: an error along the needle's length is one of many of its widths.
     cloud = make_cloud(rng, 1000)
@@ -84,7 +84,7 @@ def test_extremely_grazing_rays_hit_the_same(rng: np.random.Generator) -> None:
     # The record's normal has 24 bits, so that precision falls with the cosine: 6e-8 / 1e-5 at the worst.
     cloud = make_cloud(rng, 1000, size=0.1)
     rays = grazing_rays(rng, cloud, 250, (1e-5, 1e-2))
-    assert_like_twin(cloud, *rays, value_tolerance=1e-3, gradient_tolerance=3e-2)
+    assert_like_twin(cloud, *rays, value_tolerance=2e-5, gradient_tolerance=1e-3)
 
 
 def test_ray_inside_a_plane_does_not_hit_it() -> None:

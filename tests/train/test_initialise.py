@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from engine.errors import DatasetError
 from engine.train.initialise import from_points, from_rays
 
 CAMERAS = np.array([[0.0, 0.0, -3.0], [1.0, 0.0, -3.0], [0.0, 1.0, -3.0]])
@@ -79,7 +80,7 @@ def test_a_point_at_the_cameras() -> None:
 
 
 def test_no_usable_points() -> None:
-    with pytest.raises(ValueError, match="no usable points"):
+    with pytest.raises(DatasetError, match="lies near the cameras"):
         start(np.full((5, 3), np.nan))
 
 

@@ -9,7 +9,7 @@ __all__ = ["Densifier", "Mcmc", "Paper", "make_densifier"]
 
 
 def make_densifier(config: McmcConfig | PaperConfig, *, iterations: int, max_gaussians: int) -> Densifier:
-    """The strategy that ``config`` describes, for a run of so many iterations and at most so many Gaussians."""
+    """The strategy that ``config`` describes, for so many iterations and at most so many Gaussians."""
     if isinstance(config, McmcConfig):
         return Mcmc(config, iterations=iterations, max_gaussians=max_gaussians)
     return Paper(config, iterations=iterations, max_gaussians=max_gaussians)

@@ -46,7 +46,7 @@ class Mcmc:
     A chosen Gaussian and its copies share its opacity and shrink; copies are scattered inside it. The count
     grows by a fixed fraction each time and never passes the cap.
 
-    Not done: the paper's noise on the means unless ``noise`` > 0.
+    Not done: the paper's noise on the means; the copies are scattered instead.
     """
 
     def __init__(self, config: McmcConfig, *, iterations: int, max_gaussians: int) -> None:
@@ -75,12 +75,12 @@ class Mcmc:
         count = len(gaussians)
         opacities = gaussians.opacities.astype(np.float64)
         alive = opacities > config.dead_opacity
+        errors, self._errors = self._errors, np.zeros(0, np.float32)
         if not alive.any():
             return gaussians, adam
         score = np.where(alive, opacities, 0.0)
-        if config.error_power > 0 and len(self._errors) == count and self._errors.max(initial=0.0) > 0:
-            score = np.where(alive, self._errors.astype(np.float64) ** config.error_power, 0.0)
-        self._errors = np.zeros(0, np.float32)
+        if config.error_power > 0 and len(errors) == count and errors.max(initial=0.0) > 0:
+            score = np.where(alive, errors.astype(np.float64) ** config.error_power, 0.0)
         dead = np.flatnonzero(~alive)
         born = max(0, min(self._cap - count, round(config.growth * count)))
         wanted = len(dead) + born
