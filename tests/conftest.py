@@ -6,6 +6,8 @@ from pathlib import Path
 import jaxtyping
 import pytest
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before OpenMP is loaded, as the command line does
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
