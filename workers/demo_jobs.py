@@ -12,7 +12,7 @@ from workers.jobs import run_reconstruction
 from workers.progress import show_progress, staged
 from workers.signals import orderly_termination
 
-DEMO_ASSIGNMENTS: dict[str, tuple[str, ...]] = {"fast": ()}
+DEMO_ASSIGNMENTS: dict[str, tuple[str, ...]] = {"fast": ("iterations=2000",)}
 """Training settings by preset, chosen so that the demo takes less than three minutes on two cores."""
 
 

@@ -32,7 +32,7 @@ class GeneratedSceneConfig:
     width_px: int = 320
     height_px: int = 240
     samples_per_side: int = 3
-    points: int = 4000
+    points: int = 10_000
     seed: int = 0
     camera_model: str = "PINHOLE"
     transparent: bool = False
