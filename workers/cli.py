@@ -19,8 +19,8 @@ from workers.commands.reconstruct import reconstruct
 from workers.commands.render import render
 from workers.signals import Stopped
 
-# Threads that wait for each other sleep instead of spinning: no slower alone, several times faster on a shared
-# machine. Must be set before OpenMP is loaded; an explicit setting wins.
+# Threads that wait for each other sleep instead of spinning: no slower alone, several times faster on a
+# shared machine. Must be set before OpenMP is loaded; an explicit setting wins.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 DEBUG = "OCTASPLAT_DEBUG"
