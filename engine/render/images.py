@@ -11,6 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float, Float32, UInt8
 
+from engine.colour import srgb_to_linear
 from engine.errors import DatasetError, OutputError
 from engine.files import replacing
 
@@ -21,18 +22,6 @@ _AS_STORED = "oiio:UnassociatedAlpha"
 def to_8_bits(image: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     """Display values as bytes: clipped to [0, 1] and rounded to the nearest of 256 steps."""
     return np.asarray(np.floor(np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
-
-
-def linear_from_srgb(values: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
-    """Linear light from display values, by the exact sRGB curve (IEC 61966-2-1)."""
-    x = np.maximum(values.astype(np.float64), 0.0)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def srgb_from_linear(values: Float32[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
-    """Display values from linear light, by the exact sRGB curve (IEC 61966-2-1)."""
-    x = np.maximum(values.astype(np.float64), 0.0)
-    return np.where(x <= 0.0031308, x * 12.92, 1.055 * x ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def exr_layers(
@@ -54,7 +43,7 @@ def exr_layers(
     Returns:
         The channels by name, ready for ``write_exr``.
     """
-    linear = linear_from_srgb(rgb_srgb)
+    linear = srgb_to_linear(rgb_srgb)
     layers = {name: linear[..., k] for k, name in enumerate("RGB")}
     if alpha is not None:
         layers["A"] = alpha
