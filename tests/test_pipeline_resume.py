@@ -48,6 +48,7 @@ def make_config(**assignments: object) -> ReconstructionConfig:
         "sh_every": 100,
         "max_gaussians": 900,
         "initial_points": 500,
+        "fit_iterations": 40,
         "densify.start": 50,
         "densify.interval": 30,
         "densify.growth": 0.1,

@@ -39,7 +39,7 @@ class EmbreeTracer:
     Hits are exact: a box only says which octagons to test, the octagon test and the distance come from the
     parameters in float64, and hits are ordered by (float32 distance, id). So neither the shape of the
     hierarchy nor the number of threads changes a result, and coplanar Gaussians have one order for all rays.
-    Memory per Gaussian: 64 B record, 24 B box and about 60 B of hierarchy.
+    Memory per Gaussian: a record of 64 B, a box of 24 B, and Embree's hierarchy over the boxes.
 
     Not done: no gradient through octagon edges or visibility; rays start outside of no Gaussian (a hit
     counts from ``t_min`` on).

@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from engine.errors import ConfigError
-from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
+from engine.gaussians.octagon import CHI2_3_99
 from engine.trace.protocol import TraceSettings
 
 PresetName = Literal["fast", "standard", "paper"]
@@ -20,8 +20,10 @@ class _Frozen(BaseModel):
 
 
 class LearningRates(_Frozen):
-    """Adam steps. Means are of the extent and decay exponentially to ``mean_final``; the others follow
-    ``decay`` down to that fraction of their start."""  # noqa: D205, D209
+    """Sizes of the Adam steps, falling exponentially over the run.
+
+    Means are of the extent and fall to ``mean_final``; all others fall to the fraction ``decay``.
+    """
 
     mean: float = Field(1e-3, gt=0)
     mean_final: float = Field(1e-5, gt=0)
@@ -142,15 +144,3 @@ def preset(name: str) -> TrainConfig:
             densify=PaperConfig(),
         )
     raise ConfigError(f"There is no preset called {name!r}; choose fast, standard or paper.")
-
-
-__all__ = [
-    "CHI2_2_99",
-    "LearningRates",
-    "LossWeights",
-    "McmcConfig",
-    "PaperConfig",
-    "PresetName",
-    "TrainConfig",
-    "preset",
-]

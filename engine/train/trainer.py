@@ -17,7 +17,7 @@ from engine.scene import View
 from engine.trace.embree import EmbreeTracer
 from engine.trace.protocol import TraceGradients, Tracer, TraceSettings
 from engine.train.batches import Batch, Pixels, PixelSampler, draw_batch
-from engine.train.checkpoint import TrainState, load_best, load_checkpoint, save_best, save_checkpoint
+from engine.train.checkpoint import TrainState, load_best, save_best, save_checkpoint
 from engine.train.config import TrainConfig
 from engine.train.densify import make_densifier
 from engine.train.losses import pixel_loss, ssim_loss
@@ -151,7 +151,8 @@ class Trainer:
                 self._tracer.build(state.gaussians)
                 rebuild = False
             loss = self._iterate()
-            if self._densifier.due(state.iteration):
+            fitted = state.iteration >= config.fit_iterations
+            if fitted and self._densifier.due(state.iteration):
                 state.gaussians, state.adam = self._densifier.apply(
                     state.gaussians, state.adam, state.rng, extent=self._extent
                 )
@@ -306,14 +307,6 @@ class Trainer:
             )
             return load_best(self._folder)
         return state.gaussians
-
-
-def resume_or_start(folder: Path, fingerprint: str, start: Callable[[], TrainState]) -> TrainState:
-    """The state of the newest sound checkpoint in ``folder``, or a fresh one from ``start``."""
-    from engine.train.checkpoint import latest_checkpoint
-
-    path = latest_checkpoint(folder)
-    return start() if path is None else load_checkpoint(path, fingerprint)
 
 
 def fresh_state(gaussians: FlatGaussians, seed: int) -> TrainState:

@@ -79,6 +79,7 @@ def small_config(**changes: object) -> TrainConfig:
         "sh_degree": 1,
         "sh_every": 60,
         "max_gaussians": 400,
+        "fit_iterations": 10,
         "densify": McmcConfig(start=20, interval=20, growth=0.1),
         "rebuild_every": 10,
         "checkpoint_every": 20,

@@ -68,6 +68,12 @@ def test_events_tell_of_the_progress(whole_run: tuple[FlatGaussians, list[Event]
     assert [e.iteration for e in events if isinstance(e, CheckpointWritten)] == list(range(0, 121, 20))
 
 
+def test_nothing_is_added_while_the_first_gaussians_are_fitted(tmp_path: Path) -> None:
+    _, events = train(tmp_path, small_config(fit_iterations=75))
+    counts = {e.iteration: e.gaussians for e in events if isinstance(e, TrainingProgress)}
+    assert counts[70] == counts[10] < counts[90]
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_same_bits_on_any_number_of_threads(
     whole_run: tuple[FlatGaussians, list[Event]], tmp_path: Path, threads: int
