@@ -15,9 +15,10 @@ from engine.events import Listener, StageProgress
 from engine.files import write_json
 from engine.gaussians.model import FlatGaussians
 from engine.render.images import write_png
+from engine.render.names import render_names
 from engine.render.renderer import background_colour, render_rays
 from engine.scene import Dataset
-from engine.trace.embree import EmbreeTracer
+from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings
 
 RENDERS, METRICS, REPORT = "renders", "metrics.json", "report.html"
@@ -48,15 +49,17 @@ def evaluate_held_out(
         threads: for rendering and measuring; 0 means all cores.
         tell: hears the progress.
     """
-    tracer = EmbreeTracer(settings, threads=threads)
+    tracer = CpuTracer(settings, threads=threads)
     tracer.build(gaussians)
     rows: list[ViewMetrics] = []
     images = WorstAndBest()
     total = len(dataset.test_indices)
+    photographs = [view.name for view in dataset.views]
+    names = dict(zip(photographs, render_names(photographs), strict=True))
     for view, measured in _measured(
         _rendered(dataset, tracer, background), threads or numba.get_num_threads()
     ):
-        path = output / RENDERS / Path(view.name).with_suffix(".png")
+        path = output / RENDERS / f"{names[view.name]}.png"
         write_png(path, view.render)
         rows.append(measured.metrics)
         images.offer(
@@ -75,7 +78,7 @@ def evaluate_held_out(
     )
 
 
-def _rendered(dataset: Dataset, tracer: EmbreeTracer, background: str) -> Iterator[RenderedView]:
+def _rendered(dataset: Dataset, tracer: CpuTracer, background: str) -> Iterator[RenderedView]:
     colour = background_colour(background)
     for index in dataset.test_indices:
         origin, directions = dataset.view_rays(int(index))

@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, Int64
 from engine.gaussians.model import FlatGaussians
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.images import exr_layers, write_exr, write_png
+from engine.render.names import render_names
 from engine.render.paths import Turntable, fit_turntable
 from engine.render.renderer import RenderedImage, render_rays
 from engine.render.video import VideoWriter
@@ -42,12 +43,10 @@ class Shot:
 
 def view_shots(scene: SceneModel, indices: Int64[np.ndarray, " n"]) -> tuple[Shot, ...]:
     """The views of photographs, with their lenses, named like them."""
-    views = [scene.views[index] for index in indices]
+    names = render_names([view.name for view in scene.views])
+    views = [(names[index], scene.views[index]) for index in indices]
     return tuple(
-        Shot(
-            str(Path(view.name).with_suffix("")), partial(_view_rays, view, scene.cameras[view.camera_index])
-        )
-        for view in views
+        Shot(name, partial(_view_rays, view, scene.cameras[view.camera_index])) for name, view in views
     )
 
 

@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from engine.trace.protocol import Tracer
 
 RAYS_AT_ONCE = 1 << 18
+TILE = 8
+"""Rays go to the tracer in tiles of this side, so that neighbours are traced together."""
 
 
 @dataclass(frozen=True)
@@ -44,20 +46,31 @@ def render_rays(
         np.empty((height, width), np.float32),
         np.empty((height, width, 3), np.float32),
     )
-    rows = max(1, RAYS_AT_ONCE // width)
+    rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
     for top in range(0, height, rows):
         band = slice(top, min(top + rows, height))
         directions = directions_world[band].reshape(-1, 3)
+        order = tile_order(min(rows, height - top), width)
+        directions = directions[order]
         seen = tracer.trace(np.broadcast_to(origin_world, directions.shape), directions)
-        shape = (-1, width)
         rgb = seen.rgb_srgb + seen.transmittance[:, None] * background
-        out.rgb_srgb[band] = np.clip(rgb, 0, 1).reshape(*shape, 3)
-        out.alpha[band] = seen.alpha.reshape(shape)
-        out.depth[band] = seen.expected_depth.reshape(shape)
-        out.depth_median[band] = seen.depth_median.reshape(shape)
         length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
-        out.normal_world[band] = (seen.normal_world / np.maximum(length, 1e-12)).reshape(*shape, 3)
+        for image, values in (
+            (out.rgb_srgb, np.clip(rgb, 0, 1)),
+            (out.alpha, seen.alpha),
+            (out.depth, seen.expected_depth),
+            (out.depth_median, seen.depth_median),
+            (out.normal_world, seen.normal_world / np.maximum(length, 1e-12)),
+        ):
+            image[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
     return out
+
+
+def tile_order(height: int, width: int) -> Int64[np.ndarray, " r"]:
+    """Row-major numbers of an image's pixels, tile after tile."""
+    y, x = np.divmod(np.arange(height * width), width)
+    across = -(-width // TILE)
+    return np.argsort((y // TILE) * across + x // TILE, kind="stable")
 
 
 def background_colour(name: str) -> Float32[np.ndarray, "3"]:

@@ -20,7 +20,7 @@ RED_OFF, GREEN_OFF, BLUE_OFF = 1 << 28, 1 << 29, 1 << 30
 RAY_BITS = (1 << 28) - 1
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
+@njit(cache=True, parallel=True, fastmath={"contract"}, error_model="numpy")
 def replay_rays(
     directions, records, features, starts, counts, offsets, ids, alphas, ts, hit_rgb, alpha_max,
     g_rgb, g_transmittance, g_depth, g_median, g_normal, g_feature, with_geometry,
@@ -83,7 +83,44 @@ def replay_rays(
             g_t[out] = gt
 
 
-@njit(fastmath={"contract"})
+@njit(fastmath={"contract"}, error_model="numpy")
+def write_gradients(
+    segment, i, quats, log_scales, records,
+    s_h, s_hu, s_hv, s_huu, s_huv, s_hvv, s_tau, s_tau_u, s_tau_v, s_n0, s_n1, s_n2,
+    out_means, out_quats, out_log_scales, out_logits,
+):  # fmt: skip
+    """Gradients of one Gaussian's raw geometry from its sums over rays.
+
+    In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point
+    over <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau) r1, dL/dln s = S(h u^2), S(h v^2), and the
+    frame turns by the torque S r_i x dL/dr_i.
+    """
+    q0, q1, q2, q3 = (
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    )  # fmt: skip
+    r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
+    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    inv_s2, inv_s3 = 1.0 / s2, 1.0 / s3
+    # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(s_tau_u s2 r2 + s_tau_v s3 r3) + normal channel
+    on_r3, on_r2 = -s_tau_u * s2, s_tau_v * s3
+    on_r1 = -s_huv * s3 * inv_s2 + s_huv * s2 * inv_s3
+    w0 = on_r1 * r1[0] + on_r2 * r2[0] + on_r3 * r3[0] + r1[1] * s_n2 - r1[2] * s_n1
+    w1 = on_r1 * r1[1] + on_r2 * r2[1] + on_r3 * r3[1] + r1[2] * s_n0 - r1[0] * s_n2
+    w2 = on_r1 * r1[2] + on_r2 * r2[2] + on_r3 * r3[2] + r1[0] * s_n1 - r1[1] * s_n0
+    # dL/dq = 2 (0, w) q / |q|^2: the rotation depends on the direction of q only
+    factor = 2.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    out_quats[segment, 0] = factor * (-w0 * q1 - w1 * q2 - w2 * q3)
+    out_quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
+    out_quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
+    out_quats[segment, 3] = factor * (w2 * q0 + w0 * q2 - w1 * q1)
+    for axis in range(3):
+        out_means[segment, axis] = s_hu * inv_s2 * r2[axis] + s_hv * inv_s3 * r3[axis] + s_tau * r1[axis]
+    out_log_scales[segment, 0] = s_huu
+    out_log_scales[segment, 1] = s_hvv
+    out_logits[segment] = s_h * (1.0 - np.float64(records[i, OPACITY]))
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
 def gather_chunk(
     first, last, basis, sh_sum, feature_sum,
     origins, directions, records, means, quats, log_scales, order, sorted_keys, starts,
@@ -169,23 +206,11 @@ def gather_chunk(
                 s_n2 += facing * g_normal[r, 2]
             for f in range(feature_count):
                 feature_sum[f] += w * g_feature[r, f]
-        # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(s_tau_u s2 r2 + s_tau_v s3 r3) + normal channel
-        on_r3, on_r2 = -s_tau_u * s2, s_tau_v * s3
-        on_r1 = -s_huv * s3 * inv_s2 + s_huv * s2 * inv_s3
-        w0 = on_r1 * r1[0] + on_r2 * r2[0] + on_r3 * r3[0] + r1[1] * s_n2 - r1[2] * s_n1
-        w1 = on_r1 * r1[1] + on_r2 * r2[1] + on_r3 * r3[1] + r1[2] * s_n0 - r1[0] * s_n2
-        w2 = on_r1 * r1[2] + on_r2 * r2[2] + on_r3 * r3[2] + r1[0] * s_n1 - r1[1] * s_n0
-        # dL/dq = 2 (0, w) q / |q|^2: the rotation depends on the direction of q only
-        factor = 2.0 / (q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-        out_quats[segment, 0] = factor * (-w0 * q1 - w1 * q2 - w2 * q3)
-        out_quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
-        out_quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
-        out_quats[segment, 3] = factor * (w2 * q0 + w0 * q2 - w1 * q1)
-        for axis in range(3):
-            out_means[segment, axis] = s_hu * inv_s2 * r2[axis] + s_hv * inv_s3 * r3[axis] + s_tau * r1[axis]
-        out_log_scales[segment, 0] = s_huu
-        out_log_scales[segment, 1] = s_hvv
-        out_logits[segment] = s_h * (1.0 - np.float64(records[i, OPACITY]))
+        write_gradients(
+            segment, i, quats, log_scales, records,
+            s_h, s_hu, s_hv, s_huu, s_huv, s_hvv, s_tau, s_tau_u, s_tau_v, s_n0, s_n1, s_n2,
+            out_means, out_quats, out_log_scales, out_logits,
+        )  # fmt: skip
         for j in range(basis_count):
             for channel in range(3):
                 # degree 0 skips the basis in the loop above
@@ -200,7 +225,7 @@ def gather_chunk(
         out_counts[segment] = starts[segment + 1] - starts[segment]
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
+@njit(cache=True, parallel=True, fastmath={"contract"}, error_model="numpy")
 def gather_gaussians(
     origins, directions, records, means, quats, log_scales,
     order, sorted_keys, starts, chunk_bounds, workers, counter,

@@ -8,7 +8,7 @@ from numba import njit, prange
 from engine.trace.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN, NORMAL, OPACITY
 
 
-@njit
+@njit(error_model="numpy")
 def rotation_columns(q0, q1, q2, q3):
     """Columns r1, r2, r3 of the rotation of a quaternion (w, x, y, z) of any length, float64."""
     scale = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
@@ -20,36 +20,58 @@ def rotation_columns(q0, q1, q2, q3):
     )
 
 
-@njit
-def write_record(record, mean, quat, log_scale, logit, q):
-    """One record; returns the in-plane corner radii in world units along r2 and r3."""
-    r1, r2, r3 = rotation_columns(
-        np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-    )
-    s2, s3 = math.exp(np.float64(log_scale[0])), math.exp(np.float64(log_scale[1]))
-    logit64 = np.float64(logit)
+@njit(error_model="numpy")
+def opacity_and_radius(logit, q):
+    """Opacity, and the octagon's corner radius in standard deviations."""
     # ln sigmoid(x) without overflow at either end
-    log_opacity = -math.log1p(math.exp(-logit64)) if logit64 > 0 else logit64 - math.log1p(math.exp(logit64))
-    radius = math.sqrt(max(0.0, q + 2.0 * log_opacity))
-    for axis in range(3):
-        record[MEAN + axis] = mean[axis]
-        record[NORMAL + axis] = r1[axis]
-        record[AXIS_U + axis] = r2[axis] / s2
-        record[AXIS_V + axis] = r3[axis] / s3
-    # A Gaussian without an octagon must not be hit even through its centre.
-    record[INNER_RADIUS] = radius * COS_22 if radius > 0.0 else -1.0
-    record[OPACITY] = math.exp(log_opacity)
+    log_opacity = -math.log1p(math.exp(-logit)) if logit > 0 else logit - math.log1p(math.exp(logit))
+    return math.exp(log_opacity), math.sqrt(max(0.0, q + 2.0 * log_opacity))
+
+
+@njit(error_model="numpy")
+def legs(i, quats, log_scales, logits, q):
+    """Corner radii in world units along r2 and r3, and those axes."""
+    _r1, r2, r3 = rotation_columns(
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    )
+    _opacity, radius = opacity_and_radius(np.float64(logits[i]), q)
+    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
     return radius * s2, radius * s3, r2, r3
 
 
-@njit(cache=True, parallel=True)
-def write_records(records, boxes, means, quats, log_scales, logits, q, padding):
-    """All records, and the boxes of the octagons' ellipses enlarged by the fraction ``padding``.
+@njit(error_model="numpy")
+def write_record(records, i, means, quats, log_scales, logits, q):
+    """Record of one Gaussian."""
+    r1, r2, r3 = rotation_columns(
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+    )
+    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    opacity, radius = opacity_and_radius(np.float64(logits[i]), q)
+    for axis in range(3):
+        records[i, MEAN + axis] = means[i, axis]
+        records[i, NORMAL + axis] = r1[axis]
+        records[i, AXIS_U + axis] = r2[axis] / s2
+        records[i, AXIS_V + axis] = r3[axis] / s3
+    # A Gaussian without an octagon must not be hit even through its centre.
+    records[i, INNER_RADIUS] = radius * COS_22 if radius > 0.0 else -1.0
+    records[i, OPACITY] = opacity
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def write_records(records, means, quats, log_scales, logits, q):
+    """All records."""
+    for i in prange(len(means)):
+        write_record(records, i, means, quats, log_scales, logits, q)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def write_boxes(boxes, means, quats, log_scales, logits, q, padding):
+    """Boxes of the octagons' ellipses enlarged by the fraction ``padding``.
 
     A Gaussian without an octagon gets a box turned inside out, which Embree leaves out of its hierarchy.
     """
     for i in prange(len(means)):
-        a, b, r2, r3 = write_record(records[i], means[i], quats[i], log_scales[i], logits[i], q)
+        a, b, r2, r3 = legs(i, quats, log_scales, logits, q)
         reach = padding * max(a, b)
         for axis in range(3):
             half = math.sqrt((a * r2[axis]) ** 2 + (b * r3[axis]) ** 2)
@@ -62,9 +84,8 @@ def write_records(records, boxes, means, quats, log_scales, logits, q, padding):
                 boxes[i, axis], boxes[i, 3 + axis] = centre - half, centre + half
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def refresh_records(records, ids, means, quats, log_scales, logits, q):
-    """Records of the Gaussians ``ids`` from their changed parameters; boxes stay."""
+    """Records of the Gaussians ``ids`` from their changed parameters."""
     for k in prange(len(ids)):
-        i = ids[k]
-        write_record(records[i], means[i], quats[i], log_scales[i], logits[i], q)
+        write_record(records, ids[k], means, quats, log_scales, logits, q)

@@ -108,6 +108,11 @@ class TraceGradients:
     features: Float32[np.ndarray, "r f"] | None = None
     ray_errors: Float32[np.ndarray, " r"] | None = None
 
+    @property
+    def with_geometry(self) -> bool:
+        """Whether depth or normals have a gradient."""
+        return any(x is not None for x in (self.depth_sum, self.depth_median, self.normal_world))
+
 
 @dataclass
 class GaussianGradients:

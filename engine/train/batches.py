@@ -1,5 +1,6 @@
 """Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -73,6 +74,27 @@ class PixelSampler:
         local = flat - (self._ends[which] - width * height)
         return self._views[which], local // width, local % width
 
+    def windows(
+        self, rng: np.random.Generator, count: int, *, rays: int, side: int
+    ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+        """``rays`` pixels (a square number) in each of ``count`` windows of about ``side`` x ``side`` pixels.
+
+        A window is a grid of cells, one random pixel in each. What sticks out of its view is folded back,
+        so that every pixel is about as likely as any other.
+        """
+        areas = np.diff(self._ends, prepend=0)
+        which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
+        width, height = self._sizes[which].T
+        cells = math.isqrt(rays)
+        cell = max(1, side // cells)
+        rows, columns = np.divmod(np.arange(rays), cells)
+        left = rng.integers(-(cell * cells // 2), width - cell * cells // 2)
+        top = rng.integers(-(cell * cells // 2), height - cell * cells // 2)
+        y = top[:, None] + rows * cell + rng.integers(0, cell, (count, rays))
+        x = left[:, None] + columns * cell + rng.integers(0, cell, (count, rays))
+        view = np.broadcast_to(self._views[which][:, None], x.shape)
+        return view.reshape(-1), _fold(y, height[:, None]).reshape(-1), _fold(x, width[:, None]).reshape(-1)
+
     def patches(
         self, rng: np.random.Generator, count: int, side: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
@@ -90,20 +112,36 @@ class PixelSampler:
         return view.reshape(-1), y.reshape(-1), x.reshape(-1)
 
 
+def _fold(position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]) -> Int64[np.ndarray, "w r"]:
+    """Positions mirrored at 0 and ``size`` until they lie between."""
+    period = np.mod(position, 2 * size)
+    return np.minimum(period, 2 * size - 1 - period)
+
+
 def draw_batch(
     dataset: Pixels,
     sampler: PixelSampler,
     rng: np.random.Generator,
     *,
     rays: int,
+    window_rays: int,
+    window_side: int,
     patch_fraction: float,
     side: int,
 ) -> Batch:
-    """``rays`` rays, of which about ``patch_fraction`` come as patches (none where a view is too small)."""
+    """``rays`` rays, of which about ``patch_fraction`` come as patches (none where a view is too small).
+
+    The others come in windows of ``window_rays``, as far as that goes, and one by one where it is 1.
+    """
     patches = min(round(rays * patch_fraction / side**2), rays // side**2)
     if sampler.smallest_side_px < side:
         patches = 0
-    view, y, x = sampler.pixels(rng, rays - patches * side**2)
+    loose = rays - patches * side**2
+    windows = loose // window_rays if window_rays > 1 else 0
+    view, y, x = sampler.pixels(rng, loose - windows * window_rays)
+    if windows:
+        more = sampler.windows(rng, windows, rays=window_rays, side=window_side)
+        view, y, x = (np.concatenate(pair) for pair in zip((view, y, x), more, strict=True))
     if patches:
         extra = sampler.patches(rng, patches, side)
         view, y, x = (np.concatenate(pair) for pair in zip((view, y, x), extra, strict=True))

@@ -86,7 +86,9 @@ class TrainConfig(_Frozen):
     """One training run, fully resolved; the defaults are the ``standard`` preset."""
 
     iterations: int = Field(4000, ge=1)
-    rays: int = Field(8192, ge=64, description="rays of one iteration")
+    rays: int = Field(32_768, ge=64, description="rays of one iteration")
+    window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
+    window_side: int = Field(32, ge=1, description="pixels over which a window's rays are spread")
     patch_fraction: float = Field(
         0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM"
     )
@@ -94,9 +96,10 @@ class TrainConfig(_Frozen):
     fit_iterations: int = Field(100, ge=0, description="paper 4.2: fitting before anything is added")
     sh_degree: int = Field(2, ge=0, le=3)
     sh_every: int = Field(400, ge=1, description="iterations between raising the degree")
-    max_gaussians: int = Field(60_000, ge=1)
-    initial_points: int = Field(
-        30_000, ge=1, description="most points taken from the sparse model, or random ones made"
+    max_gaussians: int = Field(100_000, ge=1)
+    initial_points: int = Field(100_000, ge=1, description="most points to begin from")
+    lift_pixels: bool = Field(
+        True, description="where the sparse model has fewer points, lift pixels of the photographs"
     )
     initial_opacity: float = Field(0.5, gt=0, lt=1)
     background: Literal["auto", "black", "white", "random"] = Field(
@@ -122,7 +125,8 @@ def preset(name: str) -> TrainConfig:
     """
     if name == "fast":
         return TrainConfig(
-            iterations=1500,
+            iterations=1000,
+            rays=16_384,
             sh_degree=1,
             sh_every=300,
             max_gaussians=40_000,
@@ -134,7 +138,11 @@ def preset(name: str) -> TrainConfig:
         return TrainConfig(
             iterations=10_000,
             sh_degree=0,
+            rays=8192,
+            window_rays=1,
             max_gaussians=350_000,
+            initial_points=30_000,
+            lift_pixels=False,
             initial_opacity=0.1,
             rates=LearningRates(
                 mean=5e-4, mean_final=3e-6, quat=0.01, log_scale=5e-3, opacity=0.05, colour=1.4e-3, decay=0.1

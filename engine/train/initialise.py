@@ -10,6 +10,8 @@ from engine.gaussians.model import SH_C0, FlatGaussians
 
 NEIGHBOURS = 3
 PLANE_NEIGHBOURS = 8
+MAX_ANGLE = 0.3
+"""Largest scale as seen from the nearest camera, in radians."""
 FARTHEST = 50.0
 """Points farther from the cameras than this many extents are matching errors."""
 
@@ -50,6 +52,9 @@ def from_points(
     spacing = np.clip(
         spacing, 1e-5 * extent, 0.2 * extent * np.maximum(1.0, _distance(points, centre) / extent)
     )
+    # One point alone in front of a camera would hide everything.
+    to_camera = cKDTree(camera_centres_world).query(points)[0]
+    spacing = np.minimum(spacing, np.maximum(MAX_ANGLE * to_camera, 1e-5 * extent))
     normals = _unit(centre - points)
     if wanted == PLANE_NEIGHBOURS + 1:
         around = points[neighbours]

@@ -14,7 +14,7 @@ from engine.events import CheckpointWritten, HeldOutMeasured, Listener, Training
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
 from engine.scene import View
-from engine.trace.embree import EmbreeTracer
+from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceGradients, Tracer, TraceSettings
 from engine.train.batches import Batch, Pixels, PixelSampler, draw_batch
 from engine.train.checkpoint import TrainState, load_best, save_best, save_checkpoint
@@ -94,7 +94,7 @@ class Trainer:
         self._tell = listener
         self._should_stop = should_stop
         self._extent = dataset.extent
-        self._tracer: Tracer = tracer or EmbreeTracer(
+        self._tracer: Tracer = tracer or CpuTracer(
             trace_settings(config, self._extent), threads=threads, box_padding=config.box_padding
         )
         sizes_px = np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)
@@ -187,6 +187,8 @@ class Trainer:
             self._sampler,
             state.rng,
             rays=config.rays,
+            window_rays=config.window_rays,
+            window_side=config.window_side,
             patch_fraction=config.patch_fraction if config.loss.ssim > 0 else 0.0,
             side=config.patch_side,
         )

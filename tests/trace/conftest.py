@@ -3,6 +3,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
+import trace_scenes
 
 
 @pytest.fixture
@@ -17,3 +18,11 @@ def one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(params=["always", "never"])
+def both_ways(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Runs a test with packets and with single rays."""
+    trace_scenes.PACKETS[0] = request.param
+    yield request.param
+    trace_scenes.PACKETS[0] = "auto"

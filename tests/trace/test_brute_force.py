@@ -6,6 +6,9 @@ from trace_scenes import f32, in_plane, make_cloud, make_tracer, rays_inwards, u
 
 from engine.gaussians.model import FlatGaussians, concatenate
 
+pytestmark = pytest.mark.usefixtures("both_ways")
+
+
 Q = 9.0
 
 

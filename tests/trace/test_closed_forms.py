@@ -8,6 +8,9 @@ from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii
 from engine.trace.protocol import TraceGradients, TraceResult
 
+pytestmark = pytest.mark.usefixtures("both_ways")
+
+
 UP = f32([[0.0, 0.0, 1.0]])
 
 

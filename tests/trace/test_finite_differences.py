@@ -19,6 +19,9 @@ from trace_scenes import (
 from engine.trace.protocol import TraceGradients
 from engine.trace.reference import ReferenceParameters, trace_reference
 
+pytestmark = pytest.mark.usefixtures("both_ways")
+
+
 STEP = 1e-6
 
 

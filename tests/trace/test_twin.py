@@ -24,6 +24,8 @@ from engine.gaussians.model import FlatGaussians, concatenate
 from engine.trace.kernels_hit import K
 from engine.trace.protocol import TraceGradients
 
+pytestmark = pytest.mark.usefixtures("both_ways")
+
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_cloud_with_harmonics_and_features(rng: np.random.Generator, degree: int) -> None:

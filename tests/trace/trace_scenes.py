@@ -6,10 +6,12 @@ import numpy as np
 import torch
 
 from engine.gaussians.model import FlatGaussians
-from engine.trace.embree import EmbreeTracer
+from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, TraceResult, TraceSettings
 from engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
 
+PACKETS = ["auto"]
+"""Whether tracers made here send rays in packets; tests that run both ways change it."""
 OUTPUTS = ("rgb_srgb", "transmittance", "depth_sum", "depth_median", "normal_world", "features")
 PARAMETERS = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh", "features")
 VALUE_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 1e-4
@@ -80,11 +82,9 @@ def rays_inwards(
     return origins, directions
 
 
-def make_tracer(
-    gaussians: FlatGaussians, features: np.ndarray | None = None, **options: object
-) -> EmbreeTracer:
+def make_tracer(gaussians: FlatGaussians, features: np.ndarray | None = None, **options: object) -> CpuTracer:
     settings = TraceSettings(**{k: options.pop(k) for k in list(options) if k in TraceSettings.model_fields})
-    tracer = EmbreeTracer(settings, **options)
+    tracer = CpuTracer(settings, packets=PACKETS[0], **options)
     tracer.build(gaussians, features)
     return tracer
 

@@ -25,6 +25,35 @@ def test_pixels_are_uniform_over_the_given_views() -> None:
     assert tally[2].sum() == 0
 
 
+def test_windows_are_grids_with_one_pixel_a_cell() -> None:
+    sampler = PixelSampler(np.array([1]), np.array([[8, 6], [300, 200]]))
+    view, y, x = (
+        a.reshape(400, 16) for a in sampler.windows(np.random.default_rng(0), 400, rays=16, side=20)
+    )
+    assert (view == 1).all()
+    # those that are nowhere near the view's edges, where they would be folded
+    inside = (x.min(1) > 20) & (x.max(1) < 279) & (y.min(1) > 20) & (y.max(1) < 179)
+    assert inside.mean() > 0.5
+    for columns, rows in zip(x[inside], y[inside], strict=True):
+        # some corner puts each pixel into its own 5 x 5 cell
+        across, down = np.arange(16) % 4 * 5, np.arange(16) // 4 * 5
+        assert (columns - across).max() - (columns - across).min() < 5
+        assert (rows - down).max() - (rows - down).min() < 5
+
+
+def test_windows_reach_every_pixel_about_as_often() -> None:
+    sampler = PixelSampler(np.array([0, 1, 3]), SIZES)
+    view, y, x = sampler.windows(np.random.default_rng(0), 263 * 400 // 16, rays=16, side=8)
+    tally = np.zeros((4, 10, 20))
+    np.add.at(tally, (view, y, x), 1)
+    for index in (0, 1, 3):
+        width, height = SIZES[index]
+        inside = tally[index, :height, :width]
+        assert inside.sum() == tally[index].sum()
+        assert inside.min() > 200
+        assert inside.max() < 800
+
+
 def test_patches_are_whole_and_in_rows() -> None:
     sampler = PixelSampler(np.array([1, 2]), SIZES)
     view, y, x = (a.reshape(500, 4, 4) for a in sampler.patches(np.random.default_rng(0), 500, 4))
@@ -47,10 +76,14 @@ def test_patch_as_large_as_the_view() -> None:
 
 @pytest.mark.parametrize("fraction", [0.0, 0.25, 0.5, 1.0])
 @pytest.mark.parametrize("rays", [256, 1000, 1024])
-def test_batch_has_its_rays(fraction: float, rays: int) -> None:
+@pytest.mark.parametrize("window_rays", [1, 64])
+def test_batch_has_its_rays(fraction: float, rays: int, window_rays: int) -> None:
     world = FlatWorld(side_px=40)
     sampler = PixelSampler(world.train_indices, np.full((7, 2), 40))
-    batch = draw_batch(world, sampler, np.random.default_rng(0), rays=rays, patch_fraction=fraction, side=16)
+    batch = draw_batch(
+        world, sampler, np.random.default_rng(0),
+        rays=rays, window_rays=window_rays, window_side=24, patch_fraction=fraction, side=16,
+    )  # fmt: skip
     assert len(batch.rgb_srgb) == len(batch.origins_world) == len(batch.alpha) == len(batch.weight) == rays
     assert abs(batch.patches * 256 - fraction * rays) <= 256
     np.testing.assert_allclose(np.linalg.norm(batch.directions_world, axis=1), 1, atol=1e-6)
@@ -59,5 +92,8 @@ def test_batch_has_its_rays(fraction: float, rays: int) -> None:
 def test_views_too_small_for_patches_give_none() -> None:
     world = FlatWorld(side_px=12)
     sampler = PixelSampler(world.train_indices, np.full((7, 2), 12))
-    batch = draw_batch(world, sampler, np.random.default_rng(0), rays=600, patch_fraction=0.5, side=16)
+    batch = draw_batch(
+        world, sampler, np.random.default_rng(0),
+        rays=600, window_rays=64, window_side=32, patch_fraction=0.5, side=16,
+    )  # fmt: skip
     assert batch.patches == 0 and len(batch.rgb_srgb) == 600

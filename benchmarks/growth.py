@@ -1,0 +1,137 @@
+"""How time and memory grow from 10,000 to 1,000,000 Gaussians.
+
+    python benchmarks/growth.py [--largest 1000000]
+
+Three things, at about ten hits a ray whatever the count: 65,536 rays of one camera image; as many rays of a
+window that shrinks as the Gaussians do, so that neighbouring rays share as much as in a photograph of
+matching resolution; and whole training iterations on synthetic photographs.
+"""
+
+import argparse
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
+
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.order import morton_order
+from engine.trace.cpu import CpuTracer
+from engine.trace.protocol import TraceGradients
+from engine.train.config import McmcConfig, TrainConfig
+from engine.train.trainer import Trainer, fresh_state
+
+SMALLEST = 10_000
+
+
+def sorted_cloud(count: int) -> FlatGaussians:
+    """The cloud in the memory order that training keeps."""
+    gaussians = cloud(count)
+    return gaussians.select(morton_order(gaussians.means_world))
+
+
+def microseconds_a_ray(gaussians: FlatGaussians, zoom: float, repeats: int = 5) -> tuple[float, float, float]:
+    """Median wall time of forward and backward, and hits a ray; ``zoom`` narrows the camera's view."""
+    origins, directions = camera_rays(gaussians, zoom)
+    tracer = CpuTracer(SETTINGS, threads=2)
+    tracer.build(gaussians)
+    gradient = TraceGradients(rgb_srgb=np.ones((len(origins), 3), np.float32))
+    forward, backward = [], []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        seen = tracer.trace(origins, directions, record=True)
+        middle = time.perf_counter()
+        assert seen.hits is not None
+        tracer.backward(seen.hits, gradient)
+        forward.append(middle - start)
+        backward.append(time.perf_counter() - middle)
+    scale = 1e6 / len(origins)
+    return (
+        scale * float(np.median(forward[1:])),
+        scale * float(np.median(backward[1:])),
+        float(seen.hit_counts.mean()),
+    )
+
+
+class CloudPhotographs:
+    """Views from a ring around the cloud whose pixels are noise: training's work without its photographs."""
+
+    has_alpha = False
+    extent = 2.0
+
+    def __init__(self, count: int = 40, side_px: int = 512) -> None:
+        from types import SimpleNamespace
+
+        self.views = tuple(SimpleNamespace(width_px=side_px, height_px=side_px) for _ in range(count))
+        self.train_indices = np.arange(count)
+        self.test_indices = np.empty(0, np.int64)
+        self._side = side_px
+        angle = 2 * np.pi * np.arange(count) / count
+        self._origins = 2.5 * np.stack([np.cos(angle), np.sin(angle), 0.3 * np.sin(3 * angle)], axis=1)
+
+    def rays(self, view: np.ndarray, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rays towards the middle of the cloud."""
+        origins = self._origins[view]
+        forward = -origins / np.linalg.norm(origins, axis=1, keepdims=True)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right, axis=1, keepdims=True)
+        down = np.cross(forward, right)
+        a, b = ((np.stack([x, y]) + 0.5) / self._side - 0.5) * 0.8
+        directions = forward + a[:, None] * right + b[:, None] * down
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return origins.astype(np.float32), directions.astype(np.float32)
+
+    def pixels(
+        self, view: np.ndarray, y: np.ndarray, x: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Grey noise that depends on the pixel alone."""
+        grey = ((view * 7919 + y * 104729 + x * 1299709) % 256 / 255).astype(np.float32)
+        return np.repeat(grey[:, None], 3, axis=1), np.ones_like(grey), np.ones_like(grey)
+
+
+def milliseconds_an_iteration(gaussians: FlatGaussians, iterations: int = 50) -> float:
+    """Mean wall time of a training iteration, rebuilds of the hierarchy included, densification not."""
+    config = TrainConfig(
+        iterations=iterations, max_gaussians=len(gaussians), sh_degree=0, checkpoint_every=10_000,
+        probe_rays=256, densify=McmcConfig(start=10_000),
+    )  # fmt: skip
+    marks: list[tuple[int, float]] = []
+
+    def listen(event: object) -> None:
+        if type(event).__name__ == "TrainingProgress":
+            marks.append((event.iteration, event.seconds))  # type: ignore[attr-defined]
+
+    with tempfile.TemporaryDirectory() as folder:
+        Trainer(
+            CloudPhotographs(), config, fresh_state(gaussians, 0),
+            folder=Path(folder), fingerprint="growth", listener=listen, threads=2,
+        ).run()  # fmt: skip
+    (first, began), (last, ended) = marks[0], marks[-1]
+    return 1e3 * (ended - began) / (last - first)
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--largest", type=int, default=1_000_000)
+    parser.add_argument("--iterations", type=int, default=50)
+    options = parser.parse_args()
+    counts = [n for n in (SMALLEST, 100_000, 1_000_000) if n <= options.largest]
+    print("Gaussians   image: fwd  bwd us/ray  hits   window: fwd  bwd us/ray  hits   iteration ms   peak MB")
+    for count in counts:
+        gaussians = sorted_cloud(count)
+        image = microseconds_a_ray(gaussians, 1.0)
+        window = microseconds_a_ray(gaussians, 3.0 * (count / SMALLEST) ** 0.5)
+        iteration = milliseconds_an_iteration(gaussians, options.iterations)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(
+            f"{count:9d}        {image[0]:6.2f} {image[1]:5.2f}      {image[2]:5.1f}         {window[0]:6.2f}"
+            f" {window[1]:5.2f}      {window[2]:5.1f}        {iteration:6.1f}     {peak:8.0f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

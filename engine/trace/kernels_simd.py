@@ -1,0 +1,274 @@
+"""Eight lanes at a time: the tests of a packet as explicit vectors.
+
+Loop vectorisers leave these short loops scalar. The intrinsics emit vectors of eight doubles, which the
+compiler maps to whatever the processor has; no flag allows it to change a result.
+"""
+
+import llvmlite.ir as ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+LANES = 8
+_I64 = ir.IntType(64)
+_DOUBLE8 = ir.VectorType(ir.DoubleType(), LANES)
+_FLOAT8 = ir.VectorType(ir.FloatType(), LANES)
+
+
+class _Vector:
+    """A vector value with the operators that the formulas need."""
+
+    def __init__(self, builder, value):
+        self.builder, self.value = builder, value
+
+    def _other(self, other):
+        if isinstance(other, _Vector):
+            return other.value
+        return ir.Constant(_DOUBLE8, [float(other)] * LANES)
+
+    def __add__(self, other):
+        return _Vector(self.builder, self.builder.fadd(self.value, self._other(other), ("contract",)))
+
+    def __sub__(self, other):
+        return _Vector(self.builder, self.builder.fsub(self.value, self._other(other), ("contract",)))
+
+    def __mul__(self, other):
+        return _Vector(self.builder, self.builder.fmul(self.value, self._other(other), ("contract",)))
+
+    def __truediv__(self, other):
+        return _Vector(self.builder, self.builder.fdiv(self.value, self._other(other)))
+
+    def _compare(self, operator, other):
+        return _Vector(self.builder, self.builder.fcmp_ordered(operator, self.value, self._other(other)))
+
+    def __le__(self, other):
+        return self._compare("<=", other)
+
+    def __lt__(self, other):
+        return self._compare("<", other)
+
+    def __ge__(self, other):
+        return self._compare(">=", other)
+
+    def __gt__(self, other):
+        return self._compare(">", other)
+
+    def __and__(self, other):
+        return _Vector(self.builder, self.builder.and_(self.value, other.value))
+
+    def __invert__(self):
+        return _Vector(self.builder, self.builder.not_(self.value))
+
+    def __abs__(self):
+        integers = ir.VectorType(_I64, LANES)
+        no_sign = ir.Constant(integers, [0x7FFFFFFFFFFFFFFF] * LANES)
+        bits = self.builder.and_(self.builder.bitcast(self.value, integers), no_sign)
+        return _Vector(self.builder, self.builder.bitcast(bits, _DOUBLE8))
+
+    def larger(self, other):
+        """The larger of two lanes; the second where they cannot be compared."""
+        return _Vector(self.builder, self.builder.select((self > other).value, self.value, other.value))
+
+    def mask(self):
+        """Truth of the lanes as the low bits of an int64."""
+        return self.builder.zext(self.builder.bitcast(self.value, ir.IntType(LANES)), _I64)
+
+
+class _Lanes:
+    """Loads and stores rows of eight lanes at an address; broadcasts scalars."""
+
+    def __init__(self, builder, address, element):
+        self.builder, self.size = builder, 8 if element is _DOUBLE8 else 4
+        self.element = element
+        self.address = address
+
+    def _pointer(self, row):
+        offset = (
+            ir.Constant(_I64, row * LANES * self.size)
+            if isinstance(row, int)
+            else self.builder.mul(row, ir.Constant(_I64, LANES * self.size))
+        )
+        address = self.builder.add(self.address, offset)
+        return self.builder.inttoptr(address, self.element.as_pointer())
+
+    def __getitem__(self, row):
+        value = self.builder.load(self._pointer(row), align=4)
+        if self.element is _FLOAT8:
+            value = self.builder.fpext(value, _DOUBLE8)
+        return _Vector(self.builder, value)
+
+    def __setitem__(self, row, vector):
+        self.builder.store(vector.value, self._pointer(row), align=8)
+
+
+def _broadcast(builder, scalar):
+    one = builder.insert_element(ir.Constant(_DOUBLE8, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    return _Vector(builder, builder.shuffle_vector(one, ir.Constant(_DOUBLE8, ir.Undefined), zeros))
+
+
+@intrinsic
+def meet_block(typingctx, block, dx, dy, dz):
+    """Bit k: the ray meets the octagon of candidate k of a block of rows; leaves its t, u and v there.
+
+    A ray that makes a cosine below 1e-6 with the normal runs inside the plane and meets nothing.
+    """
+    signature = types.int64(types.uintp, types.float64, types.float64, types.float64)
+
+    def codegen(context, builder, sig, args):
+        rows = _Lanes(builder, args[0], _DOUBLE8)
+        d = [_broadcast(builder, component) for component in args[1:]]
+
+        def along(row):
+            return rows[row] * d[0] + rows[row + 1] * d[1] + rows[row + 2] * d[2]
+
+        cosine = along(0)
+        one = _Vector(builder, ir.Constant(_DOUBLE8, [1.0] * LANES))
+        inverse = one / cosine
+        u = along(3) * inverse
+        v = along(6) * inverse
+        rows[12] = rows[9] * inverse
+        rows[13] = u
+        rows[14] = v
+        cos_22, sin_22 = 0.9238795325112867, 0.3826834323650898
+        farthest = (abs(u) * cos_22 + abs(v) * sin_22).larger(abs(u) * sin_22 + abs(v) * cos_22)
+        met = (farthest <= rows[10]) & (abs(cosine) >= 1e-6)
+        return met.mask()
+
+    return signature, codegen
+
+
+@intrinsic
+def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
+    """Bit k: box k of a node reaches into the pyramid with apex o and the five inward ``planes``.
+
+    Row s of the planes is a normal of three doubles and three int64, the rows of the node that hold the box's
+    farthest corner along it.
+    """
+    signature = types.int64(types.uintp, types.uintp, types.float64, types.float64, types.float64)
+
+    def codegen(context, builder, sig, args):
+        rows = _Lanes(builder, args[0], _FLOAT8)
+        o = [_broadcast(builder, component) for component in args[2:]]
+        inside = None
+        for side in range(5):
+            distance = None
+            for axis in range(3):
+                normal, row = _plane(builder, args[1], side, axis)
+                term = (rows[row] - o[axis]) * normal
+                distance = term if distance is None else distance + term
+            here = distance >= 0.0
+            inside = here if inside is None else inside & here
+        return inside.mask()
+
+    return signature, codegen
+
+
+@intrinsic
+def ellipses_in_pyramid(typingctx, block, planes, ox, oy, oz):
+    """Bit k: ellipse k of a block of leaves reaches into the pyramid.
+
+    Its farthest point inwards along a normal lies sqrt(u^2 + v^2) beyond its centre, u and v being its legs
+    along the normal.
+    """
+    signature = types.int64(types.uintp, types.uintp, types.float64, types.float64, types.float64)
+
+    def codegen(context, builder, sig, args):
+        rows = _Lanes(builder, args[0], _FLOAT8)
+        o = [_broadcast(builder, component) for component in args[2:]]
+        centre = [rows[axis] - o[axis] for axis in range(3)]
+        legs = [rows[3 + k] for k in range(6)]
+        inside = None
+        for side in range(5):
+            n = [_plane(builder, args[1], side, axis)[0] for axis in range(3)]
+            height = centre[0] * n[0] + centre[1] * n[1] + centre[2] * n[2]
+            u = legs[0] * n[0] + legs[1] * n[1] + legs[2] * n[2]
+            v = legs[3] * n[0] + legs[4] * n[1] + legs[5] * n[2]
+            outside = (height < 0.0) & (height * height > u * u + v * v)
+            inside = ~outside if inside is None else inside & ~outside
+        return inside.mask()
+
+    return signature, codegen
+
+
+def _plane(builder, planes, side, axis):
+    """Broadcast component of a normal, and the row of the box's corner along it."""
+    words = builder.inttoptr(planes, ir.DoubleType().as_pointer())
+    value = builder.load(builder.gep(words, [ir.Constant(_I64, side * 6 + axis)]))
+    rows = builder.inttoptr(planes, _I64.as_pointer())
+    row = builder.load(builder.gep(rows, [ir.Constant(_I64, side * 6 + 3 + axis)]))
+    return _broadcast(builder, value), row
+
+
+@intrinsic
+def write_ranks(typingctx, keys, first, count, ranks):
+    """Write how many of ``count`` keys are below each of the eight from ``first`` on to ``ranks``."""
+    signature = types.void(types.uintp, types.int64, types.int64, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        keys, first, count, ranks = args
+        word = ir.Constant(_I64, 8)
+        integers = ir.VectorType(_I64, LANES)
+        offset = builder.mul(first, word)
+        mine = builder.load(builder.inttoptr(builder.add(keys, offset), integers.as_pointer()), align=8)
+        below = cgutils.alloca_once_value(builder, ir.Constant(integers, [0] * LANES))
+        base = builder.inttoptr(keys, _I64.as_pointer())
+        undefined = ir.Constant(integers, ir.Undefined)
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        with cgutils.for_range(builder, count) as loop:
+            key = builder.load(builder.gep(base, [loop.index]))
+            one = builder.insert_element(undefined, key, ir.Constant(ir.IntType(32), 0))
+            other = builder.shuffle_vector(one, undefined, zeros)
+            smaller = builder.icmp_unsigned("<", other, mine)
+            builder.store(builder.add(builder.load(below), builder.zext(smaller, integers)), below)
+        target = builder.inttoptr(builder.add(ranks, offset), integers.as_pointer())
+        builder.store(builder.load(below), target, align=8)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@intrinsic
+def lowest_bit(typingctx, mask):
+    """Place of the lowest bit that is set; ``mask`` must not be zero."""
+    signature = types.int64(types.int64)
+
+    def codegen(context, builder, sig, args):
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return signature, codegen
+
+
+@intrinsic
+def prefetch(typingctx, address):
+    """Ask for the cache line at ``address``, which is read some dozen operations later."""
+    signature = types.void(types.uintp)
+
+    def codegen(context, builder, sig, args):
+        pointer = ir.IntType(8).as_pointer()
+        i32 = ir.IntType(32)
+        function_type = ir.FunctionType(ir.VoidType(), [pointer, i32, i32, i32])
+        function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
+        hint = [ir.Constant(i32, 0), ir.Constant(i32, 3), ir.Constant(i32, 1)]
+        builder.call(function, [builder.inttoptr(args[0], pointer), *hint])
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _reinterpret(source, target):
+    @intrinsic
+    def reinterpret(typingctx, value):
+        signature = target(source)
+
+        def codegen(context, builder, sig, args):
+            return builder.bitcast(args[0], context.get_value_type(target))
+
+        return signature, codegen
+
+    return reinterpret
+
+
+float32_bits = _reinterpret(types.float32, types.uint32)
+float32_from_bits = _reinterpret(types.uint32, types.float32)
+float64_from_bits = _reinterpret(types.int64, types.float64)

@@ -1,0 +1,148 @@
+"""A hierarchy for packets of rays: boxes over blocks of eight Gaussians along a space-filling curve.
+
+It costs one sort and one pass over the Gaussians to build, 48 bytes a Gaussian, and needs no pointers:
+block b holds the Gaussians ``order[8 b : 8 b + 8]``, and box b of level l + 1 bounds the boxes 8 b to 8 b +
+7 of level l. A packet visits it once for all its rays, so that its boxes may be looser than those a single
+ray wants.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from engine.trace.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
+
+WIDTH = 8
+BOX_ROWS = 6
+"""Rows of a node: low x, y, z and high x, y, z of its eight boxes."""
+LEAF_ROWS = 9
+"""Rows of a block: mean x, y, z and the ellipse's legs R s2 r2 and R s3 r3 of its eight Gaussians."""
+MARGIN = 1.0 + 1e-5
+"""Legs are this much longer than the octagon's corners, which covers their rounding to float32."""
+LEFT_OUT = np.uint64(0xFFFFFFFFFFFFFFFF)
+"""Key of a Gaussian that has no octagon, or is not finite."""
+_CURVE_BITS = 19
+TOP_CELL = (1 << _CURVE_BITS) - 1
+_CLASSES = 32
+
+
+@njit(error_model="numpy")
+def _spread(x):
+    """Two zero bits between each of the low 21 bits."""
+    x = (x | (x << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
+    x = (x | (x << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
+    x = (x | (x << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
+    x = (x | (x << np.uint64(4))) & np.uint64(0x10C30C30C30C30C3)
+    return (x | (x << np.uint64(2))) & np.uint64(0x1249249249249249)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def curve_keys(records, low, inverse_cell, keys):
+    """Keys along a Z-order curve, by size class first: factors of four, the large ones in front.
+
+    Without the classes one large Gaussian would blow up its small neighbours' box.
+    """
+    for i in prange(len(records)):
+        radius = np.float64(records[i, INNER_RADIUS]) / COS_22
+        u2 = v2 = total = 0.0
+        for axis in range(3):
+            u2 += np.float64(records[i, AXIS_U + axis]) ** 2
+            v2 += np.float64(records[i, AXIS_V + axis]) ** 2
+            total += records[i, MEAN + axis]
+        size = radius / math.sqrt(min(u2, v2))
+        if not (radius > 0.0 and size < 1e30 and math.isfinite(total)):
+            keys[i] = LEFT_OUT
+            continue
+        level = min(int(0.5 * math.log2(max(size * inverse_cell, 1.0))), _CLASSES - 1)
+        key = np.uint64(_CLASSES - 1 - level) << np.uint64(3 * _CURVE_BITS)
+        for axis in range(3):
+            cell = (np.float64(records[i, MEAN + axis]) - low[axis]) * inverse_cell
+            key |= _spread(np.uint64(min(max(cell, 0.0), TOP_CELL))) << np.uint64(axis)
+        keys[i] = key
+
+
+@njit(error_model="numpy")
+def write_leaf(blocks, slot, records, i):
+    """Mean and legs of Gaussian ``i`` into its lane; a vanished octagon gets legs that are not a number."""
+    block, lane = slot // WIDTH, slot % WIDTH
+    radius = np.float64(records[i, INNER_RADIUS]) / COS_22 * MARGIN
+    u2 = v2 = 0.0
+    for axis in range(3):
+        u2 += np.float64(records[i, AXIS_U + axis]) ** 2
+        v2 += np.float64(records[i, AXIS_V + axis]) ** 2
+    # the record's axes are r2/s2 and r3/s3, and r2 s2 = axis / |axis|^2
+    scale_u = radius / u2 if radius > 0.0 else np.nan
+    scale_v = radius / v2 if radius > 0.0 else np.nan
+    for axis in range(3):
+        blocks[block, axis, lane] = records[i, MEAN + axis]
+        blocks[block, 3 + axis, lane] = records[i, AXIS_U + axis] * scale_u
+        blocks[block, 6 + axis, lane] = records[i, AXIS_V + axis] * scale_v
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def write_leaves(blocks, slots, records, order, padding, boxes):
+    """Blocks in curve order, each Gaussian's place in them, and the boxes of the blocks (level 0)."""
+    count = len(order)
+    for b in prange(len(blocks)):
+        lo0 = lo1 = lo2 = np.inf
+        hi0 = hi1 = hi2 = -np.inf
+        for lane in range(WIDTH):
+            k = b * WIDTH + lane
+            if k >= count:
+                for row in range(LEAF_ROWS):
+                    blocks[b, row, lane] = np.nan
+                continue
+            i = order[k]
+            slots[i] = k
+            write_leaf(blocks, k, records, i)
+            u0, u1, u2 = (
+                np.float64(blocks[b, 3, lane]),
+                np.float64(blocks[b, 4, lane]),
+                np.float64(blocks[b, 5, lane]),
+            )
+            v0, v1, v2 = (
+                np.float64(blocks[b, 6, lane]),
+                np.float64(blocks[b, 7, lane]),
+                np.float64(blocks[b, 8, lane]),
+            )
+            reach = padding * math.sqrt(max(u0 * u0 + u1 * u1 + u2 * u2, v0 * v0 + v1 * v1 + v2 * v2))
+            h0 = math.sqrt(u0 * u0 + v0 * v0) + reach
+            h1 = math.sqrt(u1 * u1 + v1 * v1) + reach
+            h2 = math.sqrt(u2 * u2 + v2 * v2) + reach
+            m0, m1, m2 = (
+                np.float64(blocks[b, 0, lane]),
+                np.float64(blocks[b, 1, lane]),
+                np.float64(blocks[b, 2, lane]),
+            )
+            h0 += 4e-6 * (abs(m0) + h0)
+            h1 += 4e-6 * (abs(m1) + h1)
+            h2 += 4e-6 * (abs(m2) + h2)
+            lo0, lo1, lo2 = min(lo0, m0 - h0), min(lo1, m1 - h1), min(lo2, m2 - h2)
+            hi0, hi1, hi2 = max(hi0, m0 + h0), max(hi1, m1 + h1), max(hi2, m2 + h2)
+        node, lane = b // WIDTH, b % WIDTH
+        boxes[node, 0, lane], boxes[node, 1, lane], boxes[node, 2, lane] = lo0, lo1, lo2
+        boxes[node, 3, lane], boxes[node, 4, lane], boxes[node, 5, lane] = hi0, hi1, hi2
+
+
+@njit(cache=True, error_model="numpy")
+def write_upper_levels(nodes, level_starts):
+    """Boxes of every level above the first; node k of a level bounds box k of the next."""
+    for level in range(1, len(level_starts) - 1):
+        below, here = level_starts[level - 1], level_starts[level]
+        for k in range(level_starts[level] - below):
+            child, parent, lane = below + k, here + k // WIDTH, k % WIDTH
+            for row in range(3):
+                low, high = nodes[child, row, 0], nodes[child, 3 + row, 0]
+                for other in range(1, WIDTH):
+                    low, high = min(low, nodes[child, row, other]), max(high, nodes[child, 3 + row, other])
+                nodes[parent, row, lane], nodes[parent, 3 + row, lane] = low, high
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def refresh_leaves(blocks, slots, records, ids):
+    """Rewrite the lanes of Gaussians whose records changed; boxes stay."""
+    for k in prange(len(ids)):
+        slot = slots[ids[k]]
+        if slot >= 0:
+            write_leaf(blocks, slot, records, ids[k])

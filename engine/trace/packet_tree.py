@@ -1,0 +1,67 @@
+"""The packets' hierarchy as arrays; :mod:`engine.trace.kernels_tree` says how they are laid out."""
+
+import numpy as np
+from jaxtyping import Float32, Int32, Int64
+
+from engine.trace.kernels_tree import (
+    BOX_ROWS,
+    LEAF_ROWS,
+    LEFT_OUT,
+    TOP_CELL,
+    WIDTH,
+    curve_keys,
+    refresh_leaves,
+    write_leaves,
+    write_upper_levels,
+)
+
+_SAMPLE = 4096
+
+
+class PacketTree:
+    """Eight boxes a node over blocks of eight Gaussians along a Z-order curve.
+
+    Args:
+        records: of all Gaussians; those without an octagon are left out. padding: fraction of its size by
+        which each Gaussian's box is enlarged, so that it may move until the next
+            build.
+    """
+
+    nodes: Float32[np.ndarray, "m 6 8"]
+    level_starts: Int64[np.ndarray, " l"]
+    blocks: Float32[np.ndarray, "b 9 8"]
+    order: Int32[np.ndarray, " k"]
+
+    def __init__(self, records: Float32[np.ndarray, "n 16"], padding: float) -> None:
+        count = len(records)
+        keys = np.empty(count, np.uint64)
+        low, cell = _grid(records[:, :3])
+        curve_keys(records, low, 1.0 / cell, keys)
+        order = np.argsort(keys, kind="stable").astype(np.int32)
+        self.order = order[: int(np.count_nonzero(keys != LEFT_OUT))]
+        blocks = -(-len(self.order) // WIDTH)
+        sizes = [max(1, -(-blocks // WIDTH))]
+        while sizes[-1] > 1:
+            sizes.append(-(-sizes[-1] // WIDTH))
+        self.level_starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        self.nodes = np.full((int(self.level_starts[-1]), BOX_ROWS, WIDTH), np.inf, np.float32)
+        self.nodes[:, 3:] = -np.inf  # boxes turned inside out are in no pyramid
+        self.blocks = np.empty((blocks, LEAF_ROWS, WIDTH), np.float32)
+        self._slots = np.full(count, -1, np.int32)
+        write_leaves(self.blocks, self._slots, records, self.order, padding, self.nodes)
+        write_upper_levels(self.nodes, self.level_starts)
+
+    def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
+        """Take the changed records of ``ids`` over; boxes stay."""
+        refresh_leaves(self.blocks, self._slots, records, ids)
+
+
+def _grid(means_world: Float32[np.ndarray, "n 3"]) -> tuple[np.ndarray, float]:
+    """Origin and cell size of the curve's grid: the box of the central 98 % with room around it."""
+    sample = means_world[:: max(1, len(means_world) // _SAMPLE)].astype(np.float64)
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    if len(sample) == 0:
+        return np.zeros(3), 1.0
+    low, high = np.quantile(sample, [0.01, 0.99], axis=0)
+    size = max(float((high - low).max()), 1e-30)
+    return low - 0.25 * size, 1.5 * size / TOP_CELL

@@ -1,0 +1,53 @@
+"""The held-out views of a dataset, measured and written."""
+
+import json
+import shutil
+
+import numpy as np
+
+from engine.evaluate.held_out import evaluate_held_out
+from engine.gaussians.model import FlatGaussians
+from engine.render.images import read_image, write_png
+from engine.scene import Dataset
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.trace.protocol import TraceSettings
+
+
+def test_photographs_that_differ_in_the_suffix_alone_both_get_a_render(tmp_path):
+    import pycolmap
+
+    root = tmp_path / "scene"
+    config = GeneratedSceneConfig(views=4, width_px=32, height_px=24, samples_per_side=1, points=100)
+    write_generated_scene(root, config)
+    model = pycolmap.Reconstruction(root / "sparse" / "0")
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    for image, name in zip(images, ("a.tif", "a.png", "b.png", "c.png"), strict=True):
+        source = root / "images" / image.name
+        write_png(root / "images" / "new.png", read_image(source)[..., :3])
+        shutil.move(root / "images" / "new.png", root / "images" / name)
+        source.unlink()
+        image.name = name
+    model.write(root / "sparse" / "0")
+    held_out = ["a.png", "a.tif"]
+    data = Dataset.open(root, tmp_path / "cache", held_out=held_out)
+    grey = FlatGaussians(
+        np.zeros((1, 3), np.float32),
+        np.array([[1, 0, 0, 0]], np.float32),
+        np.zeros((1, 2), np.float32),
+        np.zeros(1, np.float32),
+        np.zeros((1, 1, 3), np.float32),
+    )
+    output = tmp_path / "out"
+    evaluate_held_out(
+        data,
+        grey,
+        output,
+        settings=TraceSettings(),
+        background="black",
+        run={},
+        config={},
+        threads=1,
+        tell=lambda _event: None,
+    )
+    assert sorted(path.name for path in (output / "renders").iterdir()) == ["a.png.png", "a.tif.png"]
+    assert sorted(json.loads((output / "metrics.json").read_text())["views"]) == held_out

@@ -1,0 +1,190 @@
+"""Packets of rays: how they are found, and that they see what the slow twin and single rays see."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import trace_scenes
+from trace_scenes import (
+    assert_like_twin,
+    f32,
+    facing_z,
+    hit_lists,
+    make_cloud,
+    make_tracer,
+    random_gradients,
+    relative_error,
+    same_bits,
+    unit,
+)
+
+from engine.gaussians.model import concatenate
+from engine.trace.cpu import CpuTracer
+from engine.trace.packets import MAX_RAYS, PacketHits, find_packets
+from engine.trace.protocol import HitLists
+
+
+@pytest.fixture(autouse=True)
+def always_packets() -> Iterator[None]:
+    """Wide tiles make packets so small that single rays would be taken."""
+    trace_scenes.PACKETS[0] = "always"
+    yield
+    trace_scenes.PACKETS[0] = "auto"
+
+
+def tile_rays(
+    rng: np.random.Generator, tiles: int, *, side: int = 8, width: float = 0.2, distance: float = 3.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Square tiles of rays, each from a point of a sphere towards its middle."""
+    origins, directions = [], []
+    for _ in range(tiles):
+        origin = unit(rng.normal(size=3)) * distance
+        across = unit(np.cross(origin, rng.normal(size=3)))
+        up = np.cross(origin / distance, across)
+        middle = -origin / distance + 0.1 * rng.normal() * across
+        steps = np.linspace(-width / 2, width / 2, side)
+        a, b = (grid.reshape(-1, 1) for grid in np.meshgrid(steps, steps))
+        directions.append(unit(middle + a * across + b * up))
+        origins.append(np.broadcast_to(origin, (side * side, 3)))
+    return f32(np.concatenate(origins)), f32(np.concatenate(directions))
+
+
+def test_neighbours_with_one_origin_form_a_packet() -> None:
+    origins = f32(np.repeat([[0, 0, 0], [1, 0, 0], [0, 0, 0]], [3, 2, 1], axis=0))
+    directions = f32(np.tile([0, 0, 1], (6, 1)))
+    assert find_packets(origins, directions).tolist() == [0, 3, 5, 6]
+
+
+def test_a_packet_ends_where_it_is_full_or_looks_elsewhere() -> None:
+    count = MAX_RAYS + 5
+    origins = np.zeros((count, 3), np.float32)
+    directions = f32(np.tile([0, 0, 1], (count, 1)))
+    directions[2] = [0, 1, 0]
+    assert find_packets(origins, directions).tolist() == [0, 2, 3, 3 + MAX_RAYS, count]
+    assert find_packets(origins[:0], directions[:0]).tolist() == [0]
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_tiles_are_like_the_twin(rng: np.random.Generator, degree: int) -> None:
+    cloud = make_cloud(rng, 1000, degree=degree)
+    features = f32(rng.normal(size=(1000, degree)))
+    ours, _ = assert_like_twin(cloud, *tile_rays(rng, 4), features=features)
+    assert isinstance(ours.hits, PacketHits)
+    assert ours.hit_counts.mean() > 10
+
+
+@pytest.mark.parametrize("width", [0.01, 0.7])
+def test_narrow_and_wide_tiles_are_like_the_twin(rng: np.random.Generator, width: float) -> None:
+    cloud = make_cloud(rng, 1000)
+    ours, _ = assert_like_twin(cloud, *tile_rays(rng, 4, width=width))
+    assert isinstance(ours.hits, PacketHits)
+
+
+def test_rays_from_within_the_cloud(rng: np.random.Generator) -> None:
+    ours, _ = assert_like_twin(make_cloud(rng, 1000, size=0.15), *tile_rays(rng, 4, distance=0.3, width=0.8))
+    assert isinstance(ours.hits, PacketHits)
+
+
+def test_far_away_and_off_centre(rng: np.random.Generator) -> None:
+    cloud = make_cloud(rng, 1000)
+    origins, directions = tile_rays(rng, 4)
+    shift = f32([40.0, -25.0, 10.0])
+    cloud.means_world += shift
+    assert_like_twin(cloud, origins + shift, directions)
+
+
+def test_more_candidates_than_there_is_room_for_at_first(rng: np.random.Generator) -> None:
+    cloud = make_cloud(rng, 3000, size=0.3, logits=(-4.0, -2.0))
+    origins, directions = tile_rays(rng, 2, side=4)
+    packets, singles = (CpuTracer(packets=way) for way in ("always", "never"))
+    for tracer in (packets, singles):
+        tracer.build(cloud)
+    a, b = (tracer.trace(origins, directions, record=True) for tracer in (packets, singles))
+    assert a.hit_counts.max() > 100
+    assert isinstance(a.hits, PacketHits) and type(b.hits) is HitLists
+    assert hit_lists(a.hits) == hit_lists(b.hits)
+    np.testing.assert_allclose(a.rgb_srgb, b.rgb_srgb, atol=2e-6)
+
+
+def test_coincident_octagons_are_ordered_by_id(rng: np.random.Generator) -> None:
+    one = facing_z([[0, 0, 0]], scales=0.5, opacities=0.3)
+    many = concatenate([one] * 9)
+    many.sh = f32(rng.normal(size=many.sh.shape))
+    origins = np.tile(f32([0, 0, -2]), (16, 1))
+    directions = f32(unit(np.concatenate([rng.uniform(-0.1, 0.1, (16, 2)), np.ones((16, 1))], axis=1)))
+    tracer = make_tracer(many)
+    ours = tracer.trace(origins, directions, record=True)
+    assert isinstance(ours.hits, PacketHits)
+    assert hit_lists(ours.hits) == [list(range(9))] * 16
+
+
+def test_gradients_equal_those_of_single_rays(rng: np.random.Generator) -> None:
+    cloud = make_cloud(rng, 2000, degree=2)
+    origins, directions = tile_rays(rng, 6)
+    given = random_gradients(rng, len(origins))
+    found = []
+    for way in ("always", "never"):
+        tracer = CpuTracer(packets=way)
+        tracer.build(cloud)
+        seen = tracer.trace(origins, directions, record=True)
+        assert seen.hits is not None
+        found.append(tracer.backward(seen.hits, given))
+    a, b = found
+    np.testing.assert_array_equal(a.ids, b.ids)
+    np.testing.assert_array_equal(a.hit_counts, b.hit_counts)
+    for name in (
+        "means_world",
+        "quats_wxyz",
+        "log_scales",
+        "opacity_logits",
+        "sh",
+        "weight_sums",
+        "error_sums",
+    ):
+        assert relative_error(getattr(a, name), getattr(b, name)) < 2e-5, name
+
+
+def test_same_bits_on_any_number_of_threads(rng: np.random.Generator) -> None:
+    cloud = make_cloud(rng, 2000, degree=1)
+    origins, directions = tile_rays(rng, 12)
+    given = random_gradients(rng, len(origins))
+    seen, found = [], []
+    for threads in (1, 2):
+        tracer = CpuTracer(threads=threads)
+        tracer.build(cloud)
+        result = tracer.trace(origins, directions, record=True)
+        assert isinstance(result.hits, PacketHits)
+        found.append(tracer.backward(result.hits, given))
+        result.hits = None
+        seen.append(result)
+    same_bits(*seen)
+    same_bits(*found)
+
+
+def test_refresh_follows_parameters_inside_their_boxes(rng: np.random.Generator) -> None:
+    cloud = make_cloud(rng, 500)
+    origins, directions = tile_rays(rng, 4)
+    stale, fresh = CpuTracer(box_padding=0.5), CpuTracer()
+    stale.build(cloud)
+    stale.trace(origins, directions)
+    moved = np.arange(0, 500, 3, dtype=np.int32)
+    cloud.means_world[moved] += 0.003
+    cloud.log_scales[moved] += 0.05
+    cloud.opacity_logits[moved] -= 0.5
+    stale.refresh(moved)
+    fresh.build(cloud)
+    same_bits(stale.trace(origins, directions), fresh.trace(origins, directions))
+
+
+def test_a_gaussian_that_vanishes_is_not_seen(rng: np.random.Generator) -> None:
+    wall = facing_z([[0, 0, 0]], scales=5.0, opacities=0.9)
+    origins, directions = np.zeros((16, 3), np.float32), np.tile(f32([0, 0, 1]), (16, 1))
+    origins[:, 2] = -1
+    tracer = CpuTracer()
+    tracer.build(wall)
+    assert (tracer.trace(origins, directions).hit_counts == 1).all()
+    wall.opacity_logits[:] = -20.0
+    tracer.refresh()
+    assert (tracer.trace(origins, directions).hit_counts == 0).all()
+    tracer.build(wall)
+    assert (tracer.trace(origins, directions).transmittance == 1).all()

@@ -1,0 +1,69 @@
+"""Pixels lifted to points: they lie on the surfaces that the photographs show, in the colours shown there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from engine.scene import Dataset
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.scene.generated.arrangement import still_life
+from engine.train.dense_points import dense_points
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    root: Path = tmp_path_factory.mktemp("lifted")
+    config = GeneratedSceneConfig(views=24, width_px=160, height_px=120, points=1500, samples_per_side=1)
+    write_generated_scene(root / "scene", config)
+    return Dataset.open(root / "scene", root / "cache")
+
+
+@pytest.fixture(scope="module")
+def surface() -> cKDTree:
+    """300,000 points spread over the true surfaces, some 2 cm apart."""
+    rng = np.random.default_rng(1)
+    scene = still_life()
+    corners = scene.vertices.astype(np.float64)[scene.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = rng.choice(len(corners), 300_000, p=areas / areas.sum())
+    return cKDTree(np.einsum("nk,nkc->nc", rng.dirichlet([1, 1, 1], len(chosen)), corners[chosen]))
+
+
+def test_points_lie_on_the_surfaces(dataset: Dataset, surface: cKDTree) -> None:
+    xyz, rgb = dense_points(dataset, 3000, np.random.default_rng(0))
+    assert 1500 < len(xyz) <= 3000
+    assert xyz.dtype == rgb.dtype == np.float32
+    off, _ = surface.query(xyz.astype(np.float64))
+    # The room is 7 m wide; the table has a radius of 1 m.
+    assert np.median(off) < 0.06
+    assert (off < 0.3).mean() > 0.85
+
+
+def test_points_have_the_colour_of_their_pixels(dataset: Dataset) -> None:
+    xyz, rgb = dense_points(dataset, 1000, np.random.default_rng(0))
+    best = np.full(len(xyz), np.inf)
+    for index in dataset.train_indices:
+        view = dataset.views[index]
+        points_cam = xyz @ view.rotation_cam_from_world.T + view.translation_cam_from_world
+        where = np.floor(dataset.cameras[view.camera_index].project(points_cam.astype(np.float64)))
+        inside = ((where >= 0) & (where < [view.width_px, view.height_px])).all(axis=1) & (
+            points_cam[:, 2] > 0
+        )
+        pixel = where[inside].astype(np.int64)
+        shown, _, _ = dataset.pixels(np.full(len(pixel), index), pixel[:, 1], pixel[:, 0])
+        best[inside] = np.minimum(best[inside], np.abs(shown - rgb[inside]).max(axis=1))
+    # Each was taken from some view; projecting it back may land one pixel beside.
+    assert (best < 1e-3).mean() > 0.9
+
+
+def test_same_seed_same_points(dataset: Dataset) -> None:
+    first, second = (dense_points(dataset, 500, np.random.default_rng(3)) for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_none_wanted_none_found(dataset: Dataset) -> None:
+    xyz, rgb = dense_points(dataset, 0, np.random.default_rng(0))
+    assert xyz.shape == rgb.shape == (0, 3)
