@@ -38,6 +38,7 @@ from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig
+from engine.train.dense_points import dense_points
 from engine.train.initialise import from_points, from_rays
 from engine.train.trainer import Trainer, fresh_state, trace_settings
 
@@ -283,12 +284,17 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig) -> FlatGaussians:
     points = dataset.points
     if len(points.xyz_world) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
+        limit = min(config.initial_points, config.max_gaussians)
+        xyz, rgb = points.xyz_world, points.rgb_srgb
+        if config.lift_pixels and len(xyz) < limit:
+            more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng)
+            xyz, rgb = np.concatenate([xyz, more_xyz]), np.concatenate([rgb, more_rgb])
         return from_points(
-            points.xyz_world,
-            points.rgb_srgb,
+            xyz,
+            rgb,
             centres,
             extent=dataset.extent,
-            limit=min(config.initial_points, config.max_gaussians),
+            limit=limit,
             opacity=config.initial_opacity,
             rng=rng,
         )

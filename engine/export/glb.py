@@ -5,12 +5,14 @@ pixel (to the 8 bits of the texture). COLOR_0 is float32, as some programs misre
 linear colours are too coarse in the dark. Vertices stay in the world frame of COLMAP (y down, z forward); a
 half turn about x in the root node brings them to glTF's (y up). The scene is cut into spatial chunks, each
 with its own node, because viewers sort transparent objects, not triangles.
+
+The opaque variant needs no sorting: alpha is cut at a threshold (``alphaMode`` MASK), and each octagon
+shrinks to the ellipse that is left of it.
 """
 
-import json
+import itertools
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from jaxtyping import Float32, Int
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
+from engine.export.glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout, padded
 from engine.export.octagon_soup import OctagonBatch, OctagonSoup
 from engine.export.options import ExportOptions
 from engine.export.radial_alpha import white_with_alpha_png
@@ -25,161 +28,90 @@ from engine.export.registry import Exporter, register
 from engine.export.spatial import kd_chunks
 from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import FAN, SIDES, octagon_triangles
+from engine.gaussians.octagon import SIDES, octagon_triangles
 
-MAX_CHUNKS = 64
 MAX_BYTES = 2**32 - 1
 """A GLB states its length in 32 bits."""
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-FLOAT, UNSIGNED_INT = 5126, 5125
-LINEAR, CLAMP_TO_EDGE = 9729, 33071
-WIDEST_NUMBER = float(np.float32(-1.1754943508222875e-38))
-HALF_TURN_ABOUT_X = [1.0, 0.0, 0.0, 0.0]
-"""glTF writes quaternions x, y, z, w."""
 
-
-@dataclass(frozen=True)
-class Attribute:
-    """A vertex attribute of glTF: its semantic and how many floats it has."""
-
-    semantic: str
-    width: int
-
-    @property
-    def type(self) -> str:
-        """The shape, as glTF names it."""
-        return "SCALAR" if self.width == 1 else f"VEC{self.width}"
-
-
-OWN_ATTRIBUTES = (Attribute("POSITION", 3), Attribute("COLOR_0", 4), Attribute("TEXCOORD_0", 2))
-GID = Attribute("_GID", 1)
-CORNER = Attribute("_CORNER", 1)
-Bounds = tuple[list[float], list[float]]
-
-
-class _Layout:
-    """Where all lies in the binary part: texture, indices and corner numbers (shared), then the chunks."""
-
-    def __init__(self, chunk_sizes: list[int], png: bytes, options: ExportOptions, scene_size: int) -> None:
-        self.chunk_sizes = chunk_sizes
-        self.options = options
-        self.scene_size = scene_size
-        self.largest = max(chunk_sizes)
-        self.attributes = (*OWN_ATTRIBUTES, *((GID,) if options.ids else ()))
-        self.views: list[dict[str, object]] = []
-        self.length = 0
-        self._add_view(len(png))
-        self._add_view(self.largest * len(FAN) * 3 * 4, target=ELEMENT_ARRAY_BUFFER)
-        if options.ids:
-            self._add_view(self.largest * SIDES * 4, target=ARRAY_BUFFER, byteStride=4)
-        self.shared_views = len(self.views)
-        for size in chunk_sizes:
-            for attribute in self.attributes:
-                self._add_view(size * SIDES * attribute.width * 4, target=ARRAY_BUFFER)
-
-    def _add_view(self, length: int, **keys: int) -> None:
-        self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": length, **keys})
-        self.length += _padded(length)
-
-    def document(self, bounds: list[Bounds]) -> dict[str, object]:
-        """The JSON part, given each chunk's smallest and largest coordinates."""
-        accessors: list[dict[str, object]] = []
-        meshes: list[dict[str, object]] = []
-        for chunk, size in enumerate(self.chunk_sizes):
-            used: dict[str, int] = {}
-            first_view = self.shared_views + chunk * len(self.attributes)
-            for place, attribute in enumerate(self.attributes):
-                used[attribute.semantic] = len(accessors)
-                accessors.append(_accessor(first_view + place, FLOAT, size * SIDES, attribute.type))
-            accessors[used["POSITION"]] |= {"min": bounds[chunk][0], "max": bounds[chunk][1]}
-            if self.options.ids:
-                used[CORNER.semantic] = len(accessors)
-                accessors.append(_accessor(2, FLOAT, size * SIDES, CORNER.type))
-            accessors.append(_accessor(1, UNSIGNED_INT, size * len(FAN) * 3, "SCALAR"))
-            meshes.append(
-                {"primitives": [{"attributes": used, "indices": len(accessors) - 1, "material": 0}]}
-            )
-        chunks = range(len(self.chunk_sizes))
-        nodes: list[dict[str, object]] = [
-            {"name": "octasplat", "rotation": HALF_TURN_ABOUT_X, "children": [1 + chunk for chunk in chunks]},
-            *({"name": f"octagons_{chunk:02d}", "mesh": chunk} for chunk in chunks),
-        ]
-        return {
-            "asset": {"version": "2.0", "generator": "octasplat", "extras": self._extras()},
-            "extensionsUsed": ["KHR_materials_unlit"],
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": nodes,
-            "meshes": meshes,
-            "materials": [MATERIAL],
-            "textures": [{"sampler": 0, "source": 0}],
-            "samplers": [
-                {"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
-            ],
-            "images": [{"name": "radial_alpha", "mimeType": "image/png", "bufferView": 0}],
-            "accessors": accessors,
-            "bufferViews": self.views,
-            "buffers": [{"byteLength": self.length}],
-        }
-
-    def _extras(self) -> dict[str, object]:
-        return {"octasplat_q": self.options.q, "octasplat_gaussians": self.scene_size}
-
-
-MATERIAL: dict[str, object] = {
-    "name": "octagons",
-    "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0},
-    "extensions": {"KHR_materials_unlit": {}},
-    "alphaMode": "BLEND",
-    "doubleSided": True,
-}
+Chunks = list[Int[np.ndarray, "_"]]
 
 
 def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
-    """Write the octagons as unlit, blended meshes; memory stays at one chunk's vertices.
+    """Write the octagons as unlit meshes; memory stays at one chunk's vertices.
+
+    A scene for which one file is too small goes into ``path``, ``<stem>.part2.glb`` and so on, by chunks.
 
     Raises:
-        SceneFileError: nothing to write, or more than the 4 GiB that a GLB can hold.
+        SceneFileError: nothing to write, or a chunk that is larger than the 4 GiB that a GLB can hold.
     """
-    soup = OctagonSoup(gaussians, path, options)
-    chunks = kd_chunks(soup.means_world, MAX_CHUNKS)
+    soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
     png = white_with_alpha_png(options.texture_size, options.q)
-    layout = _Layout([len(chunk) for chunk in chunks], png, options, soup.scene_size)
-    # The JSON comes first in the file but holds the bounds of all vertices, so room is kept for the longest.
-    widest = ([WIDEST_NUMBER] * 3, [WIDEST_NUMBER] * 3)
-    room = _padded(len(_encode(layout.document([widest] * len(chunks)))))
-    total = 12 + 8 + room + 8 + layout.length
-    if total > MAX_BYTES:
-        raise SceneFileError(
-            f"{path}: not written; {len(soup)} octagons need {total / 2**30:.1f} GiB, and a GLB holds "
-            "at most 4. Leave faint Gaussians out with min_opacity, or export a mesh PLY."
-        )
-    try:
-        with replacing(path) as temporary, temporary.open("wb") as handle:
-            handle.write(struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", room, b"JSON"))
-            handle.seek(room, 1)
-            handle.write(struct.pack("<I4s", layout.length, b"BIN\0"))
-            bounds: list[Bounds] = []
-            for data in _shared_data(layout, png):
+    parts = _parts(soup, path, len(png), options)
+    paths = [path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, len(parts) + 1))]
+    for part_path, (layout, chunks) in zip(paths, parts, strict=True):
+        try:
+            _write_file(part_path, layout, soup, chunks, png, options.ids)
+        except OSError as error:
+            raise SceneFileError(f"{part_path}: cannot be written ({error.strerror or error}).") from error
+    return tuple(paths)
+
+
+def _parts(
+    soup: OctagonSoup, path: Path, png_size: int, options: ExportOptions
+) -> list[tuple[GlbLayout, Chunks]]:
+    """The fewest files that hold all chunks; neighbouring chunks stay together."""
+    chunks = kd_chunks(soup.means_world, options.chunks)
+    for count in range(1, len(chunks) + 1):
+        bounds = np.linspace(0, len(chunks), count + 1).astype(int).tolist()
+        groups = [chunks[start:end] for start, end in itertools.pairwise(bounds)]
+        parts = [
+            (GlbLayout([len(chunk) for chunk in group], png_size, options, extras), group)
+            for group, extras in zip(groups, _extras(soup, options, count), strict=True)
+        ]
+        if all(layout.total <= MAX_BYTES for layout, _ in parts):
+            return parts
+    largest = max(layout.total for layout, _ in parts)
+    raise SceneFileError(
+        f"{path}: not written; its largest chunk needs {largest / 2**30:.1f} GiB, and a GLB holds at most 4. "
+        "Allow more chunks, leave faint Gaussians out with min_opacity, or export a mesh PLY."
+    )
+
+
+def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[str, object]]:
+    """What each file says of itself: enough for an edited mesh to find back to its Gaussians."""
+    extras: dict[str, object] = {"octasplat_q": options.q, "octasplat_gaussians": soup.scene_size}
+    if options.opaque:
+        extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF
+    return [extras | ({"octasplat_part": [part, parts]} if parts > 1 else {}) for part in range(1, parts + 1)]
+
+
+def _write_file(
+    path: Path, layout: GlbLayout, soup: OctagonSoup, chunks: Chunks, png: bytes, ids: bool
+) -> None:
+    with replacing(path) as temporary, temporary.open("wb") as handle:
+        handle.write(struct.pack("<4sII", b"glTF", 2, layout.total))
+        handle.write(struct.pack("<I4s", layout.json_room, b"JSON"))
+        json_start = handle.tell()
+        handle.seek(layout.json_room, 1)
+        handle.write(struct.pack("<I4s", layout.length, b"BIN\0"))
+        for data in _shared_data(layout, png, ids):
+            handle.write(data)
+        bounds: list[Bounds] = []
+        for chunk in chunks:
+            batch = soup.batch(chunk)
+            for data in _chunk_data(batch, ids):
                 handle.write(data)
-            for chunk in chunks:
-                batch = soup.batch(chunk)
-                for data in _chunk_data(batch, options.ids):
-                    handle.write(data)
-                corners = batch.corners_world.reshape(-1, 3)
-                bounds.append((corners.min(axis=0).tolist(), corners.max(axis=0).tolist()))
-            assert handle.tell() == total
-            handle.seek(20)
-            handle.write(_encode(layout.document(bounds)).ljust(room))
-    except OSError as error:
-        raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
-    return (path,)
+            corners = batch.corners_world.reshape(-1, 3)
+            bounds.append((corners.min(axis=0).tolist(), corners.max(axis=0).tolist()))
+        assert handle.tell() == layout.total
+        handle.seek(json_start)
+        handle.write(layout.json(bounds).ljust(layout.json_room))
 
 
-def _shared_data(layout: _Layout, png: bytes) -> Iterator[bytes]:
-    yield png.ljust(_padded(len(png)), b"\0")
+def _shared_data(layout: GlbLayout, png: bytes, ids: bool) -> Iterator[bytes]:
+    yield png.ljust(padded(len(png)), b"\0")
     yield octagon_triangles(layout.largest).astype("<u4").tobytes()
-    if layout.options.ids:
+    if ids:
         yield np.tile(np.arange(SIDES, dtype="<f4"), layout.largest).tobytes()
 
 
@@ -195,18 +127,6 @@ def _chunk_data(batch: OctagonBatch, ids: bool) -> Iterator[bytes]:
 
 def _per_corner(values: Float32[np.ndarray, "n c"] | Int[np.ndarray, "n c"]) -> Float32[np.ndarray, "m c"]:
     return np.repeat(values.astype("<f4"), SIDES, axis=0)
-
-
-def _accessor(view: int, component: int, count: int, kind: str) -> dict[str, object]:
-    return {"bufferView": view, "componentType": component, "count": count, "type": kind}
-
-
-def _padded(length: int) -> int:
-    return -(-length // 4) * 4
-
-
-def _encode(document: dict[str, object]) -> bytes:
-    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
 register(Exporter("glb", ("*.glb",), "octagon mesh as GLB with opacity and fall-off, for looking at", write))

@@ -1,5 +1,6 @@
 """What all mesh formats write: the octagons of a scene, with their texture coordinates and colours."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from jaxtyping import Float32, Int
 from engine.errors import SceneFileError
 from engine.export.options import ExportOptions
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import corner_directions, octagon_corners_world, octagon_radii
+from engine.gaussians.octagon import APOTHEM, corner_directions, octagon_corners_world, octagon_radii
 
 MAX_FLOAT_ID = 1 << 24
 """Numbers below this are exact in float32, the only type that mesh editors keep for custom attributes."""
@@ -50,8 +51,12 @@ class OctagonSoup:
         q: the chi-square quantile that the radii come from.
     """
 
-    def __init__(self, gaussians: FlatGaussians, path: Path, options: ExportOptions) -> None:
+    def __init__(
+        self, gaussians: FlatGaussians, path: Path, options: ExportOptions, alpha_cutoff: float | None = None
+    ) -> None:
         """Pick the Gaussians to write; ``path`` only names the file in errors.
+
+        With ``alpha_cutoff`` each octagon is only as large as the ellipse in which alpha reaches that.
 
         Raises:
             SceneFileError: no octagons, values that are not finite, or too many Gaussians to number.
@@ -69,6 +74,9 @@ class OctagonSoup:
         self._gaussians = gaussians
         self._opacities = gaussians.opacities
         self._radii = octagon_radii(self._opacities, options.q)
+        if alpha_cutoff is not None:
+            around = octagon_radii(self._opacities, -2.0 * math.log(alpha_cutoff)) / np.float32(APOTHEM)
+            self._radii = np.minimum(self._radii, around)
         self.ids = np.flatnonzero((self._radii > 0.0) & (self._opacities >= options.min_opacity))
         if not len(self.ids):
             raise SceneFileError(

@@ -1,5 +1,7 @@
 """Settings shared by all export formats."""
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from engine.gaussians.octagon import CHI2_2_99
@@ -15,6 +17,9 @@ class ExportOptions(BaseModel):
         texture_size: side of the radial alpha texture of GLB and OBJ, in pixels.
         ids: GLB: write the vertex attributes ``_GID`` and ``_CORNER``, by which an edited mesh finds back to
             its Gaussians.
+        chunks: GLB: most spatial chunks, a power of two or rounded down to one; viewers sort the chunks.
+        opaque: GLB: cut alpha at a threshold instead of blending it, so that viewers have nothing to sort.
+        spz_version: SPZ: 3 (gzip), which every viewer reads, or 4 (Zstandard).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -24,3 +29,6 @@ class ExportOptions(BaseModel):
     sh_pad_degree: int | None = Field(default=None, ge=0, le=3)
     texture_size: int = Field(default=128, ge=8, le=4096)
     ids: bool = True
+    chunks: int = Field(default=64, ge=1, le=4096)
+    opaque: bool = False
+    spz_version: Literal[3, 4] = 3

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 SMALLEST_CHUNK = 256
 
 
-def kd_chunks(points_world: Float[np.ndarray, "n 3"], max_chunks: int) -> list[Int[np.ndarray, " m"]]:
+def kd_chunks(points_world: Float[np.ndarray, "n 3"], max_chunks: int) -> list[Int[np.ndarray, "_"]]:
     """Indices of ``points_world`` in spatially compact chunks of equal size (give or take one point).
 
     Each part is halved at the median along the axis on which it spreads most, while there may be twice as

@@ -7,15 +7,14 @@ every viewer of 3DGS files shows the scene.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
 
 from engine.errors import SceneFileError
-from engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
+from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply_format import (
     PlyElement,
     PlyWriteElement,
@@ -25,41 +24,12 @@ from engine.gaussians.ply_format import (
     write_ply,
 )
 
-FLAT_LOG_SCALE = np.float32(np.log(FLAT_SCALE))
 MAX_SH_DEGREE = 3
-LARGEST_LOGIT = np.float32(16.0)
-"""Stands for an infinite logit, which converters write for opacity 1; its sigmoid is 1 - 1e-7."""
 ROWS_AT_ONCE = 65536
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-_CYCLIC_TURNS = np.array([[1, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5]], dtype=np.float32)
-"""Quaternions of P_k, whose columns are the axes k, k+1, k+2 (mod 3): they turn axis k into the first."""
-
-
-@dataclass(frozen=True)
-class ImportReport:
-    """What reading a file of Gaussians found, and what it lost.
-
-    Attributes:
-        count: number of Gaussians.
-        sh_degree: degree of their spherical harmonics.
-        scale_count: scales per Gaussian in the file, 2 or 3.
-        flattened: Gaussians thicker than the flat scale, whose smallest extent was dropped.
-        median_thickness: over the flattened ones, median of smallest / second-smallest scale (1 = a ball or a
-            needle, no surface at all; 0 if none was flattened).
-        max_thickness: the largest such ratio.
-        saturated: opacities of exactly 0 or 1, whose infinite logits became -16 or 16.
-    """
-
-    count: int
-    sh_degree: int
-    scale_count: int
-    flattened: int
-    median_thickness: float
-    max_thickness: float
-    saturated: int
 
 
 def write_gaussian_ply(gaussians: FlatGaussians, path: Path, *, sh_pad_degree: int | None = None) -> None:
@@ -108,28 +78,39 @@ def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void])
 
 
 def read_gaussian_ply(
-    path: Path, *, two_scale_normal: Literal[0, 2] = 0
+    path: Path, *, two_scale_normal: Literal[0, 2] = 0, drop_invalid: bool = False
 ) -> tuple[FlatGaussians, ImportReport]:
     """Read a PLY of Gaussians, flat or not, by property name.
 
     Properties may come in any order and numeric type, ascii or binary; unknown ones are ignored. A Gaussian
-    with three scales is flattened along its smallest one by relabelling its axes, which changes neither the
-    directions of the other two nor their scales; a file of ours comes back bit for bit.
+    with three scales is flattened along its smallest one; a file of ours comes back bit for bit.
 
     Args:
         path: the file.
         two_scale_normal: which axis is the normal in a file with two scales: 0 as GaMeS writes it, 2 as
             2DGS does.
+        drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
 
     Raises:
         SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, lacks a
             property, or holds values that are not finite.
     """
+    cloud = read_ply_cloud(path)
+    return flatten(cloud, path, two_scale_normal=two_scale_normal, drop_invalid=drop_invalid)
+
+
+def read_ply_cloud(path: Path) -> GaussianCloud:
+    """The Gaussians of a PLY as they are in the file, found by property name.
+
+    Raises:
+        SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, or lacks a
+            property.
+    """
     header = read_ply_header(path)
     vertex = header.element("vertex")
     if header.element("chunk") is not None or (vertex is not None and "packed_position" in vertex.names):
         raise SceneFileError(
-            f"{path}: is a compressed PLY, which is not read yet; convert it to a standard 3DGS PLY first."
+            f"{path}: is a compressed PLY; octasplat import turns it into a standard 3DGS PLY."
         )
     if vertex is None:
         raise SceneFileError(f"{path}: has no element 'vertex', so it holds no Gaussians.")
@@ -137,33 +118,15 @@ def read_gaussian_ply(
     if vertex.count == 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
     table = read_ply(path, ["vertex"])[1]["vertex"]
-    means, quats = columns(table, _POSITION), columns(table, _ROTATION)
-    scales = columns(table, _scale_names(scale_count))
-    logits = columns(table, ["opacity"])[:, 0]
-    infinite = np.isinf(logits)
-    logits[infinite] = np.copysign(LARGEST_LOGIT, logits[infinite])
     colours = columns(table, [*_SH_DC, *(f"f_rest_{k}" for k in range(rest_count))])
-    _check_values(
-        path, {"position": means, "rotation": quats, "scale": scales, "opacity": logits, "colour": colours}
-    )
     rest = colours[:, 3:].reshape(len(table), 3, rest_count // 3).transpose(0, 2, 1)
-    sh = np.ascontiguousarray(np.concatenate([colours[:, None, :3], rest], axis=1))
-    if scale_count == 3:
-        quats, in_plane, thickness = _flatten(quats, scales)
-    else:
-        quats, thickness = _turn(quats, np.full(len(table), two_scale_normal)), np.empty(0)
-        in_plane = scales
-    gaussians = FlatGaussians(means, quats, in_plane, logits, sh)
-    report = ImportReport(
-        count=len(gaussians),
-        sh_degree=gaussians.sh_degree,
-        scale_count=scale_count,
-        flattened=len(thickness),
-        median_thickness=float(np.median(thickness)) if len(thickness) else 0.0,
-        max_thickness=float(thickness.max()) if len(thickness) else 0.0,
-        saturated=int(infinite.sum()),
+    return GaussianCloud(
+        means_world=columns(table, _POSITION),
+        quats_wxyz=columns(table, _ROTATION),
+        log_scales=columns(table, _scale_names(scale_count)),
+        opacity_logits=columns(table, ["opacity"])[:, 0],
+        sh=np.ascontiguousarray(np.concatenate([colours[:, None, :3], rest], axis=1)),
     )
-    return gaussians, report
 
 
 def _rest_names(degree: int) -> list[str]:
@@ -202,50 +165,3 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
             f"{path}: property '{lists[0]}' of element 'vertex' is a list; Gaussians have scalars only."
         )
     return rest_count, scale_count
-
-
-def _check_values(path: Path, values: dict[str, np.ndarray]) -> None:
-    for what, array in values.items():
-        bad = int((~np.isfinite(array.reshape(len(array), -1))).any(axis=1).sum())
-        if bad:
-            raise SceneFileError(
-                f"{path}: {bad} of {len(array)} Gaussians have no finite {what}; "
-                "remove them and save the file again."
-            )
-    zero = int((values["rotation"] == 0).all(axis=1).sum())
-    if zero:
-        raise SceneFileError(
-            f"{path}: {zero} of {len(values['rotation'])} Gaussians have a rotation of length zero."
-        )
-
-
-def _flatten(
-    quats_wxyz: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 3"]
-) -> tuple[Float32[np.ndarray, "n 4"], Float32[np.ndarray, "n 2"], Float32[np.ndarray, " m"]]:
-    """Make the smallest axis the normal; also the thickness ratio of those that were not flat already.
-
-    Axis 0 wins ties, and always where it holds our own flat scale, so that our own files stay as they are.
-    """
-    axis = np.where(log_scales[:, 0] == FLAT_LOG_SCALE, 0, np.argmin(log_scales, axis=1))
-    order = (axis[:, None] + np.arange(3)) % 3
-    turned = np.take_along_axis(log_scales, order, axis=1)
-    in_plane = np.ascontiguousarray(turned[:, 1:])
-    thick: Bool[np.ndarray, " n"] = turned[:, 0] > FLAT_LOG_SCALE
-    ratios = np.exp(turned[thick, 0] - in_plane[thick].min(axis=1))
-    return _turn(quats_wxyz, axis), in_plane, ratios
-
-
-def _turn(quats_wxyz: Float32[np.ndarray, "n 4"], axis: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 4"]:
-    """Quaternions of R P_axis; those of axis 0 keep every bit, and no length changes."""
-    w, x, y, z = quats_wxyz.T
-    a, b, c, d = _CYCLIC_TURNS[axis].T
-    product = np.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        axis=-1,
-    )
-    return np.where((axis == 0)[:, None], quats_wxyz, product)

@@ -10,6 +10,7 @@ import pytest
 import engine.export.glb as glb_module
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
+from engine.export.glb_layout import OPAQUE_CUTOFF
 from engine.export.options import ExportOptions
 from engine.export.radial_alpha import radial_alpha
 from engine.export.registry import export_scene
@@ -197,3 +198,50 @@ def test_more_than_a_glb_can_hold_is_refused_before_writing(
     with pytest.raises(SceneFileError, match=r"c\.glb: not written; .*min_opacity.*mesh PLY"):
         export_scene(scene, tmp_path / "c.glb")
     assert not (tmp_path / "c.glb").exists()
+
+
+def test_a_scene_too_large_for_one_file_goes_into_several(
+    make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene(5000)
+    export_scene(scene, tmp_path / "whole.glb")
+    whole = Glb(tmp_path / "whole.glb")
+    limit = int(0.45 * (tmp_path / "whole.glb").stat().st_size)
+    monkeypatch.setattr(glb_module, "MAX_BYTES", limit)
+    written = export_scene(scene, tmp_path / "a.glb")
+    assert [path.name for path in written] == ["a.glb", "a.part2.glb", "a.part3.glb"]
+    assert all(path.stat().st_size <= limit for path in written)
+    parts = [Glb(path) for path in written]
+    assert [part.json["asset"]["extras"]["octasplat_part"] for part in parts] == [[1, 3], [2, 3], [3, 3]]
+    assert all(part.json["asset"]["extras"]["octasplat_gaussians"] == 5000 for part in parts)
+    assert "octasplat_part" not in whole.json["asset"]["extras"]
+    together = [arrays for part in parts for arrays in part.primitives()]
+    for ours, expected in zip(together, whole.primitives(), strict=True):
+        for name in expected:
+            np.testing.assert_array_equal(ours[name], expected[name])
+
+
+@pytest.mark.parametrize(("chunks", "expected"), [(1, 1), (4, 4), (7, 4), (4096, 8)])
+def test_as_many_chunks_as_asked_for(make_scene: Make, tmp_path: Path, chunks: int, expected: int) -> None:
+    export_scene(make_scene(3000), tmp_path / "a.glb", ExportOptions(chunks=chunks))
+    assert len(Glb(tmp_path / "a.glb").primitives()) == expected
+
+
+def test_the_opaque_variant_cuts_alpha_and_loses_nothing_above_the_cut(
+    make_scene: Make, tmp_path: Path
+) -> None:
+    scene = make_scene(2000)
+    export_scene(scene, tmp_path / "a.glb", ExportOptions(opaque=True, chunks=1))
+    glb = Glb(tmp_path / "a.glb")
+    (material,) = glb.json["materials"]
+    assert material["alphaMode"] == "MASK" and material["alphaCutoff"] == OPAQUE_CUTOFF
+    (arrays,) = glb.primitives()
+    ids = arrays["_GID"][::8].astype(int)
+    np.testing.assert_array_equal(ids, np.flatnonzero(scene.opacities > OPAQUE_CUTOFF))
+    # Half way along an edge an octagon is narrowest; alpha must have fallen to the cut there, but not far.
+    middles = 0.5 * (
+        arrays["TEXCOORD_0"] + np.roll(arrays["TEXCOORD_0"].reshape(-1, 8, 2), 1, 1).reshape(-1, 2)
+    )
+    rho2 = ExportOptions().q * np.sum((2 * middles.astype(np.float64) - 1) ** 2, axis=1)
+    alpha = arrays["COLOR_0"][:, 3] * np.exp(-rho2 / 2)
+    np.testing.assert_allclose(alpha, OPAQUE_CUTOFF, rtol=1e-4)

@@ -118,3 +118,25 @@ def test_obj_texture_is_the_fall_off_as_grey(make_scene: Make, tmp_path: Path) -
     x = (np.arange(32) + 0.5) / 16 - 1
     expected = np.exp(-0.5 * 6.0 * (x**2 + x[:, None] ** 2))
     np.testing.assert_allclose(pixels[..., 0] / 255.0, expected, atol=0.5 / 255 + 1e-9)
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.mesh.ply"])
+def test_trimesh_reads_the_same_octagons_colours_and_texture_coordinates(
+    make_scene: Make, tmp_path: Path, name: str
+) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    scene = make_scene(200)
+    export_scene(scene, tmp_path / name)
+    mesh = trimesh.load(tmp_path / name, process=False, maintain_order=True)
+    radii = octagon_radii(scene.opacities)
+    ids = np.flatnonzero(radii > 0)
+    np.testing.assert_array_equal(mesh.faces, octagon_triangles(len(ids)))
+    np.testing.assert_array_equal(
+        mesh.vertices.astype(np.float32).reshape(-1, 8, 3), octagon_corners_world(scene, radii)[ids]
+    )
+    np.testing.assert_allclose(
+        mesh.visual.uv.reshape(-1, 8, 2), expected_uv(radii[ids], CHI2_2_99), atol=1e-6
+    )
+    colours = np.asarray(mesh.vertex_attributes["color"])[::8, :3].astype(np.float64)
+    colours /= 255.0 if colours.max() > 1.0 else 1.0
+    np.testing.assert_allclose(colours, np.clip(scene.base_rgb_srgb, 0, 1)[ids], atol=0.51 / 255)

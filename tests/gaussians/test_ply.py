@@ -256,7 +256,7 @@ def test_lists_and_compressed_files_are_refused(make_gaussians: Make, tmp_path: 
         b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n"
         b"element vertex 1\nproperty uint packed_position\nend_header\n" + bytes(8)
     )
-    with pytest.raises(SceneFileError, match="compressed PLY, which is not read yet"):
+    with pytest.raises(SceneFileError, match="is a compressed PLY; octasplat import"):
         read_gaussian_ply(path)
 
 

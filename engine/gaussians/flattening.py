@@ -1,0 +1,193 @@
+"""From the three-dimensional Gaussians of other programs to flat ones, and what that loses."""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+
+from engine.errors import SceneFileError
+from engine.gaussians.model import FLAT_SCALE, FlatGaussians
+
+FLAT_LOG_SCALE = np.float32(np.log(FLAT_SCALE))
+ROUNDING = np.float32(1e-5)
+"""The flat ln scale may be off by this in formats that hold the scale itself."""
+LARGEST_LOGIT = np.float32(16.0)
+"""Stands for an infinite logit, which converters write for opacity 1; its sigmoid is 1 - 1e-7."""
+THICK = 0.5
+"""Gaussians whose thickness is more than this share of their next extent are no surfaces."""
+_CYCLIC_TURNS = np.array([[1, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5]], dtype=np.float32)
+"""Quaternions of P_k, whose columns are the axes k, k+1, k+2 (mod 3): they turn axis k into the first."""
+
+
+@dataclass(frozen=True)
+class GaussianCloud:
+    """Gaussians as a file holds them, flat or not; values may be anything, even not finite.
+
+    Attributes:
+        means_world: centres, world units.
+        quats_wxyz: rotations, not necessarily of unit length.
+        log_scales: ln of the standard deviations along all three axes, or along the two in the plane.
+        opacity_logits: opacity is their sigmoid; infinite where it is 0 or 1.
+        sh: coefficients of the display colour, coefficient-major, as in
+            :class:`engine.gaussians.model.FlatGaussians`.
+        notes: what the reader of the file left out or had to assume, one sentence each.
+    """
+
+    means_world: Float32[np.ndarray, "n 3"]
+    quats_wxyz: Float32[np.ndarray, "n 4"]
+    log_scales: Float32[np.ndarray, "n s"]
+    opacity_logits: Float32[np.ndarray, " n"]
+    sh: Float32[np.ndarray, "n k 3"]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What reading a file of Gaussians found, and what it lost.
+
+    Attributes:
+        count: number of Gaussians read.
+        sh_degree: degree of their spherical harmonics.
+        scale_count: scales per Gaussian in the file, 2 or 3.
+        flattened: Gaussians thicker than the flat scale, whose smallest extent was dropped.
+        median_thickness: over the flattened ones, median of smallest / second-smallest scale (1 = a ball or a
+            needle, no surface at all; 0 if none was flattened).
+        max_thickness: the largest such ratio.
+        saturated: opacities of exactly 0 or 1, whose infinite logits became -16 or 16.
+        thick: Gaussians whose ratio is more than ``THICK``, which a flat one cannot stand for.
+        dropped: Gaussians left out because a value was not finite or a rotation had no length.
+        notes: what else the reader left out or assumed, one sentence each.
+    """
+
+    count: int
+    sh_degree: int
+    scale_count: int
+    flattened: int
+    median_thickness: float
+    max_thickness: float
+    saturated: int
+    thick: int = 0
+    dropped: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def flatten(
+    cloud: GaussianCloud, path: Path, *, two_scale_normal: Literal[0, 2] = 0, drop_invalid: bool = False
+) -> tuple[FlatGaussians, ImportReport]:
+    """Flatten each Gaussian along its smallest axis.
+
+    The axes are relabelled, which changes neither the directions of the other two nor their scales. Gaussians
+    that have our own flat scale on axis 0 come out bit for bit.
+
+    Args:
+        cloud: what a file holds.
+        path: names the file in errors.
+        two_scale_normal: which axis is the normal where there are two scales: 0 as GaMeS writes it, 2 as
+            2DGS does.
+        drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
+
+    Raises:
+        SceneFileError: there are no Gaussians, or some hold values that are not finite or rotations of length
+            zero.
+    """
+    total = len(cloud.means_world)
+    if total == 0:
+        raise SceneFileError(f"{path}: holds no Gaussians.")
+    infinite = np.isinf(cloud.opacity_logits)
+    logits = np.where(infinite, np.copysign(LARGEST_LOGIT, cloud.opacity_logits), cloud.opacity_logits)
+    cloud = replace(cloud, opacity_logits=logits.astype(np.float32))
+    valid = _valid(cloud, path, drop_invalid)
+    if not valid.all():
+        arrays = {field.name: getattr(cloud, field.name) for field in fields(cloud) if field.name != "notes"}
+        cloud = replace(cloud, **{name: array[valid] for name, array in arrays.items()})
+    scale_count = cloud.log_scales.shape[1]
+    if scale_count == 3:
+        quats, in_plane, thickness = _flattened(cloud.quats_wxyz, cloud.log_scales)
+    else:
+        axis = np.full(len(cloud.means_world), two_scale_normal)
+        quats, in_plane, thickness = turned(cloud.quats_wxyz, axis), cloud.log_scales, np.empty(0, np.float32)
+    gaussians = FlatGaussians(cloud.means_world, quats, in_plane, cloud.opacity_logits, cloud.sh)
+    report = ImportReport(
+        count=len(gaussians),
+        sh_degree=gaussians.sh_degree,
+        scale_count=scale_count,
+        flattened=len(thickness),
+        median_thickness=float(np.median(thickness)) if len(thickness) else 0.0,
+        max_thickness=float(thickness.max()) if len(thickness) else 0.0,
+        saturated=int(infinite[valid].sum()),
+        thick=int((thickness > THICK).sum()),
+        dropped=total - len(gaussians),
+        notes=cloud.notes,
+    )
+    return gaussians, report
+
+
+def _valid(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians can be used; raises for the others unless they may be dropped."""
+    scales = cloud.log_scales
+    ordered = np.sort(scales, axis=1)  # not-a-number comes last
+    # A normal may be infinitely thin; nothing else may be infinite.
+    bad_scale = ~np.isfinite(ordered[:, -2:]).all(axis=1) | np.isnan(scales).any(axis=1)
+    bad = {
+        "position": ~np.isfinite(cloud.means_world).all(axis=1),
+        "rotation": ~np.isfinite(cloud.quats_wxyz).all(axis=1),
+        "scale": bad_scale,
+        "opacity": ~np.isfinite(cloud.opacity_logits),
+        "colour": ~np.isfinite(cloud.sh).all(axis=(1, 2)),
+    }
+    no_length = (cloud.quats_wxyz == 0).all(axis=1)
+    valid: Bool[np.ndarray, " n"] = ~np.logical_or.reduce([*bad.values(), no_length])
+    if drop_invalid:
+        if not valid.any():
+            raise SceneFileError(f"{path}: none of its {len(valid)} Gaussians has finite values only.")
+        return valid
+    advice = "octasplat import --drop-invalid leaves them out"
+    for what, mask in bad.items():
+        if mask.any():
+            raise SceneFileError(
+                f"{path}: {mask.sum()} of {len(mask)} Gaussians have no finite {what}; {advice}."
+            )
+    if no_length.any():
+        raise SceneFileError(
+            f"{path}: {no_length.sum()} of {len(no_length)} Gaussians have a rotation of length zero; "
+            f"{advice}."
+        )
+    return valid
+
+
+def _flattened(
+    quats_wxyz: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 3"]
+) -> tuple[Float32[np.ndarray, "n 4"], Float32[np.ndarray, "n 2"], Float32[np.ndarray, " m"]]:
+    """Make the smallest axis the normal; also the thickness ratio of those that were not flat already.
+
+    Axis 0 wins ties, and always where it holds our own flat scale, so that our own files stay as they are.
+    """
+    own = np.abs(log_scales[:, 0] - FLAT_LOG_SCALE) <= ROUNDING
+    axis = np.where(own, 0, np.argmin(log_scales, axis=1))
+    order = (axis[:, None] + np.arange(3)) % 3
+    ordered = np.take_along_axis(log_scales, order, axis=1)
+    in_plane = np.ascontiguousarray(ordered[:, 1:])
+    thick: Bool[np.ndarray, " n"] = ordered[:, 0] > FLAT_LOG_SCALE + ROUNDING
+    ratios = np.exp(ordered[thick, 0] - in_plane[thick].min(axis=1))
+    return turned(quats_wxyz, axis), in_plane, ratios
+
+
+def turned(quats_wxyz: Float32[np.ndarray, "n 4"], axis: Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 4"]:
+    """Quaternions of R P_axis, whose first column is column ``axis`` of R and the others follow cyclically.
+
+    Those of axis 0 keep every bit, and no length changes.
+    """
+    w, x, y, z = quats_wxyz.T
+    a, b, c, d = _CYCLIC_TURNS[axis].T
+    product = np.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        axis=-1,
+    )
+    return np.where((axis == 0)[:, None], quats_wxyz, product)

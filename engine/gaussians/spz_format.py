@@ -1,0 +1,150 @@
+"""The SPZ container (Niantic): one gzip stream in versions 2 and 3, one Zstandard stream an attribute in 4.
+
+Attributes follow each other whole: positions, opacities, colours, scales, rotations, harmonics. The frame is
+y up, z backward; harmonics beyond degree 3 are left to the caller.
+"""
+
+import gzip
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import zstandard
+
+from engine.errors import SceneFileError
+
+MAGIC = b"NGSP"
+GZIP_MAGIC = b"\x1f\x8b"
+VERSIONS = (2, 3, 4)
+MAX_DEGREE = 4
+GZIP_LEVEL, ZSTD_LEVEL = 6, 9
+ANTIALIASED, HAS_EXTENSIONS = 1, 2
+_HEADER = struct.Struct("<4sIIBBBB")
+_HEADER_V4 = struct.Struct("<4sIIBBBBI12x")
+_ENTRY = struct.Struct("<QQ")
+_GZIP_RATIO = 1040
+"""Deflate compresses no better than this, so a header that promises more is wrong."""
+_ZSTD_RATIO = 1 << 17
+_MAX_EXTENSIONS = 1 << 24
+
+
+@dataclass(frozen=True)
+class SpzFile:
+    """An SPZ file without its compression.
+
+    Attributes:
+        version: 2, 3 or 4.
+        count: number of Gaussians.
+        sh_degree: 0 to 4.
+        fractional_bits: of the 24-bit fixed-point positions.
+        flags: ``ANTIALIASED`` and ``HAS_EXTENSIONS``.
+        streams: the six attributes, packed.
+    """
+
+    version: int
+    count: int
+    sh_degree: int
+    fractional_bits: int
+    flags: int
+    streams: tuple[bytes, ...]
+
+
+def stream_widths(version: int, sh_degree: int) -> tuple[int, ...]:
+    """Bytes a Gaussian of positions, opacities, colours, scales, rotations and harmonics."""
+    return (9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((sh_degree + 1) ** 2 - 1))
+
+
+def read_spz(path: Path) -> SpzFile:
+    """Read and decompress a file.
+
+    Raises:
+        SceneFileError: the file is no SPZ, is damaged, or is of an unknown version.
+    """
+    try:
+        with path.open("rb") as handle:
+            start = handle.read(len(MAGIC))
+        if start == MAGIC:
+            return _read_v4(path, path.read_bytes())
+        if start.startswith(GZIP_MAGIC):
+            return _read_gzip(path)
+    except (OSError, EOFError, zlib.error, zstandard.ZstdError, struct.error) as error:
+        raise SceneFileError(f"{path}: is damaged or cannot be read ({error}).") from error
+    raise SceneFileError(f"{path}: is no SPZ file.")
+
+
+def _read_gzip(path: Path) -> SpzFile:
+    with gzip.open(path) as handle:
+        magic, version, count, degree, bits, flags, _ = _HEADER.unpack(handle.read(_HEADER.size))
+        if magic != MAGIC:
+            raise SceneFileError(f"{path}: is gzip, but holds no SPZ.")
+        if version not in VERSIONS[:2]:
+            raise SceneFileError(f"{path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
+        widths = _checked_widths(path, version, degree)
+        if count * sum(widths) > _GZIP_RATIO * path.stat().st_size:
+            raise _truncated(path, count)
+        streams = tuple(handle.read(count * width) for width in widths)
+        handle.read(_MAX_EXTENSIONS)  # the end of the stream is where its checksum is looked at
+    if any(len(stream) < count * width for stream, width in zip(streams, widths, strict=True)):
+        raise _truncated(path, count)
+    return SpzFile(version, count, degree, bits, flags, streams)
+
+
+def _read_v4(path: Path, data: bytes) -> SpzFile:
+    _, version, count, degree, bits, flags, stream_count, contents = _HEADER_V4.unpack_from(data)
+    if version != VERSIONS[-1]:
+        raise SceneFileError(f"{path}: is SPZ version {version}; versions 2, 3 and 4 are read.")
+    widths = _checked_widths(path, version, degree)
+    if stream_count < sum(width > 0 for width in widths):
+        raise SceneFileError(f"{path}: is damaged; it has only {stream_count} of its attributes.")
+    offset = contents + stream_count * _ENTRY.size
+    streams = []
+    for number, width in enumerate(widths):
+        size, full_size = (0, 0)
+        if number < stream_count:
+            size, full_size = _ENTRY.unpack_from(data, contents + number * _ENTRY.size)
+        if full_size != count * width:
+            raise SceneFileError(f"{path}: is damaged; attribute {number} does not have {count} items.")
+        if offset + size > len(data) or full_size > _ZSTD_RATIO * max(1, size):
+            raise _truncated(path, count)
+        packed = data[offset : offset + size]
+        reader = zstandard.ZstdDecompressor().stream_reader(packed)
+        streams.append(reader.read(full_size) if full_size else b"")
+        if len(streams[-1]) < full_size:
+            raise _truncated(path, count)
+        offset += size
+    return SpzFile(version, count, degree, bits, flags, tuple(streams))
+
+
+def _checked_widths(path: Path, version: int, degree: int) -> tuple[int, ...]:
+    if degree > MAX_DEGREE:
+        raise SceneFileError(f"{path}: is damaged; it claims harmonics of degree {degree}.")
+    return stream_widths(version, degree)
+
+
+def _truncated(path: Path, count: int) -> SceneFileError:
+    return SceneFileError(f"{path}: is truncated; not all of its {count} Gaussians are there.")
+
+
+def write_spz(path: Path, file: SpzFile) -> None:
+    """Write a file: gzip for version 3, Zstandard for version 4."""
+    with path.open("wb") as handle:
+        if file.version == VERSIONS[-1]:
+            _write_v4(handle, file)
+            return
+        header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, 0)
+        with gzip.GzipFile("", "wb", GZIP_LEVEL, handle, mtime=0) as packed:
+            packed.write(_HEADER.pack(MAGIC, *header))
+            for stream in file.streams:
+                packed.write(stream)
+
+
+def _write_v4(handle: IO[bytes], file: SpzFile) -> None:
+    streams = [stream for stream in file.streams if stream]
+    packed = [zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(stream) for stream in streams]
+    header = (file.version, file.count, file.sh_degree, file.fractional_bits, file.flags, len(packed))
+    handle.write(_HEADER_V4.pack(MAGIC, *header, _HEADER_V4.size))
+    for small, stream in zip(packed, streams, strict=True):
+        handle.write(_ENTRY.pack(len(small), len(stream)))
+    handle.writelines(packed)

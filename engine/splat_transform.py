@@ -1,0 +1,52 @@
+"""The converter ``@playcanvas/splat-transform``, run as a program of its own where somebody installed it."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+from engine.errors import SceneFileError
+
+PACKAGE = "@playcanvas/splat-transform"
+PROGRAM = "splat-transform"
+VARIABLE = "OCTASPLAT_SPLAT_TRANSFORM"
+"""Environment variable that names the program where it is not on the PATH."""
+SECONDS = 1800
+
+
+def converter() -> Path | None:
+    """The program, or None where there is none."""
+    named = os.environ.get(VARIABLE)
+    if named:
+        return Path(named) if Path(named).exists() else None
+    found = shutil.which(PROGRAM)
+    return Path(found) if found else None
+
+
+def convert(source: Path, target: Path, *options: str) -> None:
+    """Convert ``source`` to ``target``, whose suffixes say the formats; no GPU is used.
+
+    Args:
+        source: file to read.
+        target: file to write, replaced if it exists.
+        options: further options of the program.
+
+    Raises:
+        SceneFileError: the program is missing, fails, or writes nothing.
+    """
+    program = converter()
+    if program is None:
+        raise SceneFileError(
+            f"{target}: needs the program {PROGRAM}; install node and then it with npm install -g {PACKAGE}, "
+            f"or name it in {VARIABLE}."
+        )
+    command = [str(program), "-q", "-w", "-g", "cpu", *options, str(source.resolve()), str(target.resolve())]
+    try:
+        done = subprocess.run(  # noqa: S603 - no shell, and the paths are absolute
+            command, capture_output=True, text=True, timeout=SECONDS, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise SceneFileError(f"{target}: {program.name} could not be run ({error}).") from error
+    if done.returncode != 0 or not target.exists():
+        words = " ".join((done.stderr or done.stdout).split())[-300:]
+        raise SceneFileError(f"{target}: {program.name} failed ({words or done.returncode}).")

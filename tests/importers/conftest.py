@@ -1,0 +1,50 @@
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engine.gaussians.flattening import GaussianCloud
+
+SH_C0 = 0.28209479177387814
+
+
+@pytest.fixture
+def make_cloud() -> Callable[..., GaussianCloud]:
+    """Random Gaussians with three extents, within what every format can hold."""
+
+    def make(count: int, sh_degree: int = 0, seed: int = 0) -> GaussianCloud:
+        random = np.random.default_rng(seed)
+
+        def uniform(low: float, high: float, *shape: int) -> np.ndarray:
+            return random.uniform(low, high, shape).astype(np.float32)
+
+        quats = random.standard_normal((count, 4)).astype(np.float32)
+        return GaussianCloud(
+            means_world=uniform(-3, 3, count, 3),
+            quats_wxyz=quats / np.linalg.norm(quats, axis=1, keepdims=True),
+            log_scales=uniform(-6, -1, count, 3),
+            opacity_logits=uniform(-4, 4, count),
+            sh=np.concatenate(
+                [
+                    uniform(-0.5, 0.5, count, 1, 3) / np.float32(SH_C0),
+                    uniform(-0.9, 0.9, count, (sh_degree + 1) ** 2 - 1, 3),
+                ],
+                axis=1,
+            ).astype(np.float32),
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def splats() -> Path:
+    """Folder of trained splats of other programs, beside the photographed scenes."""
+    scenes = os.environ.get("OCTASPLAT_SCENES")
+    if not scenes:
+        pytest.skip("OCTASPLAT_SCENES does not name a folder of photographed scenes")
+    folder = Path(scenes).parent / "splats"
+    if not folder.is_dir():
+        pytest.skip("there is no folder 'splats' beside OCTASPLAT_SCENES")
+    return folder

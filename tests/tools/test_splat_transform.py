@@ -1,0 +1,141 @@
+"""PlayCanvas splat-transform as judge: what it writes we read as it does, what we write it reads as we do."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from npm_packages import npm_folder
+
+from engine.export.options import ExportOptions
+from engine.export.registry import export_scene
+from engine.gaussians.flattening import GaussianCloud
+from engine.gaussians.model import FlatGaussians
+from engine.importers import importer_for, read_scene
+from engine.importers.gaussian_ply import read_ply_cloud
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "importers"))
+from cloud_difference import difference
+
+pytestmark = pytest.mark.tools
+Convert = Callable[..., Path]
+
+
+@pytest.fixture(scope="module")
+def program() -> Path:
+    packages = npm_folder("@playcanvas/splat-transform", "2.7.1")
+    return packages / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
+
+
+@pytest.fixture(scope="module")
+def convert(program: Path) -> Convert:
+    """Converts a file with the judge."""
+
+    def run(source: Path, target: Path, *options: str) -> Path:
+        node = shutil.which("node")
+        assert node is not None
+        command = [node, str(program), "-q", "-w", "-g", "cpu", *options, str(source), str(target)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return target
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def scene() -> FlatGaussians:
+    random = np.random.default_rng(5)
+
+    def uniform(low: float, high: float, *shape: int) -> np.ndarray:
+        return random.uniform(low, high, shape).astype(np.float32)
+
+    return FlatGaussians(
+        uniform(-2, 2, 3000, 3),
+        random.standard_normal((3000, 4)).astype(np.float32),
+        uniform(-5, -2, 3000, 2),
+        uniform(-3, 4, 3000),
+        np.concatenate([uniform(-1.5, 1.5, 3000, 1, 3), uniform(-0.8, 0.8, 3000, 15, 3)], axis=1),
+    )
+
+
+def read(path: Path) -> GaussianCloud:
+    return importer_for(path).read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.compressed.ply", ()),
+        ("a.sog", ("--iterations", "2")),
+        ("a.spz", ("--spz-version", "3")),
+        ("a.spz", ("--spz-version", "4")),
+    ],
+)
+def test_we_read_its_files_as_it_does(
+    convert: Convert, scene: FlatGaussians, tmp_path: Path, name: str, options: tuple[str, ...]
+) -> None:
+    export_scene(scene, tmp_path / "own.ply")
+    theirs = convert(tmp_path / "own.ply", tmp_path / name, *options)
+    again = read_ply_cloud(convert(theirs, tmp_path / "again.ply"))
+    # They decode SPZ rotations in float32, and opacities of 0 or 1 a little differently.
+    difference(read(theirs), again).assert_below(
+        position=1e-6, rotation_degrees=0.1, log_scale=1e-6, opacity=0.001, sh=2e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "version", "degrees"), [("a.splat", 3, 0.95), ("a.spz", 3, 0.1), ("a.spz", 4, 0.1)]
+)
+def test_it_reads_our_files_as_we_do(
+    convert: Convert, scene: FlatGaussians, tmp_path: Path, name: str, version: int, degrees: float
+) -> None:
+    export_scene(scene, tmp_path / name, ExportOptions(spz_version=version))
+    theirs = read_ply_cloud(convert(tmp_path / name, tmp_path / "theirs.ply"))
+    # In .splat they take 127.5 for the middle of a byte, and most others 128, as we do.
+    difference(read(tmp_path / name), theirs).assert_below(
+        position=1e-6, rotation_degrees=degrees, log_scale=1e-6, opacity=0.001, sh=2e-6
+    )
+
+
+def test_it_reads_our_ply_bit_for_bit(convert: Convert, scene: FlatGaussians, tmp_path: Path) -> None:
+    export_scene(scene, tmp_path / "own.ply")
+    back, report = read_scene(convert(tmp_path / "own.ply", tmp_path / "back.ply"))
+    assert report.flattened == 0
+    for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(scene, name))
+
+
+def test_we_read_its_glb(convert: Convert, scene: FlatGaussians, tmp_path: Path) -> None:
+    export_scene(scene, tmp_path / "own.ply")
+    back, report = read_scene(convert(tmp_path / "own.ply", tmp_path / "theirs.glb"))
+    assert (report.count, report.sh_degree, report.flattened) == (3000, 3, 0)
+    # It turns a PLY by half a turn about z and calls that y up: seen from us, half a turn about y.
+    np.testing.assert_allclose(back.means_world, scene.means_world * (-1, 1, -1), atol=1e-6)
+    np.testing.assert_allclose(back.log_scales, scene.log_scales, atol=2e-6)
+    np.testing.assert_allclose(back.opacities, scene.opacities, atol=1e-6)
+    normals = scene.rotations[:, :, 0] * (-1, 1, -1)
+    np.testing.assert_allclose(np.abs(np.sum(back.rotations[:, :, 0] * normals, axis=1)), 1, atol=1e-5)
+
+
+def test_sog_is_written_through_it(
+    program: Path, scene: FlatGaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OCTASPLAT_SPLAT_TRANSFORM", os.fspath(program))
+    written = export_scene(scene, tmp_path / "out" / "a.sog")
+    assert list((tmp_path / "out").iterdir()) == list(written)
+    back, report = read_scene(written[0])
+    assert (report.count, report.sh_degree) == (3000, 3)
+    # It sorts the Gaussians; the nearest of ours in place is the same one.
+    distances = np.linalg.norm(back.means_world[:, None] - scene.means_world[None], axis=2)
+    ours = distances.argmin(axis=1)
+    assert len(np.unique(ours)) == 3000
+    assert distances.min(axis=1).max() < 2e-4
+    np.testing.assert_allclose(back.log_scales, scene.log_scales[ours], atol=0.1)
+    np.testing.assert_allclose(back.opacities, scene.opacities[ours], atol=1.002 / 255)  # rounded down
+    np.testing.assert_allclose(back.base_rgb_srgb, scene.base_rgb_srgb[ours], atol=0.01)
+    normals = np.abs(np.sum(back.rotations[:, :, 0] * scene.rotations[ours][:, :, 0], axis=1))
+    assert np.degrees(np.arccos(np.clip(normals, -1, 1))).max() < 1.8  # components rounded down too

@@ -1,0 +1,77 @@
+"""three.js draws our GLB as its example page asks, in headless Chromium."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import psnr
+from shell_scene import our_view, shell_cameras, shell_scene, write_shell_cameras
+from threejs_example import draw_glb
+
+from engine.colour import to_bytes
+from engine.export.options import ExportOptions
+from engine.export.registry import export_scene
+from engine.gaussians.model import FlatGaussians
+
+pytestmark = [pytest.mark.tools, pytest.mark.heavy]
+
+
+@pytest.fixture(scope="module")
+def scene() -> FlatGaussians:
+    return shell_scene(1000)
+
+
+@pytest.fixture(scope="module")
+def cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cameras") / "cameras.json"
+    write_shell_cameras(path)
+    return path
+
+
+@pytest.mark.parametrize(("sort", "least_db"), [(True, 45.0), (False, 42.0)])
+@pytest.mark.parametrize("frame", [0, 1])
+def test_threejs_draws_what_we_draw(
+    scene: FlatGaussians, cameras: Path, tmp_path: Path, frame: int, sort: bool, least_db: float
+) -> None:
+    export_scene(scene, tmp_path / "scene.glb", ExportOptions(chunks=2))
+    page = draw_glb(tmp_path / "scene.glb", cameras, frame, sort=sort)
+    ours = to_bytes(our_view(scene, shell_cameras()[frame]))
+    assert (ours.max(axis=2) > 20).mean() > 0.2  # there is something to compare
+    assert psnr(page.image, ours) >= least_db, page.messages
+
+
+def test_averaged_frames_have_the_right_order_where_octagons_cross(cameras: Path, tmp_path: Path) -> None:
+    # Two large octagons through each other: half of each lies before the other, whichever is drawn last.
+    scene = FlatGaussians(
+        np.zeros((2, 3), np.float32),
+        np.array([[np.cos(a), 0, np.sin(a), 0] for a in (np.pi / 8, 3 * np.pi / 8)], np.float32),
+        np.full((2, 2), np.log(0.3), np.float32),
+        np.full(2, 3.0, np.float32),
+        np.array([[[1.0, -1.0, -1.0]], [[-1.0, 1.0, -1.0]]], np.float32),
+    )
+    export_scene(scene, tmp_path / "scene.glb")
+    ours = to_bytes(our_view(scene, shell_cameras()[0]))
+    sorted_db = psnr(draw_glb(tmp_path / "scene.glb", cameras, 0).image, ours)
+    refined_db = psnr(draw_glb(tmp_path / "scene.glb", cameras, 0, refine=256).image, ours)
+    assert sorted_db < 30.0
+    assert refined_db > 37.0
+
+
+def test_more_chunks_are_nearer_to_the_truth(cameras: Path, tmp_path: Path) -> None:
+    scene = shell_scene(20000)
+    ours = to_bytes(our_view(scene, shell_cameras()[0]))
+    figures = []
+    for chunks in (1, 64):
+        export_scene(scene, tmp_path / "scene.glb", ExportOptions(chunks=chunks))
+        figures.append(psnr(draw_glb(tmp_path / "scene.glb", cameras, 0, sort=False).image, ours))
+    assert figures[1] > figures[0] + 0.3
+
+
+def test_the_opaque_variant_needs_no_order(scene: FlatGaussians, cameras: Path, tmp_path: Path) -> None:
+    backwards = scene.select(np.arange(len(scene))[::-1])
+    images = []
+    for number, version in enumerate((scene, backwards)):
+        export_scene(version, tmp_path / f"{number}.glb", ExportOptions(opaque=True, chunks=1))
+        images.append(draw_glb(tmp_path / f"{number}.glb", cameras, 0, sort=False).image)
+    assert (images[0].max(axis=2) > 20).mean() > 0.1
+    np.testing.assert_array_equal(images[0], images[1])
