@@ -1,0 +1,1 @@
+"""Scenes changed after training: meshes edited elsewhere, proxies that drive a scene, selection, clean-up."""

@@ -1,0 +1,85 @@
+"""Axes that a mesh lost on its way through an editor, and the quantile Q of its octagons.
+
+glTF and (by custom) OBJ have y up, Blender has z up. A mesh that goes in and out by the same format comes
+back as it was, one that changes format comes back turned by a multiple of 90 degrees about x.
+"""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from engine.edit.mesh import Mesh
+from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
+
+Axes = Literal["x0", "x90", "x180", "x270"]
+"""Angle in degrees by which a file's coordinates must be turned about x to be the scene's."""
+
+TURNS: dict[Axes, Float64[np.ndarray, "3 3"]] = {
+    "x0": np.eye(3),
+    "x90": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "x180": np.diag([1.0, -1, -1]),
+    "x270": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+}
+CLEARLY = 0.5
+"""Another turn must at least halve the median distance to be believed."""
+Q_TOLERANCE = 1e-3
+
+
+def usual_axes(path: Path) -> Axes:
+    """How our own exporter writes this kind of file: the GLB's root node turns the scene by 180 degrees."""
+    return "x180" if path.suffix.lower() == ".glb" else "x0"
+
+
+def detect_axes(
+    usual: Axes,
+    corners: Float64[np.ndarray, "n 8 3"],
+    present: Bool[np.ndarray, "n 8"],
+    unedited_world: Float[np.ndarray, "n 8 3"],
+) -> Axes:
+    """The turn that brings most vertices back to where they were, by median distance to the unedited ones."""
+    edited, unedited = corners[present], unedited_world[present].astype(np.float64)
+    if len(edited) == 0:
+        return usual
+    distances = {
+        name: float(np.median(np.linalg.norm(edited @ turn.T - unedited, axis=-1)))
+        for name, turn in TURNS.items()
+    }
+    best = min(distances, key=lambda name: distances[name])
+    return best if distances[best] < CLEARLY * distances[usual] else usual
+
+
+def infer_q(mesh: Mesh, opacities: Float[np.ndarray, " n"], default: float) -> float:
+    """The Q of the export: as the file states it, else from the octagons' radii or textures, else a default.
+
+    A radius is sqrt(Q + 2 ln a) for opacity a, and the texture coordinates hold radius / sqrt(Q).
+    """
+    if mesh.q is not None and np.isfinite(mesh.q) and mesh.q > 0:
+        return mesh.q
+    if mesh.gid is None:
+        return default
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(mesh.gid) & (mesh.gid > -0.5) & (mesh.gid < len(opacities) - 0.5)
+        known &= np.abs(mesh.gid - np.round(mesh.gid)) < 1e-3
+    vertices = np.flatnonzero(known)
+    logs = np.log(
+        np.maximum(opacities[np.round(mesh.gid[vertices]).astype(np.int64)].astype(np.float64), 1e-30)
+    )
+    estimates = np.zeros(0)
+    if mesh.radius is not None:
+        estimates = mesh.radius[vertices].astype(np.float64) ** 2 - 2 * logs
+    elif mesh.uv is not None:
+        squares = 4 * np.sum((mesh.uv[vertices].astype(np.float64) - 0.5) ** 2, axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            estimates = np.where(squares < 0.9, 2 * logs / (squares - 1), np.nan)
+    estimates = estimates[np.isfinite(estimates) & (estimates > 0)]
+    return _snapped(float(np.median(estimates))) if len(estimates) else default
+
+
+def _snapped(q: float) -> float:
+    """The number that somebody chose, where rounding in the file left it a little off."""
+    for chosen in (CHI2_2_99, CHI2_3_99, round(q, 2)):
+        if abs(q - chosen) <= Q_TOLERANCE * q:
+            return chosen
+    return q

@@ -1,0 +1,79 @@
+"""Spherical harmonics that turn with their Gaussian.
+
+Within one degree the harmonics span a space that every rotation, and every reflection, maps onto itself. So
+the matrix that turns coefficients follows from sampling: the turned function takes, at a direction d, the
+value that the old one had at O^T d, and 2l + 1 or more directions in general position fix its coefficients.
+That needs no recursion over degrees and holds for whatever signs and order the basis has.
+"""
+
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+ROWS_AT_ONCE = 65536
+SAMPLES = 16
+_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+
+def sh_basis(directions: Float[np.ndarray, "*n 3"], degree: int) -> Float[np.ndarray, "*n k"]:
+    """Real harmonics of degree 0 to ``degree`` (at most 3) at unit directions, signs and order of 3DGS."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    xx, yy, zz = x * x, y * y, z * z
+    pi = np.pi
+    c1 = np.sqrt(3 / (4 * pi))
+    c2 = np.sqrt(15 / (4 * pi))
+    c30, c31, c32 = np.sqrt(35 / (32 * pi)), np.sqrt(105 / (4 * pi)), np.sqrt(21 / (32 * pi))
+    functions = [
+        np.full_like(x, 0.5 / np.sqrt(pi)),
+        -c1 * y, c1 * z, -c1 * x,
+        c2 * x * y, -c2 * y * z, np.sqrt(5 / (16 * pi)) * (2 * zz - xx - yy), -c2 * x * z,
+        c2 / 2 * (xx - yy),
+        -c30 * y * (3 * xx - yy), c31 * x * y * z, -c32 * y * (4 * zz - xx - yy),
+        np.sqrt(7 / (16 * pi)) * z * (2 * zz - 3 * xx - 3 * yy),
+        -c32 * x * (4 * zz - xx - yy), c31 / 2 * z * (xx - yy), -c30 * x * (xx - 3 * yy),
+    ]  # fmt: skip
+    return np.stack(functions[: (degree + 1) ** 2], axis=-1)
+
+
+def rotate_sh(
+    sh: Float32[np.ndarray, "n k 3"], turns: Float[np.ndarray, "n 3 3"]
+) -> Float32[np.ndarray, "n k 3"]:
+    """Coefficients of the colours after each Gaussian was turned: new(d) = old(O^T d).
+
+    Args:
+        sh: coefficients of degree 0 to 3, coefficient-major.
+        turns: orthogonal matrices O, world to world; reflections are allowed.
+    """
+    degree = int(np.sqrt(sh.shape[1])) - 1
+    turned = sh.copy()
+    if degree == 0:
+        return turned
+    for start in range(0, len(sh), ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
+        matrices = sh_rotations(turns[part], degree)
+        for band, matrix in enumerate(matrices, start=1):
+            own = slice(band**2, (band + 1) ** 2)
+            turned[part, own] = np.einsum("nij,njc->nic", matrix, sh[part, own])
+    return turned
+
+
+def sh_rotations(turns: Float[np.ndarray, "n 3 3"], degree: int) -> list[Float[np.ndarray, "n m m"]]:
+    """Matrices that turn the coefficients of degree 1, 2, ... ``degree``; orthogonal like ``turns``."""
+    samples, inverses = _samples()
+    values = sh_basis(np.einsum("nij,si->nsj", turns.astype(np.float64), samples), degree)
+    return [
+        np.einsum("ms,nsk->nmk", inverses[band], values[..., band**2 : (band + 1) ** 2])
+        for band in range(1, degree + 1)
+    ]
+
+
+@cache
+def _samples() -> tuple[Float[np.ndarray, "s 3"], dict[int, Float[np.ndarray, "m s"]]]:
+    """Directions spread over the sphere, and for each degree the way from values there to coefficients."""
+    z = 1 - 2 * (np.arange(SAMPLES) + 0.5) / SAMPLES
+    angle = _GOLDEN_ANGLE * np.arange(SAMPLES)
+    ring = np.sqrt(1 - z * z)
+    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1)
+    basis = sh_basis(directions, 3)
+    return directions, {band: np.linalg.pinv(basis[:, band**2 : (band + 1) ** 2]) for band in (1, 2, 3)}

@@ -1,0 +1,295 @@
+"""Coarse meshes that drive a scene: every octagon corner is bound to a proxy and follows its deformation.
+
+Two ways. *Nearest*: a corner follows the affine maps of the triangles around the nearest one, blended with
+smooth weights; made for open surfaces such as a cloth or a hull. *Mean value*: a corner is a smooth
+combination of all vertices of a closed cage around it, which reproduces every affine map exactly.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from scipy.spatial import KDTree
+
+from engine.edit.kernels_proxy import blend, mean_value_weights, triangle_weights, winding_numbers
+from engine.errors import SceneFileError
+
+Method = Literal["nearest", "mvc"]
+CANDIDATES = 24
+MOST_CUTS = 16
+POINTS_AT_ONCE = 1 << 18
+STORED_BYTES = 1 << 30
+"""Mean-value coordinates are kept from frame to frame up to this size, and computed anew beyond."""
+DEFAULT_REACH = 0.1
+"""How far a surface moves what is around it, as a share of the diagonal of its bounding box."""
+
+
+@dataclass(frozen=True)
+class Proxy:
+    """A triangle mesh in the scene's frame.
+
+    Attributes:
+        vertices_world: positions at rest.
+        triangles: vertex indices; those without area are of no use and left out.
+    """
+
+    vertices_world: Float64[np.ndarray, "v 3"]
+    triangles: Int64[np.ndarray, "t 3"]
+
+    def __post_init__(self) -> None:
+        """Leave out triangles without area."""
+        corners = self.vertices_world[self.triangles]
+        area = np.linalg.norm(_area_vectors(corners), axis=-1)
+        object.__setattr__(self, "triangles", self.triangles[area > 1e-14 * max(self.diagonal, 1e-300) ** 2])
+        if not len(self.triangles):
+            raise SceneFileError("The proxy has no triangle with an area; it needs faces.")
+
+    @property
+    def diagonal(self) -> float:
+        """Diagonal of the bounding box, world units."""
+        return float(np.linalg.norm(np.ptp(self.vertices_world, axis=0)))
+
+    def is_closed(self) -> bool:
+        """Whether every edge has two triangles, which run along it in opposite directions."""
+        edges = self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        codes = edges[:, 0] * len(self.vertices_world) + edges[:, 1]
+        back = edges[:, 1] * len(self.vertices_world) + edges[:, 0]
+        return len(np.unique(codes)) == len(codes) and np.array_equal(np.sort(codes), np.sort(back))
+
+
+@runtime_checkable
+class Binding(Protocol):
+    """Octagon corners tied to a proxy."""
+
+    @property
+    def moving(self) -> Bool[np.ndarray, " n"]:
+        """Which Gaussians the proxy moves at all."""
+        ...
+
+    def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
+        """Where the corners are once the proxy's vertices are at ``vertices_world``."""
+        ...
+
+
+def bind(
+    proxy: Proxy,
+    corners_world: Float64[np.ndarray, "n 8 3"],
+    method: Method = "nearest",
+    reach_world: float | None = None,
+) -> Binding:
+    """Bind octagon corners to ``proxy`` at rest.
+
+    Args:
+        proxy: for ``mvc`` a closed mesh.
+        corners_world: octagon corners of the undeformed scene.
+        method: see the module.
+        reach_world: corners up to this distance from the proxy follow it fully, those beyond twice the
+            distance stay, with a smooth change in between. None means a tenth of the proxy's diagonal for
+            ``nearest``, and for ``mvc`` that the Gaussians inside the cage follow and no others.
+
+    Raises:
+        SceneFileError: ``mvc`` with a mesh that is not closed.
+    """
+    if method == "mvc":
+        return MeanValueBinding(proxy, corners_world, reach_world)
+    reach = DEFAULT_REACH * proxy.diagonal if reach_world is None else reach_world
+    return NearestBinding(proxy, corners_world, reach)
+
+
+class NearestBinding:
+    """Corners bound to the triangles near them."""
+
+    def __init__(self, proxy: Proxy, corners_world: Float64[np.ndarray, "n 8 3"], reach_world: float) -> None:
+        self._proxy = proxy
+        self._corners = corners_world
+        points = corners_world.reshape(-1, 3)
+        self._chosen, self._weights, distances = nearest_triangles(proxy, points)
+        self._influence = _fade(distances, reach_world).reshape(corners_world.shape[:2])
+        self._frames = _triangle_frames(proxy.vertices_world[proxy.triangles])
+        self._centres = proxy.vertices_world[proxy.triangles].mean(axis=1)
+
+    @property
+    def moving(self) -> Bool[np.ndarray, " n"]:
+        """Which Gaussians have a corner within reach."""
+        result: np.ndarray = self._influence.max(axis=1) > 0
+        return result
+
+    def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
+        """Corners after the proxy's vertices moved."""
+        moved = _checked(vertices_world, self._proxy)[self._proxy.triangles]
+        derivatives = _moved_frames(moved, self._proxy.vertices_world[self._proxy.triangles]) @ np.linalg.inv(
+            self._frames
+        )
+        points = self._corners.reshape(-1, 3)
+        result = np.empty_like(points)
+        blend(points, self._chosen, self._weights, derivatives, self._centres, moved.mean(axis=1), result)
+        return _mix(self._corners, result.reshape(self._corners.shape), self._influence)
+
+
+class MeanValueBinding:
+    """Corners bound to a closed cage by mean-value coordinates."""
+
+    def __init__(
+        self, proxy: Proxy, corners_world: Float64[np.ndarray, "n 8 3"], reach_world: float | None
+    ) -> None:
+        if not proxy.is_closed():
+            raise SceneFileError(
+                "The proxy is not closed (some edge has not exactly two faces that agree in direction), but "
+                "mean-value coordinates need a closed cage; close it, or use the method nearest."
+            )
+        self._proxy = proxy
+        self._corners = corners_world
+        winding = np.zeros(len(corners_world), np.int64)
+        winding_numbers(corners_world.mean(axis=1), proxy.vertices_world, proxy.triangles, winding)
+        inside = (winding != 0).astype(np.float64)
+        self._influence = np.repeat(inside[:, None], corners_world.shape[1], axis=1)
+        if reach_world is not None and reach_world > 0:
+            points = corners_world.reshape(-1, 3)
+            faded = _fade(nearest_triangles(proxy, points)[2], reach_world).reshape(corners_world.shape[:2])
+            self._influence = np.maximum(self._influence, faded)
+        self._rows = np.flatnonzero(self._influence.max(axis=1) > 0)
+        self._stored: np.ndarray | None = None
+        if self._rows.size * corners_world.shape[1] * len(proxy.vertices_world) * 8 <= STORED_BYTES:
+            points = corners_world[self._rows].reshape(-1, 3)
+            self._stored = np.empty((len(points), len(proxy.vertices_world)))
+            for part, weights in self._coordinates(points):
+                self._stored[part] = weights
+
+    @property
+    def moving(self) -> Bool[np.ndarray, " n"]:
+        """Which Gaussians lie in the cage or within reach of it."""
+        result: np.ndarray = self._influence.max(axis=1) > 0
+        return result
+
+    def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
+        """Corners after the cage's vertices moved."""
+        shifts = _checked(vertices_world, self._proxy) - self._proxy.vertices_world
+        points = self._corners[self._rows].reshape(-1, 3)
+        moved = np.empty_like(points)
+        if self._stored is not None:
+            moved[:] = points + self._stored @ shifts
+        else:
+            for part, weights in self._coordinates(points):
+                moved[part] = points[part] + weights @ shifts
+        result = self._corners.copy()
+        result[self._rows] = moved.reshape(-1, *self._corners.shape[1:])
+        return _mix(self._corners, result, self._influence)
+
+    def _coordinates(self, points: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+        """The coordinates of ``points``, in batches."""
+        count = len(self._proxy.vertices_world)
+        step = max(1, min(POINTS_AT_ONCE, (1 << 26) // count))
+        for start in range(0, len(points), step):
+            part = slice(start, min(start + step, len(points)))
+            weights = np.empty((part.stop - part.start, count))
+            mean_value_weights(
+                points[part],
+                self._proxy.vertices_world,
+                self._proxy.triangles,
+                self._proxy.diagonal,
+                weights,
+            )
+            yield part, weights
+
+
+def nearest_triangles(
+    proxy: Proxy, points: Float64[np.ndarray, "p 3"]
+) -> tuple[Int32[np.ndarray, "p k"], Float32[np.ndarray, "p k"], Float64[np.ndarray, " p"]]:
+    """Triangles near each point with smooth weights, and the distance to the nearest one.
+
+    Candidates come from points spread over the triangles, one on a triangle of usual size, so that a large
+    one is found from everywhere on it.
+    """
+    corners = np.ascontiguousarray(proxy.vertices_world[proxy.triangles])
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    spacing = float(np.median(edges))
+    samples, owners = _spread_samples(corners, edges.max(axis=1), spacing)
+    tree = KDTree(samples)
+    count = min(CANDIDATES, len(samples))
+    chosen = np.zeros((len(points), count), np.int32)
+    weights = np.zeros((len(points), count), np.float32)
+    distances = np.zeros(len(points))
+    for start in range(0, len(points), POINTS_AT_ONCE):
+        part = slice(start, start + POINTS_AT_ONCE)
+        apart, near = tree.query(points[part], k=count)
+        candidates = owners[near.reshape(-1, count)]
+        triangle_weights(
+            np.ascontiguousarray(points[part]),
+            corners,
+            candidates,
+            apart.reshape(-1, count),
+            spacing,
+            chosen[part],
+            weights[part],
+            distances[part],
+        )
+    return chosen, weights, distances
+
+
+def _spread_samples(
+    corners: Float64[np.ndarray, "t 3 3"], longest: Float64[np.ndarray, " t"], spacing: float
+) -> tuple[Float64[np.ndarray, "s 3"], Int64[np.ndarray, " s"]]:
+    cuts = np.clip(np.ceil(longest / (2.0 * spacing)), 1, MOST_CUTS).astype(np.int64)
+    samples, owners = [], []
+    for cut in np.unique(cuts):
+        rows = np.flatnonzero(cuts == cut)
+        i, j = np.meshgrid(np.arange(cut), np.arange(cut), indexing="ij")
+        u, v = ((i + 1 / 3) / cut).ravel(), ((j + 1 / 3) / cut).ravel()
+        inner = u + v <= 1
+        barycentric = np.stack([1 - u - v, u, v], axis=-1)[inner]
+        samples.append(np.einsum("sk,tkc->tsc", barycentric, corners[rows]).reshape(-1, 3))
+        owners.append(np.repeat(rows, len(barycentric)))
+    return np.concatenate(samples), np.concatenate(owners)
+
+
+def _area_vectors(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:
+    """Normals as long as twice the area."""
+    result: np.ndarray = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return result
+
+
+def _triangle_frames(corners: Float64[np.ndarray, "t 3 3"]) -> Float64[np.ndarray, "t 3 3"]:
+    """Columns: two edges and the unit normal."""
+    return _moved_frames(corners, corners)
+
+
+def _moved_frames(
+    corners: Float64[np.ndarray, "t 3 3"], rest: Float64[np.ndarray, "t 3 3"]
+) -> Float64[np.ndarray, "t 3 3"]:
+    """Columns: two edges, and the normal stretched by the root of the change in area."""
+    vectors, area = _area_vectors(corners), np.linalg.norm(_area_vectors(rest), axis=-1)
+    now = np.linalg.norm(vectors, axis=-1)
+    normals = vectors / np.maximum(np.sqrt(now * area), 1e-300)[:, None]
+    edges = [corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]]
+    return np.stack([*edges, normals], axis=-1)
+
+
+def _fade(distances: Float64[np.ndarray, " p"], reach: float) -> Float64[np.ndarray, " p"]:
+    """1 up to ``reach``, 0 from twice that on, smooth in between."""
+    if np.isinf(reach):
+        return np.ones_like(distances)
+    t = np.clip(2.0 - distances / max(reach, 1e-300), 0.0, 1.0)
+    result: np.ndarray = t * t * (3.0 - 2.0 * t)
+    return result
+
+
+def _mix(
+    rest: Float64[np.ndarray, "n 8 3"],
+    moved: Float64[np.ndarray, "n 8 3"],
+    influence: Float64[np.ndarray, "n 8"],
+) -> Float64[np.ndarray, "n 8 3"]:
+    """Corners that follow by their influence; those with none stay exactly."""
+    share = influence[:, :, None]
+    result: np.ndarray = np.where(share > 0, rest + share * (moved - rest), rest)
+    return result
+
+
+def _checked(vertices_world: Float64[np.ndarray, "v 3"], proxy: Proxy) -> Float64[np.ndarray, "v 3"]:
+    if vertices_world.shape != proxy.vertices_world.shape:
+        raise SceneFileError(
+            f"The deformed proxy has {len(vertices_world)} vertices, but at rest it has "
+            f"{len(proxy.vertices_world)}; both must be the same mesh."
+        )
+    return vertices_world

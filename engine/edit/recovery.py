@@ -1,0 +1,360 @@
+"""Gaussians from the octagons of an edited mesh (paper section 3.3, by least squares over all corners)."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+from pydantic import BaseModel, ConfigDict, Field
+
+from engine.edit.axes import TURNS, Axes, detect_axes, infer_q, usual_axes
+from engine.edit.harmonics import rotate_sh
+from engine.edit.local_maps import (
+    frames_from_skewed_legs,
+    has_area,
+    legs_world,
+    solid_derivatives,
+    surface_turns,
+)
+from engine.edit.matching import Octagons, match_octagons
+from engine.edit.mesh import Mesh
+from engine.edit.octagon_fit import LEAST_CORNERS, fit_octagons
+from engine.edit.surroundings import carry, flipped_against, neighbour_turns
+from engine.errors import SceneFileError
+from engine.gaussians.frames import rotation_matrices
+from engine.gaussians.model import FlatGaussians, concatenate
+from engine.gaussians.octagon import (
+    CHI2_2_99,
+    coordinate_rounding,
+    frames_from_octagons,
+    octagon_corners_world,
+    octagon_radii,
+)
+
+STRAINED = 0.3
+"""Residual, in standard deviations, above which one Gaussian is a coarse stand-in for what the edit made."""
+
+
+class EditOptions(BaseModel):
+    """How an edited mesh becomes Gaussians.
+
+    Attributes:
+        method: ``least-squares`` over all corners, or the paper's rule from corners 0, 2 and 6, which drops
+            shear.
+        damaged: what becomes of octagons that lost corners, flipped or crumpled. ``repair``: fitted to the
+            corners left, turned back, or moved as their neighbours were; ``drop``: left out.
+        axes: the turn about x that brings the mesh into the scene's frame, or ``auto``.
+        q: chi-square quantile that the mesh was exported with; None asks the mesh.
+        max_residual: octagons further than this from an affine image, in standard deviations, are crumpled.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    method: Literal["least-squares", "three-point"] = "least-squares"
+    damaged: Literal["repair", "drop"] = "repair"
+    axes: Literal["auto"] | Axes = "auto"
+    q: float | None = Field(default=None, gt=0.0, le=100.0)
+    max_residual: float = Field(default=1.0, gt=0.0)
+
+
+@dataclass
+class EditReport:
+    """What was found in an edited mesh and what became of it; all numbers count Gaussians unless they say.
+
+    Attributes:
+        scene_size: in the unedited scene.
+        result_size: in the result.
+        matched_by: ``ids`` or ``order``.
+        axes: the turn about x that was applied to the mesh.
+        axes_usual: what this kind of file has if it was not converted on its way.
+        q: chi-square quantile of the octagons.
+        unmoved: kept bit for bit, as no corner moved.
+        moved: recovered from their corners.
+        deleted: without any vertex left, so left out.
+        copies: added, as their octagons were duplicated.
+        carried: without an octagon of their own (too faint), moved as their neighbours were.
+        orphaned: without an octagon, left out as their nearest neighbour was deleted.
+        incomplete: with some corners missing.
+        crumpled: folded, without area, or too far from an affine image.
+        flipped: facing the other way than their surroundings.
+        mirrored: in parts of the scene that were mirrored as a whole.
+        dropped: of the damaged ones, left out.
+        foreign_vertices: vertices that belong to no octagon.
+        ambiguous_corners: corners claimed by several vertices, taken as missing.
+        strained: with a residual above 0.3 standard deviations.
+        residual_median: median residual of the moved ones, in standard deviations.
+        residual_p95: 95th percentile.
+        residual_max: largest.
+    """
+
+    scene_size: int
+    result_size: int = 0
+    matched_by: str = ""
+    axes: Axes = "x0"
+    axes_usual: Axes = "x0"
+    q: float = CHI2_2_99
+    unmoved: int = 0
+    moved: int = 0
+    deleted: int = 0
+    copies: int = 0
+    carried: int = 0
+    orphaned: int = 0
+    incomplete: int = 0
+    crumpled: int = 0
+    flipped: int = 0
+    mirrored: int = 0
+    dropped: int = 0
+    foreign_vertices: int = 0
+    ambiguous_corners: int = 0
+    strained: int = 0
+    residual_median: float = 0.0
+    residual_p95: float = 0.0
+    residual_max: float = 0.0
+
+
+@dataclass
+class _Recovered:
+    """New parameters, one row an octagon, and what is known about each."""
+
+    means: Float64[np.ndarray, "m 3"]
+    legs: Float64[np.ndarray, "m 3 2"]
+    signs: Float64[np.ndarray, " m"]
+    unmoved: Bool[np.ndarray, " m"]
+    readable: Bool[np.ndarray, " m"]
+    damaged: Bool[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+
+def recover_edit(
+    gaussians: FlatGaussians, mesh: Mesh, path: Path, options: EditOptions | None = None
+) -> tuple[FlatGaussians, EditReport]:
+    """The scene as an edit of its octagon mesh left it.
+
+    Gaussians of which no corner moved keep every bit. Of the others the centre, frame and scales follow the
+    corners, the harmonics turn with the surface, and opacity stays.
+
+    Args:
+        gaussians: the scene that the mesh was exported from.
+        mesh: the edited mesh.
+        path: its file, named in errors; its suffix says which axes are usual.
+        options: see there.
+
+    Raises:
+        SceneFileError: the mesh does not belong to the scene, its vertices cannot be identified, or nothing
+            is left of the scene.
+    """
+    options = options or EditOptions()
+    opacities = gaussians.opacities
+    q = options.q or infer_q(mesh, opacities, CHI2_2_99)
+    radii = octagon_radii(opacities, q)
+    octagons = match_octagons(path, mesh, opacities, radii)
+    old, old_corners = _unedited(gaussians, octagons, radii)
+    report = EditReport(len(gaussians), matched_by=octagons.matched_by, axes_usual=usual_axes(path), q=q)
+    if options.axes == "auto":
+        report.axes = detect_axes(usual_axes(path), octagons.corners_world, octagons.present, old_corners)
+    else:
+        report.axes = options.axes
+    corners = octagons.corners_world @ TURNS[report.axes].T
+    octagons = replace(octagons, corners_world=corners)
+    if octagons.is_copy.any():
+        distances = np.linalg.norm(corners - old_corners, axis=2).mean(axis=1, where=octagons.present)
+        octagons = octagons.nearest_first(distances)
+        old, old_corners = _unedited(gaussians, octagons, radii)
+    recovered = _recover(old, old_corners, octagons, radii[octagons.gids], mesh.rounding, options, report)
+    result = _assemble(gaussians, old, octagons, recovered, radii, options, report)
+    report.foreign_vertices = octagons.foreign_vertices
+    report.ambiguous_corners = octagons.ambiguous_corners
+    report.result_size = len(result)
+    if len(result) == 0:
+        raise SceneFileError(f"{path}: nothing is left of the scene after this edit.")
+    return result, report
+
+
+def _unedited(
+    gaussians: FlatGaussians, octagons: Octagons, radii: Float[np.ndarray, " n"]
+) -> tuple[FlatGaussians, Float[np.ndarray, "m 8 3"]]:
+    """The Gaussian of each octagon as it was, and its corners as they were exported."""
+    old = gaussians.select(octagons.gids)
+    return old, octagon_corners_world(old, radii[octagons.gids])
+
+
+def _recover(
+    old: FlatGaussians,
+    old_corners: Float[np.ndarray, "m 8 3"],
+    octagons: Octagons,
+    radii: Float[np.ndarray, " m"],
+    file_rounding: float,
+    options: EditOptions,
+    report: EditReport,
+) -> _Recovered:
+    present, corners = octagons.present, octagons.corners_world
+    moves = np.where(present[:, :, None], corners - old_corners, 0.0)
+    rounding = coordinate_rounding(old_corners).astype(np.float64) + 2 * file_rounding
+    complete = present.all(axis=1)
+    unmoved = present.any(axis=1) & (np.abs(moves).max(axis=(1, 2)) <= rounding)
+    fit = fit_octagons(old, moves, present, radii)
+    means, legs = fit.means_world, fit.legs_world
+    enough = present.sum(axis=1) >= LEAST_CORNERS
+    if options.method == "three-point":
+        means, legs, enough = _three_point(corners, present, radii, old)
+    new_rounding = np.abs(means).max(axis=1) * 2 * np.finfo(np.float32).eps + 2 * file_rounding
+    sound = has_area(legs, new_rounding / np.maximum(radii, 1e-3)) & (radii > 0)
+    crumpled = enough & ~unmoved & (~sound | fit.folded | (fit.residuals > options.max_residual))
+    readable = unmoved | (enough & sound & ~crumpled)
+    signs, flipped, mirrored = _facing(old, means, legs, readable & ~unmoved, octagons)
+    if options.damaged == "repair":
+        signs = np.where(flipped, -signs, signs)
+    judged = readable & ~unmoved
+    report.unmoved = int((unmoved & ~octagons.is_copy).sum())
+    report.moved = int((judged & ~octagons.is_copy).sum())
+    report.incomplete = int((~complete).sum())
+    report.crumpled = int(crumpled.sum())
+    report.flipped, report.mirrored = int(flipped.sum()), int(mirrored.sum())
+    if judged.any():
+        residuals = fit.residuals[judged]
+        report.strained = int((residuals > STRAINED).sum())
+        report.residual_median, report.residual_p95 = np.quantile(residuals, [0.5, 0.95]).tolist()
+        report.residual_max = float(residuals.max())
+    return _Recovered(means, legs, signs, unmoved, readable, ~complete | crumpled | flipped)
+
+
+def _three_point(
+    corners: Float64[np.ndarray, "m 8 3"],
+    present: Bool[np.ndarray, "m 8"],
+    radii: Float[np.ndarray, " m"],
+    old: FlatGaussians,
+) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3 2"], Bool[np.ndarray, " m"]]:
+    """The paper's rule: centre from corners 2 and 6, axes from 0 and 2 by Gram-Schmidt."""
+    means, quats, log_scales, good = frames_from_octagons(corners, radii.astype(np.float64))
+    legs = rotation_matrices(quats)[:, :, 1:] * np.exp(log_scales)[:, None, :]
+    enough = present[:, 0] & present[:, 2] & present[:, 6]
+    bad = ~(good & enough)
+    means[bad], legs[bad] = old.means_world[bad], legs_world(old)[bad]
+    return means, legs, enough
+
+
+def _facing(
+    old: FlatGaussians,
+    means: Float64[np.ndarray, "m 3"],
+    legs: Float64[np.ndarray, "m 3 2"],
+    asked: Bool[np.ndarray, " m"],
+    octagons: Octagons,
+) -> tuple[Float64[np.ndarray, " m"], Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """Signs of the normals, and which Gaussians flipped or were mirrored, judged by their neighbours.
+
+    Originals are judged among originals. Copies are judged among copies, unless a Gaussian was copied more
+    than once, where neighbours may belong to different copies.
+    """
+    signs = np.ones(len(old))
+    flipped = np.zeros(len(old), dtype=bool)
+    mirrored = np.zeros(len(old), dtype=bool)
+    normals = rotation_matrices(old.quats_wxyz.astype(np.float64))[:, :, 0]
+    copied = octagons.gids[octagons.is_copy]
+    groups = [~octagons.is_copy]
+    if len(np.unique(copied)) == len(copied):
+        groups.append(octagons.is_copy)
+    complete = octagons.present.sum(axis=1) >= LEAST_CORNERS
+    for group in groups:
+        members = np.flatnonzero(group & complete)
+        wanted = np.flatnonzero(asked[members])
+        if not len(wanted):
+            continue
+        turns = neighbour_turns(old.means_world[members].astype(np.float64), means[members], wanted)
+        rows = members[wanted]
+        new_normals = np.cross(legs[rows, :, 0], legs[rows, :, 1])
+        new_normals /= np.maximum(np.linalg.norm(new_normals, axis=-1, keepdims=True), 1e-300)
+        flipped[rows], mirrored[rows] = flipped_against(turns, normals[rows], new_normals)
+        signs[rows] = np.where(mirrored[rows], -1.0, 1.0)
+    return signs, flipped, mirrored
+
+
+def _assemble(
+    gaussians: FlatGaussians,
+    old: FlatGaussians,
+    octagons: Octagons,
+    recovered: _Recovered,
+    radii: Float[np.ndarray, " n"],
+    options: EditOptions,
+    report: EditReport,
+) -> FlatGaussians:
+    """The result in the order of the scene, copies last."""
+    originals = np.flatnonzero(~octagons.is_copy)
+    gids = octagons.gids
+    absent = np.ones(len(gaussians), dtype=bool)
+    absent[gids] = False
+    # What the export left out is kept; it may also have left out those below a least opacity.
+    faintest = gaussians.opacities[gids].min() if len(gids) else 1.0
+    never = absent & ((radii <= 0) | (gaussians.opacities < faintest))
+    deleted = absent & ~never
+    report.deleted = int(deleted.sum())
+    kept = np.ones(len(octagons), dtype=bool)
+    if options.damaged == "drop":
+        kept &= ~recovered.damaged & recovered.readable
+    unreadable = np.flatnonzero(~recovered.readable & kept)
+    # Rows: octagons, then the Gaussians that never had one.
+    rest = np.flatnonzero(never)
+    pool = originals[recovered.readable[originals]]
+    points = np.concatenate([old.means_world[unreadable], gaussians.means_world[rest]]).astype(np.float64)
+    base = concatenate([old.select(unreadable), gaussians.select(rest)])
+    moved = carry(
+        points,
+        old.means_world[pool].astype(np.float64),
+        recovered.means[pool],
+        solid_derivatives(old.select(pool), recovered.legs[pool], recovered.signs[pool]),
+        recovered.unmoved[pool],
+        gaussians.means_world[deleted].astype(np.float64),
+    )
+    carried_legs = moved.derivatives @ legs_world(base)
+    signs = np.where(np.linalg.det(moved.derivatives) < 0, -1.0, 1.0)
+    carried_part = apply_legs(base, moved.means_world, carried_legs, signs, moved.unmoved)
+    own = recovered.readable & kept
+    own_part = apply_legs(
+        old.select(own),
+        recovered.means[own],
+        recovered.legs[own],
+        recovered.signs[own],
+        recovered.unmoved[own],
+    )
+    orphaned = moved.orphaned.copy()
+    orphaned[: len(unreadable)] = False
+    report.orphaned = int(orphaned.sum())
+    report.carried = int((~orphaned[len(unreadable) :]).sum())
+    report.dropped = int((~kept).sum())
+    report.copies = int((octagons.is_copy & kept).sum())
+    everything = concatenate([own_part, carried_part])
+    places = np.concatenate([gids[own], gids[unreadable], rest])
+    is_copy = np.concatenate(
+        [octagons.is_copy[own], octagons.is_copy[unreadable], np.zeros(len(rest), dtype=bool)]
+    )
+    left = np.concatenate([np.ones(int(own.sum()), dtype=bool), ~orphaned])
+    order = np.lexsort((places, is_copy))
+    return everything.select(order[left[order]])
+
+
+def apply_legs(
+    old: FlatGaussians,
+    means_world: Float64[np.ndarray, "n 3"],
+    legs: Float64[np.ndarray, "n 3 2"],
+    normal_signs: Float64[np.ndarray, " n"],
+    unmoved: Bool[np.ndarray, " n"],
+    turn: Float64[np.ndarray, "3 3"] | None = None,
+) -> FlatGaussians:
+    """Gaussians with new centres and legs, and harmonics turned along; ``unmoved`` ones keep every bit.
+
+    The harmonics turn as the surface does, or all by ``turn`` where the whole map is known. A Gaussian whose
+    new legs have no area at all keeps its old frame, scales and colour.
+    """
+    result = old.copy()
+    flat = ~has_area(legs, np.zeros(len(old)))
+    result.means_world[~unmoved] = means_world[~unmoved].astype(np.float32)
+    rows = np.flatnonzero(~unmoved & ~flat)
+    part = old.select(rows)
+    quats, log_scales = frames_from_skewed_legs(legs[rows], normal_signs[rows])
+    result.quats_wxyz[rows] = quats.astype(np.float32)
+    result.log_scales[rows] = log_scales.astype(np.float32)
+    if turn is None:
+        turns = surface_turns(part, legs[rows], normal_signs[rows])
+    else:
+        turns = np.broadcast_to(turn, (len(rows), 3, 3))
+    result.sh[rows] = rotate_sh(part.sh, turns)
+    return result

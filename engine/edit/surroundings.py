@@ -1,0 +1,136 @@
+"""What a Gaussian's neighbours did: to judge octagons that flipped, and to move those without corners."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64
+from scipy.spatial import KDTree
+
+NEIGHBOURS = 12
+LEAST_AGREEMENT = 0.8
+"""Correlation of the neighbours' moves with a rotation and scale, below which they are no witnesses."""
+MIRROR_GAIN = 0.1
+"""A reflection must beat the best rotation by this much correlation to be believed: in a plane it cannot."""
+FLIPPED_COSINE = -0.2
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Gaussians moved as their neighbours were.
+
+    Attributes:
+        means_world: new centres.
+        derivatives: of the map at the centres, world to world.
+        unmoved: every neighbour stayed as it was, so this one does too.
+        orphaned: the nearest neighbour was deleted.
+    """
+
+    means_world: Float64[np.ndarray, "u 3"]
+    derivatives: Float64[np.ndarray, "u 3 3"]
+    unmoved: Bool[np.ndarray, " u"]
+    orphaned: Bool[np.ndarray, " u"]
+
+
+def neighbour_turns(
+    old_means: Float64[np.ndarray, "n 3"],
+    new_means: Float64[np.ndarray, "n 3"],
+    asked: Int64[np.ndarray, " m"],
+) -> Float64[np.ndarray, "m 3 3"]:
+    """Orthogonal matrices that best take each asked Gaussian's old neighbours to the new ones (Kabsch).
+
+    Zero where there are too few neighbours, or where they moved in no common way. Neighbours that lie in a
+    plane do not show whether they were mirrored; for them the whole scene decides.
+    """
+    count = min(NEIGHBOURS, len(old_means))
+    if count < 4 or len(asked) == 0:
+        return np.zeros((len(asked), 3, 3))
+    _, near = KDTree(old_means).query(old_means[asked], k=count)
+    everything = _orthogonal_fits(old_means[None], new_means[None], 1.0)
+    return _orthogonal_fits(old_means[near], new_means[near], -1.0 if _mirrors(everything)[0] else 1.0)
+
+
+def _orthogonal_fits(
+    old: Float64[np.ndarray, "m k 3"], new: Float64[np.ndarray, "m k 3"], planar_sign: float
+) -> Float64[np.ndarray, "m 3 3"]:
+    """Rotations or reflections from old to new points; ``planar_sign`` says which where either would do."""
+    old = old - old.mean(axis=1, keepdims=True)
+    new = new - new.mean(axis=1, keepdims=True)
+    u, spread, vt = np.linalg.svd(np.einsum("nki,nkj->nij", new, old))
+    best = np.sign(np.linalg.det(u @ vt))
+    whole = np.sqrt(np.sum(old**2, axis=(1, 2)) * np.sum(new**2, axis=(1, 2)))
+    sign = np.where(2 * spread[:, 2] > MIRROR_GAIN * whole, best, planar_sign)
+    u[:, :, 2] *= (sign * best)[:, None]
+    agreement = spread[:, 0] + spread[:, 1] + sign * best * spread[:, 2]
+    turns: np.ndarray = u @ vt
+    turns[agreement < LEAST_AGREEMENT * whole] = 0.0
+    return turns
+
+
+def _mirrors(turns: Float64[np.ndarray, "m 3 3"]) -> Bool[np.ndarray, " m"]:
+    result: np.ndarray = np.linalg.det(turns) < 0
+    return result
+
+
+def flipped_against(
+    turns: Float64[np.ndarray, "m 3 3"],
+    old_normals: Float64[np.ndarray, "m 3"],
+    new_normals: Float64[np.ndarray, "m 3"],
+) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """Octagons whose surface faces the other way than their surroundings say; where ``turns`` is zero, none.
+
+    Returns:
+        Which octagons flipped (alone), and which belong to a part of the scene that was mirrored as a whole,
+        where the cross product of the legs points to the other side by right.
+    """
+    mirrored = _mirrors(turns)
+    expected = np.einsum("nij,nj->ni", turns, old_normals)
+    cosines = np.sum(expected * new_normals, axis=-1)
+    facing = np.where(mirrored, -cosines, cosines)
+    return facing < FLIPPED_COSINE, mirrored
+
+
+def carry(
+    points: Float64[np.ndarray, "u 3"],
+    old_means: Float64[np.ndarray, "n 3"],
+    new_means: Float64[np.ndarray, "n 3"],
+    derivatives: Float64[np.ndarray, "n 3 3"],
+    unmoved: Bool[np.ndarray, " n"],
+    deleted_means: Float64[np.ndarray, "d 3"],
+) -> Carried:
+    """Move points as the weighted affine maps of their nearest known Gaussians say.
+
+    Args:
+        points: old centres of those without readable corners.
+        old_means: old centres of those with.
+        new_means: their new centres.
+        derivatives: their maps' derivatives.
+        unmoved: which of them stayed exactly.
+        deleted_means: old centres of Gaussians that were deleted.
+    """
+    count = min(NEIGHBOURS, len(old_means))
+    if count == 0 or len(points) == 0:
+        eye = np.broadcast_to(np.eye(3), (len(points), 3, 3)).copy()
+        none = np.zeros(len(points), dtype=bool)
+        return Carried(points.copy(), eye, ~none, none)
+    distances, near = KDTree(old_means).query(points, k=count)
+    distances, near = distances.reshape(len(points), count), near.reshape(len(points), count)
+    weights = _weights(distances)
+    offsets = points[:, None] - old_means[near]
+    moved = new_means[near] + np.einsum("nkij,nkj->nki", derivatives[near], offsets)
+    orphaned = np.zeros(len(points), dtype=bool)
+    if len(deleted_means):
+        orphaned = KDTree(deleted_means).query(points)[0] < distances[:, 0]
+    return Carried(
+        np.einsum("nk,nki->ni", weights, moved),
+        np.einsum("nk,nkij->nij", weights, derivatives[near]),
+        unmoved[near].all(axis=1),
+        orphaned,
+    )
+
+
+def _weights(distances: Float[np.ndarray, "u k"]) -> Float[np.ndarray, "u k"]:
+    """Weights that fall to zero at the last neighbour, so that neighbours come and go without a jump."""
+    reach = distances[:, -1:] * (1 + 1e-6) + 1e-30
+    weights = (1 - distances / reach) ** 2 + 1e-12
+    result: np.ndarray = weights / weights.sum(axis=1, keepdims=True)
+    return result

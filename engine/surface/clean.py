@@ -1,0 +1,83 @@
+"""Small parts removed, and decimation."""
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int32
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from engine.surface.holes import fill_holes
+from engine.surface.mesh import TriangleMesh, directed_edges, edge_report
+
+UNTANGLING_ROUNDS = 5
+
+
+def face_components(mesh: TriangleMesh) -> Int32[np.ndarray, " m"]:
+    """The number of the connected part that each triangle belongs to; parts touch at vertices."""
+    a, b, c = mesh.faces.T
+    rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
+    count = len(mesh.vertices_world)
+    graph = coo_matrix((np.ones(len(rows), np.uint8), (rows, columns)), shape=(count, count))
+    _, part = connected_components(graph, directed=False)
+    return part[a].astype(np.int32)
+
+
+def keep_large_components(
+    mesh: TriangleMesh, *, keep: int | None = None, min_share: float = 0.0
+) -> TriangleMesh:
+    """The ``keep`` largest connected parts by area, or those of at least ``min_share`` of the largest's."""
+    part = face_components(mesh)
+    areas: Float64[np.ndarray, " p"] = np.bincount(part, mesh.face_areas)
+    if keep is not None:
+        wanted = np.zeros(len(areas), dtype=bool)
+        wanted[np.argsort(-areas, kind="stable")[:keep]] = True
+    else:
+        wanted = areas >= min_share * areas.max()
+    return mesh.select_faces(wanted[part])
+
+
+def decimate(mesh: TriangleMesh, max_triangles: int) -> TriangleMesh:
+    """At most ``max_triangles`` triangles, by collapsing the edges that matter least (quadric error).
+
+    Colours are not carried over; bake them afterwards. A watertight mesh stays watertight. Closing what the
+    collapse tangled can add a handful of triangles back, so that a few more than asked for may come out.
+    """
+    import fast_simplification
+
+    if len(mesh.faces) <= max_triangles:
+        return mesh
+    # The library stops short of its aim now and then; a few more rounds bring it there.
+    points, faces = mesh.vertices_world, mesh.faces
+    for aggression in (5, 7, 10):
+        points, faces = fast_simplification.simplify(
+            points, faces, target_count=max_triangles, agg=aggression
+        )
+        if len(faces) <= max_triangles:
+            break
+    points, faces = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(faces, np.int32)
+    return _untangled(TriangleMesh(points, faces), closed=edge_report(mesh.faces).watertight)
+
+
+def _untangled(mesh: TriangleMesh, *, closed: bool) -> TriangleMesh:
+    """The mesh without triangles at edges that are crowded or twisted; what that opens is closed again.
+
+    Collapsing edges now and then folds a thin part onto itself.
+    """
+    for _ in range(UNTANGLING_ROUNDS):
+        mesh = mesh.select_faces(_simple(mesh.faces))
+        if closed:
+            mesh, _ = fill_holes(mesh, None)
+        if _simple(mesh.faces).all():
+            break
+    return mesh
+
+
+def _simple(faces: Int32[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
+    """Which triangles have three corners, and edges with at most one other triangle that winds alike."""
+    edges = directed_edges(faces).astype(np.int64)
+    size = int(faces.max(initial=0)) + 1
+    _, place, uses = np.unique(edges[:, 0] * size + edges[:, 1], return_inverse=True, return_counts=True)
+    # An edge used twice in one direction is crowded or twisted.
+    alone = (uses[place.reshape(-1)] == 1).reshape(-1, 3).all(axis=1)
+    distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    result: np.ndarray = alone & distinct
+    return result

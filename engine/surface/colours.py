@@ -1,0 +1,123 @@
+"""Colours of surface points, as the cameras that see them best see them."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from engine.render.cameras import RenderCamera
+from engine.surface.mesh import TriangleMesh
+from engine.surface.occlusion import Occluder
+from engine.trace.protocol import Tracer
+
+Progress = Callable[[int, int], None]
+BEST_VIEWS = 3
+POINTS_AT_ONCE = 1 << 15
+MIN_COSINE = 0.1
+UNSEEN_RGB_SRGB = 0.5
+MIN_ALPHA = 0.25
+"""Rays that the scene covers less than this say nothing of its colour."""
+
+
+def bake_colours(
+    points_world: Float32[np.ndarray, "n 3"],
+    normals_world: Float32[np.ndarray, "n 3"],
+    mesh: TriangleMesh,
+    cameras: Sequence[RenderCamera],
+    tracer: Tracer,
+    tolerance: float,
+    progress: Progress = lambda _done, _total: None,
+) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    """Trace the scene along the rays from the best cameras to points on its surface.
+
+    The best cameras of a point are those that have it in their image, unhidden by the mesh, and look at it
+    most squarely and from nearby. Their colours are averaged with the squares of that measure as weights.
+
+    Args:
+        points_world: where colours are wanted.
+        normals_world: unit normals there, outwards.
+        mesh: the surface, which hides points from cameras.
+        cameras: candidates.
+        tracer: with the scene built.
+        tolerance: surface this near to a point (world units) does not hide it.
+        progress: told (points done, points in all).
+
+    Returns:
+        Display colours, grey where no camera sees the point, and whether one does.
+    """
+    occluder = Occluder(mesh)
+    rgb_srgb = np.full((len(points_world), 3), UNSEEN_RGB_SRGB, np.float32)
+    seen = np.zeros(len(points_world), dtype=bool)
+    progress(0, len(points_world))
+    for start in range(0, len(points_world), POINTS_AT_ONCE):
+        part = slice(start, start + POINTS_AT_ONCE)
+        choice, weights = _best_cameras(
+            points_world[part].astype(np.float64), normals_world[part], cameras, occluder, tolerance
+        )
+        rgb_srgb[part], seen[part] = _mean_colours(points_world[part], choice, weights, cameras, tracer)
+        progress(min(start + POINTS_AT_ONCE, len(points_world)), len(points_world))
+    return rgb_srgb, seen
+
+
+def _best_cameras(
+    points: Float64[np.ndarray, "n 3"],
+    normals: Float32[np.ndarray, "n 3"],
+    cameras: Sequence[RenderCamera],
+    occluder: Occluder,
+    tolerance: float,
+) -> tuple[np.ndarray, Float32[np.ndarray, "n k"]]:
+    """Numbers of the best cameras of each point and their weights, 0 where there are fewer."""
+    count = len(points)
+    choice = np.zeros((count, BEST_VIEWS), np.int32)
+    weights = np.zeros((count, BEST_VIEWS), np.float32)
+    for number, camera in enumerate(cameras):
+        way = camera.centre_world - points
+        length = np.maximum(np.linalg.norm(way, axis=1), 1e-12)
+        cosine = np.sum(way * normals, axis=1) / length
+        xy = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = ((xy >= 0) & (xy < [camera.width_px, camera.height_px])).all(axis=1)
+        # Pixels per length on the surface, up to a factor that all cameras of one scene share more or less.
+        merit = np.where(inside & (cosine > MIN_COSINE), cosine * camera.fy_px / length, 0.0)
+        better = np.flatnonzero(merit > weights[:, -1])
+        if len(better) == 0:
+            continue
+        viewers = np.broadcast_to(camera.centre_world, (len(better), 3))
+        better = better[occluder.sees(points[better], viewers, tolerance)]
+        weights[better, -1], choice[better, -1] = merit[better], number
+        order = np.argsort(-weights[better], axis=1, kind="stable")
+        weights[better] = np.take_along_axis(weights[better], order, axis=1)
+        choice[better] = np.take_along_axis(choice[better], order, axis=1)
+    return choice, weights
+
+
+def _mean_colours(
+    points: Float32[np.ndarray, "n 3"],
+    choice: np.ndarray,
+    weights: Float32[np.ndarray, "n k"],
+    cameras: Sequence[RenderCamera],
+    tracer: Tracer,
+) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    centres = np.stack([camera.centre_world for camera in cameras]).astype(np.float32)
+    total = np.zeros((len(points), 3))
+    sums = np.zeros(len(points))
+    for k in range(choice.shape[1]):
+        used = np.flatnonzero(weights[:, k] > 0)
+        if len(used) == 0:
+            continue
+        # Rays of one camera side by side, so that the tracer can follow neighbours together.
+        used = used[np.argsort(choice[used, k], kind="stable")]
+        origins = centres[choice[used, k]]
+        way = points[used] - origins
+        directions = way / np.linalg.norm(way, axis=1, keepdims=True)
+        traced = tracer.trace(origins, directions.astype(np.float32))
+        solid = traced.alpha >= MIN_ALPHA
+        # What shows through the scene is not its colour.
+        rgb = traced.rgb_srgb[solid] / traced.alpha[solid, None]
+        weight = weights[used[solid], k].astype(np.float64) ** 2
+        total[used[solid]] += weight[:, None] * np.clip(rgb, 0.0, 1.0)
+        sums[used[solid]] += weight
+    seen = sums > 0
+    mean = np.full((len(points), 3), UNSEEN_RGB_SRGB)
+    mean[seen] = total[seen] / sums[seen, None]
+    return mean.astype(np.float32), seen

@@ -1,0 +1,77 @@
+"""Depth maps of a scene, rendered by the tracer and kept in a temporary file."""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from engine.render.cameras import RenderCamera
+from engine.render.renderer import RenderedImage, render_rays
+from engine.surface.options import SurfaceOptions
+from engine.trace.protocol import Tracer
+
+Progress = Callable[[int, int], None]
+EMPTY_ALPHA = 0.05
+"""Pixels that the scene covers less than this are empty: all space before them is free."""
+EMPTY = np.float32(np.inf)
+UNKNOWN = np.float32(0.0)
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """Depths as seen by each camera; the images may differ in size.
+
+    Attributes:
+        cameras: the cameras.
+        distances: for each, distances along the unit rays in world units; 0 where nothing is known, infinite
+            where the ray is free.
+        cosines: for each, cosines of the angles between rays and surface normals.
+    """
+
+    cameras: tuple[RenderCamera, ...]
+    distances: tuple[Float32[np.ndarray, "_h _w"], ...]
+    cosines: tuple[Float32[np.ndarray, "_h _w"], ...]
+
+
+def render_depth_maps(
+    tracer: Tracer,
+    cameras: Sequence[RenderCamera],
+    options: SurfaceOptions,
+    folder: Path,
+    progress: Progress = lambda _done, _total: None,
+) -> DepthMaps:
+    """Render the depth maps of ``cameras`` into a file in ``folder``, 8 bytes a pixel.
+
+    The file has no name, so that nothing is left of it whatever happens.
+    """
+    sizes = [camera.width_px * camera.height_px for camera in cameras]
+    with tempfile.TemporaryFile(dir=folder) as handle:
+        handle.truncate(max(8, 8 * sum(sizes)))
+        stored = np.memmap(handle, dtype=np.float32, mode="r+", shape=(2 * sum(sizes),))
+    distances, cosines, start = [], [], 0
+    black = np.zeros(3, np.float32)
+    progress(0, len(cameras))
+    for number, (camera, size) in enumerate(zip(cameras, sizes, strict=True)):
+        shape = (camera.height_px, camera.width_px)
+        distances.append(stored[start : start + size].reshape(shape))
+        cosines.append(stored[start + size : start + 2 * size].reshape(shape))
+        start += 2 * size
+        origin_world, directions_world = camera.rays()
+        image = render_rays(tracer, origin_world, directions_world, black)
+        distances[-1][...] = _distances(image, options)
+        # The tracer turns normals to the viewer, so the dot product is negative.
+        cosines[-1][...] = np.clip(-np.sum(image.normal_world * directions_world, axis=-1), 0.0, 1.0)
+        progress(number + 1, len(cameras))
+    return DepthMaps(tuple(cameras), tuple(distances), tuple(cosines))
+
+
+def _distances(image: RenderedImage, options: SurfaceOptions) -> Float32[np.ndarray, "h w"]:
+    distances = image.depth_median if options.depth == "median" else image.depth
+    distances = np.where(image.alpha >= options.min_alpha, distances, UNKNOWN)
+    distances[image.alpha < EMPTY_ALPHA] = EMPTY
+    if options.depth_trunc is not None:
+        distances[(distances > options.depth_trunc) & (distances < EMPTY)] = UNKNOWN
+    return distances

@@ -1,0 +1,138 @@
+"""From Gaussians and cameras to one coloured triangle mesh."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32
+from scipy.spatial import cKDTree
+
+from engine.errors import Cancelled
+from engine.events import Listener, StageFinished, StageProgress, StageStarted, ignore
+from engine.render.cameras import RenderCamera
+from engine.surface.clean import decimate, keep_large_components
+from engine.surface.colours import bake_colours
+from engine.surface.depth import render_depth_maps
+from engine.surface.holes import fill_holes
+from engine.surface.marching import surface_of
+from engine.surface.mesh import EdgeReport, TriangleMesh, edge_report
+from engine.surface.options import SurfaceOptions
+from engine.surface.region import Region, choose_region, focus
+from engine.surface.texture import lay_out, with_texture
+from engine.surface.volume import BYTES_PER_BLOCK, Volume, fuse
+from engine.trace.protocol import Tracer
+
+TOLERANCE_VOXELS = 2.0
+"""Surface this near to a point does not hide it when colours are baked."""
+
+
+@dataclass(frozen=True)
+class ExtractedSurface:
+    """A mesh and how it came about.
+
+    Attributes:
+        mesh: the coloured mesh, in the world frame.
+        region: the grid it was found in.
+        volume_bytes: memory of the fused volume.
+        triangles_found: triangles before small parts were removed and holes were closed.
+        holes_closed: number of holes closed.
+        edges: how the triangles hang together, before a texture cuts them apart.
+    """
+
+    mesh: TriangleMesh
+    region: Region
+    volume_bytes: int
+    triangles_found: int
+    holes_closed: int
+    edges: EdgeReport
+
+
+def extract_surface(
+    tracer: Tracer,
+    cameras: Sequence[RenderCamera],
+    options: SurfaceOptions,
+    *,
+    scratch: Path,
+    listener: Listener = ignore,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> ExtractedSurface:
+    """Fuse the depth that ``cameras`` see into a mesh, clean it up and colour it.
+
+    Args:
+        tracer: with the scene built.
+        cameras: where depth and colours are rendered from.
+        options: all settings.
+        scratch: folder for a temporary file of 8 bytes for every pixel of the depth maps.
+        listener: hears the stages ``render``, ``fusing``, ``meshing`` and ``colouring``.
+        should_stop: asked now and then.
+
+    Raises:
+        ConfigError: the region cannot be found, is empty or takes too much memory.
+        Cancelled: stopped as asked.
+    """
+
+    @contextmanager
+    def stage(name: str, steps: int) -> Iterator[Callable[[int, int], None]]:
+        listener(StageStarted(name, steps))
+        began = time.perf_counter()
+
+        def progress(done: int, total: int) -> None:
+            listener(StageProgress(name, done, total))
+            if should_stop():
+                raise Cancelled("Stopped; no surface was written.")
+
+        yield progress
+        listener(StageFinished(name, time.perf_counter() - began))
+
+    if not options.unbounded and options.bounds is None:
+        focus(cameras)  # complain before the long work
+    with stage("render", len(cameras)) as progress:
+        maps = render_depth_maps(tracer, cameras, options, scratch, progress)
+    region = choose_region(maps, options)
+    with stage("fusing", 2 * len(cameras)) as progress:
+        volume: Volume | None = fuse(maps, region, options, progress)
+    del maps
+    assert volume is not None
+    volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
+    with stage("meshing", 4) as progress:
+        mesh = surface_of(volume, options.min_weight)
+        volume, found = None, len(mesh.faces)
+        progress(1, 4)
+        mesh = keep_large_components(mesh, keep=options.keep_components, min_share=options.min_component)
+        progress(2, 4)
+        max_rim = None if options.fill_holes is None else options.fill_holes * region.voxel_world
+        mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
+        progress(3, 4)
+        if options.max_triangles is not None:
+            mesh = decimate(mesh, options.max_triangles)
+        progress(4, 4)
+    edges = edge_report(mesh.faces)
+    tolerance = TOLERANCE_VOXELS * region.voxel_world
+    with stage("colouring", 0) as progress:
+        if options.texture_side is None:
+            normals = mesh.vertex_normals()
+            rgb, seen = bake_colours(mesh.vertices_world, normals, mesh, cameras, tracer, tolerance, progress)
+            mesh = replace(mesh, rgb_srgb=_spread(mesh.vertices_world, rgb, seen))
+        else:
+            layout = lay_out(mesh, options.texture_side)
+            rgb, seen = bake_colours(
+                layout.points_world, layout.normals_world, mesh, cameras, tracer, tolerance, progress
+            )
+            rgb = _spread(layout.points_world, rgb, seen)
+            mesh = with_texture(layout, rgb, options.texture_side)
+    return ExtractedSurface(mesh, region, volume_bytes, found, closed, edges)
+
+
+def _spread(
+    points: Float32[np.ndarray, "n 3"], rgb: Float32[np.ndarray, "n 3"], seen: Bool[np.ndarray, " n"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Colours with those of points that nobody sees taken from the nearest that somebody does."""
+    if seen.all() or not seen.any():
+        return rgb
+    _, nearest = cKDTree(points[seen]).query(points[~seen])
+    filled = rgb.copy()
+    filled[~seen] = rgb[seen][nearest]
+    return filled

@@ -1,0 +1,138 @@
+"""Marching cubes over blocks of voxels; vertices are shared across blocks by the edges they lie on."""
+
+import numpy as np
+from numba import njit, prange
+
+BLOCK = 8
+SIDE = BLOCK + 1
+"""A block's cells also need the first voxels of the next blocks."""
+CELLS = SIDE**3
+
+
+@njit
+def neighbour(table, blocks, b, x, y, z):
+    """Row of the block that holds voxel (x, y, z) counted from block ``b``, and the voxel's place in it."""
+    bx, by, bz = blocks[b, 0] + x // BLOCK, blocks[b, 1] + y // BLOCK, blocks[b, 2] + z // BLOCK
+    place = ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK
+    if bx >= table.shape[0] or by >= table.shape[1] or bz >= table.shape[2]:
+        return -1, place
+    return table[bx, by, bz], place
+
+
+@njit
+def gather(table, blocks, b, values, weights, min_weight, out):
+    """The 9^3 values that the cells of a block need; not-a-number where too little is known."""
+    for x in range(SIDE):
+        for y in range(SIDE):
+            for z in range(SIDE):
+                row, place = neighbour(table, blocks, b, x, y, z)
+                if row >= 0 and weights[row, place] >= min_weight:
+                    out[(x * SIDE + y) * SIDE + z] = values[row, place]
+                else:
+                    out[(x * SIDE + y) * SIDE + z] = np.nan
+
+
+@njit
+def offset_of(corner):
+    """Place of a cell's corner among the 9^3 values, from the cell's first corner."""
+    return ((corner & 1) * SIDE + (corner >> 1 & 1)) * SIDE + (corner >> 2 & 1)
+
+
+@njit
+def case_of(near, at):
+    """Which corners of the cell lie inside, as bits; 0 where one of them is unknown."""
+    case = 0
+    for corner in range(8):
+        value = near[at + offset_of(corner)]
+        if np.isnan(value):
+            return 0
+        if value < 0.0:
+            case |= 1 << corner
+    return case
+
+
+@njit(cache=True, parallel=True)
+def count_parts(table, blocks, values, weights, min_weight, triangle_counts, crossed, vertices, triangles):
+    """How many vertices and triangles each block owns; ``crossed`` gets a bit for each axis of a voxel.
+
+    A voxel owns the edges that leave it along +x, +y and +z. Edges that no cell uses count as well; their
+    vertices are dropped later.
+    """
+    for b in prange(len(blocks)):
+        near = np.empty(CELLS, np.float32)
+        gather(table, blocks, b, values, weights, min_weight, near)
+        vertex_count, triangle_count = 0, 0
+        for x in range(BLOCK):
+            for y in range(BLOCK):
+                for z in range(BLOCK):
+                    at = (x * SIDE + y) * SIDE + z
+                    value = near[at]
+                    bits = 0
+                    if not np.isnan(value):
+                        for axis in range(3):
+                            other = near[at + offset_of(1 << axis)]
+                            if not np.isnan(other) and (value < 0.0) != (other < 0.0):
+                                bits |= 1 << axis
+                                vertex_count += 1
+                        triangle_count += triangle_counts[case_of(near, at)]
+                    crossed[b, (x * BLOCK + y) * BLOCK + z] = bits
+        vertices[b], triangles[b] = vertex_count, triangle_count
+
+
+@njit(cache=True, parallel=True)
+def place_vertices(table, blocks, values, weights, min_weight, crossed, starts, first, points):
+    """Vertices where values change sign along edges, in voxels from the grid's first voxel centre.
+
+    ``first`` gets the number of each voxel's first vertex.
+    """
+    for b in prange(len(blocks)):
+        near = np.empty(CELLS, np.float32)
+        gather(table, blocks, b, values, weights, min_weight, near)
+        number = starts[b]
+        for x in range(BLOCK):
+            for y in range(BLOCK):
+                for z in range(BLOCK):
+                    place = (x * BLOCK + y) * BLOCK + z
+                    first[b, place] = number
+                    at = (x * SIDE + y) * SIDE + z
+                    for axis in range(3):
+                        if crossed[b, place] >> axis & 1:
+                            here, there = near[at], near[at + offset_of(1 << axis)]
+                            # Not quite to the ends, where triangles would lose their area.
+                            t = min(max(here / (here - there), np.float32(0.01)), np.float32(0.99))
+                            points[number, 0] = blocks[b, 0] * BLOCK + x
+                            points[number, 1] = blocks[b, 1] * BLOCK + y
+                            points[number, 2] = blocks[b, 2] * BLOCK + z
+                            points[number, axis] += t
+                            number += 1
+
+
+@njit(cache=True, parallel=True)
+def place_triangles(
+    table, blocks, values, weights, min_weight, edge_corners, edge_table, triangle_counts,
+    crossed, first, starts, faces,
+):  # fmt: skip
+    """Triangles of all cells, in the order of the blocks."""
+    for b in prange(len(blocks)):
+        near = np.empty(CELLS, np.float32)
+        gather(table, blocks, b, values, weights, min_weight, near)
+        number = starts[b]
+        for x in range(BLOCK):
+            for y in range(BLOCK):
+                for z in range(BLOCK):
+                    at = (x * SIDE + y) * SIDE + z
+                    if np.isnan(near[at]):
+                        continue
+                    case = case_of(near, at)
+                    for k in range(3 * triangle_counts[case]):
+                        edge = edge_table[case, k]
+                        low = edge_corners[edge, 0]
+                        axis = edge // 4
+                        row, place = neighbour(
+                            table, blocks, b, x + (low & 1), y + (low >> 1 & 1), z + (low >> 2 & 1)
+                        )
+                        vertex = first[row, place]
+                        for before in range(axis):
+                            vertex += crossed[row, place] >> before & 1
+                        faces[number + k // 3, k % 3] = vertex
+                    number += triangle_counts[case]

@@ -1,0 +1,44 @@
+"""What can be seen past a mesh, by Embree."""
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh as EmbreeMesh
+from embreex.rtcore_scene import EmbreeScene
+from jaxtyping import Bool, Float
+
+from engine.surface.mesh import TriangleMesh
+
+NEAR_SHARE = 1e-3
+"""The last thousandth of the way to a point is not tested, lest the point's own triangle hide it."""
+
+
+class Occluder:
+    """A mesh that hides what is behind it."""
+
+    def __init__(self, mesh: TriangleMesh) -> None:
+        self._scene = EmbreeScene()
+        self._mesh = EmbreeMesh(self._scene, mesh.vertices_world, mesh.faces)
+
+    def sees(
+        self,
+        points_world: Float[np.ndarray, "n 3"],
+        viewers_world: Float[np.ndarray, "n 3"],
+        tolerance: float = 0.0,
+    ) -> Bool[np.ndarray, " n"]:
+        """Whether nothing lies between each point and its viewer.
+
+        Args:
+            points_world: the points, on the mesh or off it.
+            viewers_world: where each is looked at from.
+            tolerance: surface this near to the point (world units, along the ray) does not hide it.
+        """
+        way = points_world - viewers_world
+        length = np.linalg.norm(way, axis=1)
+        reach = np.maximum(length * (1 - NEAR_SHARE) - tolerance, 0.0)
+        directions = way / np.maximum(length, 1e-30)[:, None]
+        blocked = self._scene.run(
+            np.ascontiguousarray(viewers_world, np.float32),
+            np.ascontiguousarray(directions, np.float32),
+            query="OCCLUDED",
+            dists=reach.astype(np.float32),
+        )
+        return np.asarray(blocked < 0)

@@ -1,0 +1,163 @@
+"""The part of space that is fused, and its grid of voxels."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from engine.errors import ConfigError
+from engine.render.cameras import RenderCamera
+from engine.render.paths import fit_turntable
+from engine.surface.depth import DepthMaps
+from engine.surface.options import SurfaceOptions
+
+BLOCK = 8
+"""Voxels along a side of a block."""
+MAX_BLOCKS_PER_SIDE = 512
+CONTRACTED_HALF = 2.0
+"""Contracted space fills the ball of this radius."""
+MIN_TRUNCATION_VOXELS = 4.0
+TRUNCATION_SHARE = 0.03
+"""Of the cameras' distance; what gave the best F-score on the generated scene, whatever the voxels."""
+RESOLUTION = 512
+PIXELS_PER_VOXEL = 1.5
+SAMPLES_PER_SIDE = 160
+STRAY_SHARE = 1e-3
+MARGIN_SHARE = 0.05
+NOTHING_SEEN = "No surface lies in the region to mesh; name another with --bounds, or use --unbounded."
+_ANY_AXIS = np.array([0.36, 0.48, 0.8])
+
+
+@dataclass(frozen=True)
+class Region:
+    """A grid of cubic voxels over a box, or over all of space by contraction.
+
+    Contraction (mip-NeRF 360, Eq. 10): with x = (world - centre) / radius, x stays where it is inside the
+    unit ball and goes to (2 - 1/|x|) x/|x| outside. The grid then lies over the box [-2, 2]^3 and its unit
+    is ``radius``.
+
+    Attributes:
+        low: least corner of the grid, world units or contracted.
+        voxel: side of a voxel in the same units.
+        blocks: number of blocks of 8^3 voxels along x, y and z.
+        contracted: whether grid coordinates are contracted.
+        centre_world: centre of the contraction; zero if there is none.
+        radius: of the unit ball, world units; 1 if there is none.
+        truncation: half width of the band around the surface, in voxels.
+    """
+
+    low: Float64[np.ndarray, "3"]
+    voxel: float
+    blocks: tuple[int, int, int]
+    contracted: bool
+    centre_world: Float64[np.ndarray, "3"]
+    radius: float
+    truncation: float
+
+    @property
+    def voxel_world(self) -> float:
+        """Side of a voxel in world units, at the centre if contracted."""
+        return self.voxel * self.radius
+
+    def world_from_grid(self, points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """World positions of points given in voxels from the first voxel's centre."""
+        at = self.low + (points.astype(np.float64) + 0.5) * self.voxel
+        if not self.contracted:
+            return at
+        length = np.linalg.norm(at, axis=1, keepdims=True)
+        # Beyond the ball of radius 2 lies nothing; its rim stands for infinity.
+        stretch = 1.0 / np.maximum(2.0 - length, 1e-4) / np.maximum(length, 1.0)
+        return self.centre_world + self.radius * np.where(length > 1.0, stretch, 1.0) * at
+
+
+def choose_region(maps: DepthMaps, options: SurfaceOptions) -> Region:
+    """The region that the options ask for, or what is seen of the space that the cameras stand around.
+
+    That space is a cube around the point nearest to all viewing axes, as far to each side as the cameras are
+    away from it in the median; of it, the box that holds the depths seen.
+
+    Raises:
+        ConfigError: the cameras have no common centre and the options name no box, nothing is seen, or the
+            grid is too fine.
+    """
+    pixel = 0.0 if options.resolution is not None else _pixel(maps.cameras)
+    if options.bounds is not None:
+        low, high = np.array(options.bounds[:3]), np.array(options.bounds[3:])
+        try:
+            _, distance = focus(maps.cameras)
+        except ConfigError:
+            distance = 0.5 * float((high - low).max())
+        return _grid(low, high, distance, pixel * distance, options)
+    centre, distance = focus(maps.cameras)
+    if not options.unbounded:
+        box = _seen_box(maps, centre - distance, centre + distance)
+        return _grid(*box, distance, pixel * distance, options)
+    half = np.full(3, CONTRACTED_HALF)
+    voxel = None if options.voxel is None else options.voxel / distance
+    grid = _grid(-half, half, 1.0, pixel, options.model_copy(update={"voxel": voxel}))
+    return replace(grid, contracted=True, centre_world=centre, radius=distance)
+
+
+def _pixel(cameras: Sequence[RenderCamera]) -> float:
+    """Width of a pixel at distance 1, in the median."""
+    return float(np.median([1.0 / camera.fx_px for camera in cameras]))
+
+
+def _seen_box(
+    maps: DepthMaps, low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]
+) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+    """The box of the depths within a cube, but for stray ones, and a margin."""
+    found = []
+    for camera, distances in zip(maps.cameras, maps.distances, strict=True):
+        step = max(1, max(distances.shape) // SAMPLES_PER_SIDE)
+        origin, directions = camera.rays()
+        some = np.asarray(distances[::step, ::step])
+        known = (some > 0) & np.isfinite(some)
+        points = origin + some[known][:, None] * directions[::step, ::step][known]
+        found.append(points[((points > low) & (points < high)).all(axis=1)])
+    points = np.concatenate(found)
+    if len(points) == 0:
+        raise ConfigError(NOTHING_SEEN)
+    least, most = np.quantile(points, [STRAY_SHARE, 1 - STRAY_SHARE], axis=0).astype(np.float64)
+    margin = MARGIN_SHARE * float((most - least).max())
+    return np.maximum(low, least - margin), np.minimum(high, most + margin)
+
+
+def focus(cameras: Sequence[RenderCamera]) -> tuple[Float64[np.ndarray, "3"], float]:
+    """The point that the cameras look at, and their median distance to it.
+
+    Raises:
+        ConfigError: there is no such point.
+    """
+    centres = np.stack([camera.centre_world for camera in cameras])
+    rotations = np.stack([camera.rotation_cam_from_world for camera in cameras])
+    try:
+        # Any axis will do: only the centre is used, and cameras all around share no up direction.
+        point = fit_turntable(centres, rotations[:, 2], np.tile(_ANY_AXIS, (len(centres), 1))).centre_world
+    except ConfigError:
+        raise ConfigError(
+            "The cameras look at no common centre; name the region to mesh with --bounds x0,y0,z0,x1,y1,z1."
+        ) from None
+    return point, float(np.median(np.linalg.norm(centres - point, axis=1)))
+
+
+def _grid(
+    low: Float64[np.ndarray, "3"],
+    high: Float64[np.ndarray, "3"],
+    distance: float,
+    pixel: float,
+    options: SurfaceOptions,
+) -> Region:
+    """The grid over a box that is seen from a distance, where a pixel is ``pixel`` wide."""
+    side = float((high - low).max())
+    voxel = options.voxel or max(side / (options.resolution or RESOLUTION), PIXELS_PER_VOXEL * pixel)
+    blocks = np.maximum(1, np.ceil((high - low) / (voxel * BLOCK) - 1e-6)).astype(int)
+    if blocks.max() > MAX_BLOCKS_PER_SIDE:
+        raise ConfigError(
+            f"The region has {int(blocks.max()) * BLOCK:,} voxels along a side, but at most "
+            f"{MAX_BLOCKS_PER_SIDE * BLOCK:,} are possible; choose larger voxels or a smaller region."
+        )
+    size = (int(blocks[0]), int(blocks[1]), int(blocks[2]))
+    truncation = options.truncation or max(MIN_TRUNCATION_VOXELS, TRUNCATION_SHARE * distance / voxel)
+    return Region(low.astype(np.float64), float(voxel), size, False, np.zeros(3), 1.0, truncation)

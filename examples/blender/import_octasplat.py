@@ -1,0 +1,265 @@
+"""Opens an octagon mesh of octasplat in Blender, looking as octasplat renders it.
+
+From a shell, with Blender 4.2 or later, to make a .blend that opens with a click::
+
+    blender -b --python import_octasplat.py -- scene.mesh.ply scene.blend
+    blender -b --python import_octasplat.py -- scene.mesh.ply scene.blend --cameras path.json --render out.png
+
+In Blender: Scripting > Open > this file, write the path of a mesh behind ``MESH =`` below, Run Script.
+
+What it sets, and why:
+
+* Colours are composited as display values, so the mesh emits the raw numbers of the file and the view
+  transform is Raw. Any other view transform blends linear light, which is another picture.
+* The fall-off of a Gaussian comes from the texture coordinates: opacity * exp(-Q/2 |2 uv - 1|^2).
+* Each ray may pass 256 transparent octagons, and is not ended early by chance (Cycles does so by default).
+* The object is turned upright: the scene's y points down, Blender's z points up. Export with
+  "Forward: Z" and "Up: -Y" to get the file's own axes back; ``octasplat edit`` finds out by itself.
+"""
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+
+import bpy
+from mathutils import Matrix, Vector
+
+MESH = ""
+DEFAULT_Q = 9.210340371976184
+TRANSPARENT_BOUNCES = 256
+SENSOR_MM = 36.0
+BLENDER_FROM_WORLD = Matrix(((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1)))
+"""COLMAP's x right, y down, z forward to Blender's x right, y forward, z up."""
+BLENDER_CAM_FROM_CAM = Matrix.Diagonal((1, -1, -1, 1))
+"""A camera of Blender looks along its -z axis with y up."""
+
+
+def read_header(path):
+    """Names of a PLY's vertex properties, its comments, and whether it has faces."""
+    names, comments, faces, element = [], [], 0, ""
+    with path.open("rb") as handle:
+        if handle.readline().strip() != b"ply":
+            raise SystemExit(f"{path}: is not a PLY file; name the mesh.ply of a run.")
+        for line in handle:
+            words = line.decode("utf-8", "replace").split()
+            if not words:
+                continue
+            if words[0] == "end_header":
+                return names, comments, faces
+            if words[0] == "element":
+                element = words[1]
+                faces = int(words[2]) if element == "face" else faces
+            elif words[0] == "property" and element == "vertex":
+                names.append(words[-1])
+            elif words[0] == "comment":
+                comments.append(words[1:])
+    raise SystemExit(f"{path}: the PLY header never ends; the file is damaged.")
+
+
+def check(path):
+    """The quantile Q of an octagon mesh; ends with a sentence if the file is something else."""
+    if not path.is_file():
+        raise SystemExit(f"{path}: there is no such file.")
+    names, comments, faces = read_header(path)
+    if "f_dc_0" in names or not faces:
+        mesh = path.with_suffix(".mesh.ply")
+        raise SystemExit(f"{path}: holds points, not a mesh; first run: octasplat export {path} {mesh}")
+    if not {"s", "t", "red", "alpha"} <= set(names):
+        raise SystemExit(f"{path}: has no texture coordinates or colours; export it with octasplat.")
+    stated = [words[1] for words in comments if len(words) == 2 and words[0] == "octasplat_q"]
+    return float(stated[0]) if stated else DEFAULT_Q
+
+
+def clear_scene():
+    """An empty file without the cube."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def import_octagons(path):
+    """Import the mesh with its material, upright; returns the object."""
+    q = check(path)
+    before = set(bpy.data.objects)
+    bpy.ops.wm.ply_import(
+        filepath=str(path), import_colors="LINEAR", import_attributes=True, forward_axis="Y", up_axis="Z"
+    )
+    (octagons,) = set(bpy.data.objects) - before
+    octagons.data.materials.clear()
+    octagons.data.materials.append(octagon_material(q, octagons.data.color_attributes[0].name))
+    octagons["octasplat_q"] = q
+    upright = bpy.data.objects.new("octasplat_upright", None)
+    bpy.context.scene.collection.objects.link(upright)
+    octagons.parent = upright
+    octagons.matrix_parent_inverse = BLENDER_FROM_WORLD  # a matrix, not angles: exact, and undone exactly
+    return octagons
+
+
+def octagon_material(q, colours):
+    """Emission of the raw colours, mixed with transparency by the Gaussian's alpha."""
+    material = bpy.data.materials.new("octagons")
+    if not material.node_tree:
+        material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+
+    def node(kind, inputs=(), **settings):
+        made = tree.nodes.new(kind)
+        for name, value in settings.items():
+            setattr(made, name, value)
+        for place, source in inputs:
+            if hasattr(source, "is_output"):
+                tree.links.new(source, made.inputs[place])
+            else:
+                made.inputs[place].default_value = source
+        return made
+
+    def maths(operation, *inputs):
+        return node("ShaderNodeMath", tuple(enumerate(inputs)), operation=operation).outputs[0]
+
+    def vectors(operation, *inputs):
+        return node("ShaderNodeVectorMath", tuple(enumerate(inputs)), operation=operation)
+
+    uv = node("ShaderNodeUVMap", uv_map="UVMap").outputs["UV"]
+    offset = vectors("SUBTRACT", uv, (0.5, 0.5, 0.0)).outputs["Vector"]
+    square = vectors("DOT_PRODUCT", offset, offset).outputs["Value"]
+    fall_off = maths("EXPONENT", maths("MULTIPLY", square, -2.0 * q))
+    colour = node("ShaderNodeAttribute", attribute_type="GEOMETRY", attribute_name=colours)
+    alpha = maths("MULTIPLY", fall_off, colour.outputs["Alpha"])
+    glow = node("ShaderNodeEmission", [("Color", colour.outputs["Color"]), ("Strength", 1.0)])
+    clear = node("ShaderNodeBsdfTransparent")
+    mix = node(
+        "ShaderNodeMixShader",
+        [(0, alpha), (1, clear.outputs["BSDF"]), (2, glow.outputs["Emission"])],
+    )
+    node("ShaderNodeOutputMaterial", [("Surface", mix.outputs["Shader"])])
+    material.use_backface_culling = False
+    return material
+
+
+def set_up_scene(samples):
+    """Cycles for transparency, raw colours, black behind the scene."""
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.samples = samples
+    cycles.use_denoising = False
+    cycles.use_adaptive_sampling = False
+    cycles.max_bounces = 0
+    cycles.transparent_max_bounces = TRANSPARENT_BOUNCES
+    cycles.min_transparent_bounces = TRANSPARENT_BOUNCES
+    cycles.pixel_filter_type = "BOX"
+    cycles.filter_width = 1.0
+    scene.render.resolution_percentage = 100
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.image_settings.color_mode = "RGB"
+    scene.display_settings.display_device = "sRGB"
+    scene.view_settings.view_transform = "Raw"
+    scene.view_settings.look = "None"
+    world = bpy.data.worlds.new("black")
+    if not world.node_tree:
+        world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0
+    scene.world = world
+    for screen in bpy.data.screens:
+        for area in screen.areas:
+            if area.type == "VIEW_3D":
+                area.spaces[0].shading.type = "MATERIAL"
+
+
+def add_cameras(path):
+    """One camera that takes the poses of a camera path (as ``octasplat render --path``) frame by frame."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    width, height = content["width"], content["height"]
+    scene, camera = bpy.context.scene, new_camera()
+    scene.render.resolution_x, scene.render.resolution_y = width, height
+    scene.render.fps = max(1, round(content.get("fps", 30)))
+    scene.frame_start, scene.frame_end = 1, len(content["frames"])
+    camera.rotation_mode = "QUATERNION"
+    last = None
+    for number, frame in enumerate(content["frames"], start=1):
+        if "fov_y_degrees" in frame:
+            fx = fy = height / 2 / math.tan(math.radians(frame["fov_y_degrees"]) / 2)
+        else:
+            fx, fy = frame["fx"], frame["fy"]
+        # Blender has one focal length; pixels that are not square make up for the other.
+        scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = 1.0, fx / fy
+        camera.data.lens = fx * SENSOR_MM / width
+        camera.data.shift_x = (width / 2 - frame.get("cx", width / 2)) / width
+        camera.data.shift_y = (frame.get("cy", height / 2) - height / 2) / width * fx / fy
+        pose = BLENDER_FROM_WORLD @ Matrix(frame["camera_to_world"]) @ BLENDER_CAM_FROM_CAM
+        camera.location = pose.to_translation()
+        turn = pose.to_quaternion()
+        if last is not None:
+            turn.make_compatible(last)
+        camera.rotation_quaternion = last = turn
+        for channel in ("location", "rotation_quaternion"):
+            camera.keyframe_insert(channel, frame=number)
+        for channel in ("lens", "shift_x", "shift_y"):
+            camera.data.keyframe_insert(channel, frame=number)
+    scene.frame_set(1)
+
+
+def add_default_camera(octagons):
+    """A camera in front of the middle half of the vertices, which distant background does not move."""
+    count = len(octagons.data.vertices)
+    flat = [0.0] * (3 * count)
+    octagons.data.vertices.foreach_get("co", flat)
+    ranges = []
+    for axis in range(3):
+        values = sorted(flat[axis::3])
+        ranges.append((values[count // 4], values[count // 2], values[(3 * count) // 4]))
+    bpy.context.view_layer.update()
+    centre = octagons.matrix_world @ Vector([middle for _, middle, _ in ranges])
+    size = max(max(high - low for low, _, high in ranges), 1e-6)
+    camera = new_camera()
+    camera.location = centre + Vector((0.0, -4.0, 1.0)) * size
+    camera.rotation_mode = "QUATERNION"
+    camera.rotation_quaternion = (centre - camera.location).to_track_quat("-Z", "Y")
+    camera.data.clip_end = 1000 * size
+
+
+def new_camera():
+    """An active camera with a horizontal sensor."""
+    data = bpy.data.cameras.new("camera")
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR_MM
+    data.clip_start, data.clip_end = 1e-3, 1e6
+    camera = bpy.data.objects.new("camera", data)
+    bpy.context.scene.collection.objects.link(camera)
+    bpy.context.scene.camera = camera
+    return camera
+
+
+def main(arguments):
+    """Make the .blend, and the images if asked for."""
+    parser = argparse.ArgumentParser(prog="import_octasplat.py", description="Octagon meshes into Blender.")
+    parser.add_argument("mesh", type=Path, help="the mesh.ply of a run, or an export named *.mesh.ply")
+    parser.add_argument("blend", type=Path, help="the .blend to write")
+    parser.add_argument(
+        "--cameras", type=Path, help="a camera path in JSON, as octasplat render --path takes"
+    )
+    parser.add_argument("--samples", type=int, default=16, help="Cycles samples per pixel (default: 16)")
+    parser.add_argument("--render", type=Path, help="also render the first frame to this PNG")
+    given = parser.parse_args(arguments)
+    check(given.mesh)
+    clear_scene()
+    octagons = import_octagons(given.mesh)
+    set_up_scene(given.samples)
+    if given.cameras:
+        add_cameras(given.cameras)
+    else:
+        add_default_camera(octagons)
+    bpy.ops.wm.save_as_mainfile(filepath=str(given.blend.resolve()), compress=True)
+    if given.render:
+        bpy.context.scene.render.filepath = str(given.render.resolve())
+        bpy.ops.render.render(write_still=True)
+
+
+if __name__ == "__main__":
+    if "--" in sys.argv:
+        main(sys.argv[sys.argv.index("--") + 1 :])
+    elif MESH:
+        set_up_scene(16)
+        import_octagons(Path(MESH))
+    else:
+        raise SystemExit("Name a mesh: write its path behind MESH = in this script, or see its first lines.")

@@ -1,0 +1,107 @@
+"""Let a copy of one thing of a reconstruction fall as a soft body, and film it.
+
+    python drop.py SCENE.ply THING.ply -o drop.mp4
+
+THING.ply is a closed mesh of the thing, as octasplat surface makes it; see the README beside this file.
+"""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from mujoco_drop import simulate
+from soft_body import Rider, belongs_to, lattice_around
+
+from engine.edit.mesh import read_mesh
+from engine.gaussians.model import FlatGaussians, concatenate
+from engine.importers import read_scene
+from engine.render.cameras import RenderCamera, focal_from_fov
+from engine.render.images import write_png
+from engine.render.paths import look_at
+from engine.render.renderer import render_rays
+from engine.render.video import VideoWriter
+from engine.surface.mesh import TriangleMesh
+from engine.trace.cpu import CpuTracer
+from engine.trace.protocol import Tracer
+
+
+def film(
+    still: FlatGaussians,
+    rider: Rider,
+    frames: np.ndarray,
+    camera: RenderCamera,
+    tracer: Tracer,
+) -> Iterator[np.ndarray]:
+    """Images of the scene with the moved thing in it, display values (h, w, 3)."""
+    origin, directions = camera.rays()
+    for nodes in frames:
+        tracer.build(concatenate([still, rider.at(nodes)]))
+        yield render_rays(tracer, origin, directions, np.zeros(3, np.float32)).rgb_srgb
+
+
+def main() -> None:
+    """Run the example."""
+    options = _options()
+    scene, _ = read_scene(options.scene)
+    read = read_mesh(options.thing)
+    mesh = TriangleMesh(read.vertices.astype(np.float32), read.triangles.astype(np.int32))
+    mine = belongs_to(scene, mesh, options.near)
+    lattice = lattice_around(mesh, options.cell)
+    print(
+        f"{mine.sum():,} Gaussians ride in {len(lattice.cells):,} cells, {len(lattice.nodes_world):,} nodes."
+    )
+    frames = simulate(
+        lattice,
+        options.world,
+        move=options.move,
+        seconds=options.seconds,
+        fps=options.fps,
+        young=options.young,
+    )
+    print(f"Simulated {len(frames)} frames.")
+    rider = Rider(scene.select(mine), lattice)
+    pose = look_at(np.array(options.eye), np.array(options.target), np.array([0.0, 0.0, 1.0]))
+    camera = RenderCamera.from_pose(
+        pose, options.width, options.height, fy_px=focal_from_fov(options.fov, options.height)
+    )
+    still = scene if options.keep else scene.select(~mine)
+    with VideoWriter(options.output, options.fps, options.width, options.height) as video:
+        for number, image in enumerate(film(still, rider, frames, camera, CpuTracer())):
+            video.write(image)
+            if options.frames:
+                write_png(options.frames / f"{number:04d}.png", image)
+    print(f"Wrote {options.output}.")
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path, help="a file of Gaussians, or the folder of a run")
+    parser.add_argument("thing", type=Path, help="a closed mesh of the thing")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the video, .mp4")
+    parser.add_argument("--frames", type=Path, help="also write the frames as PNG into this folder")
+    parser.add_argument("--world", type=Path, default=Path(__file__).with_name("still_life.xml"))
+    parser.add_argument("--move", type=_triple, default=(-0.38, -0.92, 0.75), help="shift before it falls")
+    parser.add_argument("--cell", type=float, default=0.04, help="side of the lattice's cells")
+    parser.add_argument(
+        "--near", type=float, default=0.012, help="Gaussians so near to the mesh belong to it"
+    )
+    parser.add_argument("--young", type=float, default=4e4, help="stiffness")
+    parser.add_argument("--seconds", type=float, default=2.5)
+    parser.add_argument("--fps", type=float, default=24)
+    parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--height", type=int, default=480)
+    parser.add_argument("--fov", type=float, default=34.0, help="from top to bottom, degrees")
+    parser.add_argument("--eye", type=_triple, default=(0.1, -2.25, 1.05))
+    parser.add_argument("--target", type=_triple, default=(0.05, -0.4, 0.28))
+    parser.add_argument("--take", dest="keep", action="store_false", help="the thing itself falls, no copy")
+    return parser.parse_args()
+
+
+def _triple(text: str) -> tuple[float, float, float]:
+    x, y, z = (float(part) for part in text.split(","))
+    return x, y, z
+
+
+if __name__ == "__main__":
+    main()

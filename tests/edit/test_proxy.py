@@ -1,0 +1,188 @@
+"""Proxies against exact maps, and no tearing."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from edit_scenes import (
+    assert_same,
+    bend,
+    covariance_errors,
+    covariances,
+    cube,
+    grid,
+    moved_covariances,
+    random_turn,
+    twist,
+)
+
+from engine.edit.deform import deform, deform_to, deformation_corners
+from engine.edit.proxy import MeanValueBinding, Proxy, bind
+from engine.errors import SceneFileError
+from engine.gaussians.model import FlatGaussians
+
+Make = Callable[..., FlatGaussians]
+SHEAR = np.array([[1.2, 0.3, 0.0], [0.0, 0.8, 0.1], [0.2, 0.0, 1.0]])
+
+
+def near_the_plane(make_scene: Make, thickness: float) -> FlatGaussians:
+    g = make_scene(500, size=0.004)  # so small that their own bending does not count
+    g.means_world[:, 2] *= thickness
+    return g
+
+
+def follow(
+    g: FlatGaussians, proxy: Proxy, move: Callable[[np.ndarray], np.ndarray], **options
+) -> FlatGaussians:
+    corners = deformation_corners(g)
+    moved = bind(proxy, corners, **options).deform(move(proxy.vertices_world))
+    return deform_to(g, corners, moved)[0]
+
+
+@pytest.mark.parametrize("method", ["nearest", "mvc"])
+def test_a_rigid_motion_with_scale_is_exact(make_scene: Make, method: str) -> None:
+    g = make_scene(300)
+    turn = random_turn(1)
+    proxy = Proxy(*(cube(3) if method == "mvc" else grid(8)))
+    result = follow(g, proxy, lambda p: 1.3 * p @ turn.T + [1, 2, 3], method=method, reach_world=np.inf)
+    np.testing.assert_allclose(result.means_world, 1.3 * g.means_world @ turn.T + [1, 2, 3], atol=1e-6)
+    assert covariance_errors(result, 1.69 * turn @ covariances(g) @ turn.T).max() < 1e-5
+
+
+def test_every_affine_map_is_exact_in_a_cage(make_scene: Make) -> None:
+    g = make_scene(300)
+    result = follow(g, Proxy(*cube(2)), lambda p: p @ SHEAR.T, method="mvc")
+    np.testing.assert_allclose(result.means_world, g.means_world @ SHEAR.T, atol=1e-6)
+    assert covariance_errors(result, SHEAR @ covariances(g) @ SHEAR.T).max() < 1e-5
+
+
+def test_every_affine_map_is_exact_on_a_surface(make_scene: Make) -> None:
+    g = near_the_plane(make_scene, 0.0)
+    g.quats_wxyz[:] = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]  # the normal along z
+    result = follow(g, Proxy(*grid(8)), lambda p: p @ SHEAR.T)
+    np.testing.assert_allclose(result.means_world, g.means_world @ SHEAR.T, atol=1e-6)
+    assert covariance_errors(result, SHEAR @ covariances(g) @ SHEAR.T).max() < 1e-5
+
+
+def test_a_bent_sheet_is_followed_to_second_order_in_its_cells(make_scene: Make) -> None:
+    g = near_the_plane(make_scene, 0.05)
+    move, derivative = bend(1.0)
+    worst, shapes = [], []
+    for cells in (12, 24, 48):
+        result = follow(g, Proxy(*grid(cells)), move)
+        worst.append(float(np.linalg.norm(result.means_world - move(g.means_world), axis=1).max()))
+        shapes.append(float(np.median(covariance_errors(result, moved_covariances(g, derivative)))))
+    # Cells of 0.2, 0.1 and 0.05 at a radius of 1.
+    assert worst[0] < 1.5e-2 and worst[1] < 0.5 * worst[0] and worst[2] < 0.6 * worst[1]
+    assert shapes[2] < 0.02
+
+
+def test_a_twisted_sheet(make_scene: Make) -> None:
+    g = near_the_plane(make_scene, 0.0)
+    g.quats_wxyz[:] = [np.sqrt(0.5), 0, np.sqrt(0.5), 0]
+    move, derivative = twist(1.0, axis=0)
+    result = follow(g, Proxy(*grid(48)), move)
+    assert np.linalg.norm(result.means_world - move(g.means_world), axis=1).max() < 2e-3
+    assert np.median(covariance_errors(result, moved_covariances(g, derivative))) < 0.01
+
+
+def test_twist_and_bend_of_a_cage_stay_near_the_exact_maps(make_scene: Make) -> None:
+    g = make_scene(300, spread=0.8)
+    proxy = Proxy(*cube(6))
+    for move, bound in ((twist(0.5)[0], 0.05), (bend(0.3)[0], 0.12)):
+        result = follow(g, proxy, move, method="mvc")
+        assert np.linalg.norm(result.means_world - move(g.means_world), axis=1).max() < bound
+
+
+@pytest.mark.parametrize("method", ["nearest", "mvc"])
+def test_nothing_tears(method: str) -> None:
+    random = np.random.default_rng(0)
+    vertices, triangles = cube(4, 1.0) if method == "mvc" else grid(10)
+    crumpled = vertices + 0.15 * random.standard_normal(vertices.shape)
+    start = random.uniform(-0.9, 0.9, (4000, 3)) * [1, 1, 0.9 if method == "mvc" else 0.15]
+    step = 1e-5 * random.standard_normal((4000, 3))
+    pairs = np.stack([start, start + step], axis=1).repeat(4, axis=1)
+    moved = bind(Proxy(vertices, triangles), pairs, method, None).deform(crumpled)
+    apart = np.linalg.norm(moved[:, 0] - moved[:, 4], axis=1) / np.linalg.norm(step, axis=1)
+    assert apart.max() < 15.0  # a tear of one thousandth of a cell would give 20
+
+
+@pytest.mark.parametrize("method", ["nearest", "mvc"])
+def test_a_proxy_at_rest_leaves_the_scene_as_it_is(make_scene: Make, method: str) -> None:
+    g = make_scene(100)
+    result = follow(g, Proxy(*cube(3)), lambda p: p, method=method)
+    np.testing.assert_allclose(result.means_world, g.means_world, atol=1e-6)
+    assert covariance_errors(result, covariances(g)).max() < 1e-5
+
+
+def test_what_is_out_of_reach_keeps_every_bit(make_scene: Make) -> None:
+    g = make_scene(400, spread=3.0)
+    far = np.abs(g.means_world).max(axis=1) > 2.2
+    near = np.abs(g.means_world).max(axis=1) < 1.0
+    assert far.sum() > 50 and near.sum() > 5
+    for method, reach in (("mvc", None), ("mvc", 0.2), ("nearest", 0.2)):
+        corners = deformation_corners(g)
+        binding = bind(Proxy(*cube(4)), corners, method, reach)
+        assert not binding.moving[far].any()
+        result, report = deform_to(g, corners, binding.deform(cube(4)[0] + np.array([0, 0, 1.0])))
+        assert_same(result.select(far), g.select(far))
+        assert report.unmoved >= far.sum()
+        if method == "mvc":
+            np.testing.assert_allclose(
+                result.means_world[near], g.means_world[near] + np.float32([0, 0, 1]), atol=1e-6
+            )
+
+
+def test_coordinates_at_corners_on_faces_and_when_not_kept(monkeypatch) -> None:
+    vertices, triangles = cube(2)
+    centre = vertices[triangles[0]].mean(axis=0)
+    points = np.stack([vertices[3], centre, vertices[triangles[0][:2]].mean(axis=0), np.full(3, 0.1)])
+    corners = points[:, None].repeat(8, axis=1)
+    shifted = vertices + np.random.default_rng(0).standard_normal(vertices.shape)
+    kept = MeanValueBinding(Proxy(vertices, triangles), corners, 0.5).deform(shifted)
+    np.testing.assert_allclose(kept[0, 0], shifted[3], atol=1e-9)
+    np.testing.assert_allclose(kept[1, 0], shifted[triangles[0]].mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(kept[2, 0], shifted[triangles[0][:2]].mean(axis=0), atol=1e-6)
+    monkeypatch.setattr("engine.edit.proxy.STORED_BYTES", 0)
+    np.testing.assert_allclose(
+        MeanValueBinding(Proxy(vertices, triangles), corners, 0.5).deform(shifted), kept, atol=1e-12
+    )
+
+
+def test_open_cages_and_other_meshes_are_refused(make_scene: Make) -> None:
+    vertices, triangles = cube(2)
+    corners = deformation_corners(make_scene(5))
+    with pytest.raises(SceneFileError, match="not closed"):
+        bind(Proxy(vertices, triangles[1:]), corners, "mvc")
+    with pytest.raises(SceneFileError, match="the same mesh"):
+        bind(Proxy(vertices, triangles), corners, "mvc").deform(vertices[1:])
+    with pytest.raises(SceneFileError, match="no triangle"):
+        Proxy(vertices, triangles[:0])
+
+
+def test_any_function_of_points_drives_a_scene(make_scene: Make) -> None:
+    g = make_scene(200, size=0.02)
+    move, derivative = twist(0.8)
+    seen = []
+
+    def engine(corners: np.ndarray) -> np.ndarray:
+        seen.append(corners.shape)
+        return move(corners)
+
+    result, report = deform(g, engine)
+    assert seen == [(200, 8, 3)] and report.moved == 200
+    np.testing.assert_allclose(result.means_world, move(g.means_world), atol=3e-3)
+    assert np.median(covariance_errors(result, moved_covariances(g, derivative))) < 2e-3
+    assert report.residual_max < 0.2
+    same, report = deform(g, lambda corners: corners.copy())
+    assert_same(same, g)
+    assert report.unmoved == 200
+
+
+def test_points_that_fall_together_keep_their_gaussians_finite(make_scene: Make) -> None:
+    g = make_scene(20)
+    result, report = deform(g, lambda corners: np.zeros_like(corners) + 3.0)
+    assert report.collapsed == 20 and result.is_finite()
+    np.testing.assert_array_equal(result.means_world, np.full((20, 3), 3, np.float32))
+    with pytest.raises(ValueError, match="not finite"):
+        deform(g, lambda corners: corners * np.nan)

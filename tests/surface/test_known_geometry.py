@@ -1,0 +1,112 @@
+"""The generated scene, whose geometry is known: from its true depth, and from a reconstruction of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engine.config import resolve_config
+from engine.gaussians.ply import read_gaussian_ply
+from engine.pipeline import SCENE, reconstruct
+from engine.render.cameras import RenderCamera
+from engine.render.images import read_channels
+from engine.scene import SceneModel, load_scene
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.scene.generated.arrangement import TABLE_RADIUS, still_life
+from engine.surface.cameras import photograph_cameras
+from engine.surface.compare import SurfaceScore, distances_to_surface, sample_surface, score
+from engine.surface.depth import DepthMaps
+from engine.surface.extract import extract_surface
+from engine.surface.marching import surface_of
+from engine.surface.mesh import TriangleMesh, edge_report
+from engine.surface.occlusion import Occluder
+from engine.surface.options import SurfaceOptions
+from engine.surface.region import choose_region
+from engine.surface.volume import fuse
+from engine.trace.cpu import CpuTracer
+
+MIN_VIEWS = 3
+"""Only what so many cameras see can be asked for."""
+
+
+def on_the_table(mesh: TriangleMesh) -> TriangleMesh:
+    """The triangles of the table's top and of what stands on it."""
+    corners = mesh.face_corners_world
+    near = np.linalg.norm(corners[..., :2], axis=-1).max(axis=1) < TABLE_RADIUS + 0.05
+    return mesh.select_faces(near & (corners[..., 2].min(axis=1) > -0.07))
+
+
+def scored(mesh: TriangleMesh, cameras: tuple[RenderCamera, ...], threshold: float) -> SurfaceScore:
+    """How near the things on the table come to the truth."""
+    rng = np.random.default_rng(0)
+    life = still_life()
+    truth = TriangleMesh(life.vertices, life.faces)
+    wanted, _ = sample_surface(on_the_table(truth), 20_000, rng)
+    occluder = Occluder(truth)
+    views = np.zeros(len(wanted), int)
+    for camera in cameras:
+        views += occluder.sees(wanted, np.broadcast_to(camera.centre_world, wanted.shape))
+    found = on_the_table(mesh)
+    there, _ = sample_surface(found, 20_000, rng)
+    return score(
+        distances_to_surface(there, truth, rng, 500_000),
+        distances_to_surface(wanted[views >= MIN_VIEWS], found, rng, 300_000),
+        threshold,
+    )
+
+
+def scene_and_cameras(root: Path, **size: int) -> tuple[SceneModel, tuple[RenderCamera, ...]]:
+    write_generated_scene(root, GeneratedSceneConfig(**size))
+    scene = load_scene(root)
+    return scene, photograph_cameras(scene, np.arange(len(scene.views)), 800)
+
+
+def test_true_depth_gives_the_true_surface(tmp_path):
+    scene, cameras = scene_and_cameras(
+        tmp_path / "scene", views=30, width_px=240, height_px=180, samples_per_side=1, points=100
+    )
+    distances, cosines = [], []
+    for view, camera in zip(scene.views, cameras, strict=True):
+        truth = tmp_path / "scene" / "ground_truth"
+        name = Path(view.name).with_suffix(".exr").name
+        depth_cam = read_channels(truth / "depth" / name)["Z"]
+        layers = read_channels(truth / "normals" / name)
+        normals = np.stack([layers[f"N.{axis}"] for axis in "xyz"], axis=-1)
+        _, directions = camera.rays()
+        along = directions @ camera.rotation_cam_from_world[2]
+        distances.append((depth_cam / along).astype(np.float32))
+        cosines.append(np.abs((normals * directions).sum(axis=-1)).astype(np.float32))
+    options = SurfaceOptions(resolution=320)
+    maps = DepthMaps(cameras, tuple(distances), tuple(cosines))
+    mesh = surface_of(fuse(maps, choose_region(maps, options), options), options.min_weight)
+    result = scored(mesh, cameras, 0.01)
+    assert result.chamfer < 0.004
+    assert result.f_score > 0.93
+    report = edge_report(mesh.faces)
+    assert report.crowded_edges == report.twisted_edges == 0
+
+
+@pytest.mark.heavy
+def test_reconstruction_comes_near_the_truth(tmp_path):
+    _, cameras = scene_and_cameras(
+        tmp_path / "scene", views=24, width_px=160, height_px=120, samples_per_side=2, points=4000
+    )
+    config = resolve_config(
+        "fast",
+        settings={"test_every": 0, "exports": ()},
+        assignments=["iterations=700", "rays=4096", "max_gaussians=12000", "initial_points=4000"],
+    )
+    run = reconstruct(tmp_path / "scene", tmp_path / "run", config)
+    gaussians, _ = read_gaussian_ply(run / SCENE)
+    tracer = CpuTracer()
+    tracer.build(gaussians)
+    options = SurfaceOptions(resolution=256)
+    median, expected = (
+        extract_surface(tracer, cameras, options.model_copy(update={"depth": depth}), scratch=tmp_path).mesh
+        for depth in ("median", "expected")
+    )
+    result = scored(median, cameras, 0.02)
+    assert result.f_score > 0.8
+    assert result.chamfer < 0.015
+    # The measurement behind the default.
+    assert result.f_score > scored(expected, cameras, 0.02).f_score

@@ -1,0 +1,120 @@
+"""Components, holes and decimation."""
+
+import numpy as np
+import pytest
+import trimesh
+from surface_shapes import sphere, volume_of
+
+from engine.surface.clean import decimate, face_components, keep_large_components
+from engine.surface.holes import fill_holes, rims
+from engine.surface.marching import surface_of
+from engine.surface.mesh import TriangleMesh, edge_report
+
+
+def joined(*meshes: TriangleMesh) -> TriangleMesh:
+    starts = np.cumsum([0, *(len(mesh.vertices_world) for mesh in meshes[:-1])]).astype(np.int32)
+    return TriangleMesh(
+        np.concatenate([mesh.vertices_world for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
+    )
+
+
+def ball(radius: float = 9.0) -> TriangleMesh:
+    return surface_of(volume_of(lambda points: sphere(points, radius), 4), 0.5)
+
+
+def test_small_parts_go():
+    large, middle, small = ball(12), ball(6), ball(2)
+    mesh = joined(small, large, middle)
+    assert len(np.unique(face_components(mesh))) == 3
+    assert len(keep_large_components(mesh, keep=1).faces) == len(large.faces)
+    assert len(keep_large_components(mesh, min_share=0.1).faces) == len(large.faces) + len(middle.faces)
+    kept = keep_large_components(mesh, min_share=0.0)
+    np.testing.assert_array_equal(kept.faces, mesh.faces)
+
+
+def without(mesh: TriangleMesh, *axes: tuple[float, float, float], reach: float = 0.9) -> TriangleMesh:
+    """The mesh of a ball with round holes cut around directions."""
+    middles = mesh.face_corners_world.mean(axis=1)
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    cut = np.any([middles @ np.array(axis) > reach for axis in axes], axis=0)
+    return mesh.select_faces(~cut)
+
+
+def test_rims_are_found():
+    mesh = without(ball(), (0, 0, 1), (1, 0, 0))
+    found = rims(mesh.faces)
+    assert len(found) == 2
+    assert sum(len(rim) for rim in found) == edge_report(mesh.faces).open_edges
+    assert rims(ball().faces) == []
+
+
+def test_all_holes_closed_make_it_watertight():
+    whole = ball()
+    mesh, closed = fill_holes(without(whole, (0, 0, 1), (1, 0, 0), (0, -1, 0)), None)
+    assert closed == 3
+    assert edge_report(mesh.faces).watertight
+    as_theirs = trimesh.Trimesh(mesh.vertices_world, mesh.faces, process=False)
+    assert as_theirs.is_watertight
+    assert as_theirs.is_winding_consistent
+    # Flat lids take little off the ball: caps of height 0.1 radii.
+    cap = np.pi * (0.9) ** 2 * (3 * 9 - 0.9) / 3
+    assert as_theirs.volume == pytest.approx(4 / 3 * np.pi * 9**3 - 3 * cap, rel=0.01)
+
+
+def test_only_small_holes_are_closed_if_so_asked():
+    mesh = without(ball(), (0, 0, 1), reach=0.6)
+    mesh = mesh.select_faces(np.arange(len(mesh.faces)) != 100)
+    before = edge_report(mesh.faces).open_edges
+    filled, closed = fill_holes(mesh, 6.0)
+    assert closed == 1
+    assert edge_report(filled.faces).open_edges == before - 3
+
+
+def test_a_sheet_gets_a_back_only_if_all_is_closed(sheet):
+    same, closed = fill_holes(sheet, 3.9)
+    assert closed == 0
+    assert same is sheet
+    both, closed = fill_holes(sheet, None)
+    assert closed == 1
+    assert edge_report(both.faces).watertight
+
+
+def test_holes_that_touch_in_a_vertex(sheet):
+    # Two missing squares that share one corner: their rim passes it twice.
+    corner = [5 * 20 + 5, 6 * 20 + 6]
+    gone = np.array(corner + [c + 400 for c in corner])
+    mesh = sheet.select_faces(np.setdiff1d(np.arange(len(sheet.faces)), gone))
+    filled, closed = fill_holes(mesh, 1.0)
+    assert closed == 2
+    assert edge_report(filled.faces).open_edges == edge_report(sheet.faces).open_edges
+    assert filled.face_areas.sum() == pytest.approx(1.0)
+
+
+def test_decimation_keeps_the_shape_and_stays_closed():
+    whole = ball(12)
+    small = decimate(whole, 1000)
+    assert 900 <= len(small.faces) <= 1000
+    assert edge_report(small.faces).watertight
+    radii = np.linalg.norm(small.vertices_world, axis=1)
+    assert np.abs(radii - 12).max() < 0.15
+    assert decimate(small, 5000) is small
+
+
+def test_thin_parts_do_not_come_out_tangled():
+    def frame(points):  # three thin bars that cross
+        near = [np.linalg.norm(np.delete(points, axis, axis=1), axis=1) for axis in range(3)]
+        return np.maximum(np.minimum.reduce(near) - 1.2, np.abs(points).max(axis=1) - 13)
+
+    whole = surface_of(volume_of(frame, 4), 0.5)
+    assert edge_report(whole.faces).watertight
+    for count in (400, 150, 60):
+        small = decimate(whole, count)
+        assert edge_report(small.faces).watertight, count
+        assert len(small.faces) <= count + 10
+
+
+def test_normals_point_outwards():
+    mesh = ball()
+    outwards = mesh.vertices_world / np.linalg.norm(mesh.vertices_world, axis=1, keepdims=True)
+    assert (np.sum(mesh.vertex_normals() * outwards, axis=1) > 0.97).all()
