@@ -12,11 +12,25 @@ import click
 
 import engine
 from engine.errors import OctasplatError
+from workers.commands.clean import clean
+from workers.commands.client import COMMANDS as CLIENT_COMMANDS
+from workers.commands.crop import crop
+from workers.commands.deform import deform
 from workers.commands.demo import demo
+from workers.commands.edit import edit
 from workers.commands.evaluate import evaluate
 from workers.commands.export import export
+from workers.commands.fsck import fsck
+from workers.commands.import_ import import_
+from workers.commands.merge import merge
+from workers.commands.quota import quota
 from workers.commands.reconstruct import reconstruct
 from workers.commands.render import render
+from workers.commands.serve import serve
+from workers.commands.surface import surface
+from workers.commands.token import token
+from workers.commands.transform import transform
+from workers.commands.worker import worker
 from workers.signals import Stopped
 
 # Threads that wait for each other sleep instead of spinning: no slower alone, several times faster on a
@@ -70,7 +84,11 @@ def cli() -> None:
     """
 
 
-for _command in (reconstruct, evaluate, export, render, demo):
+for _command in (
+    reconstruct, evaluate, export, import_, render, surface,
+    edit, deform, transform, crop, merge, clean, demo,
+    serve, worker, token, fsck, quota, *CLIENT_COMMANDS,
+):  # fmt: skip
     cli.add_command(_command)
 
 

@@ -32,6 +32,10 @@ _DOING = {
     "export": "Exporting",
     "generate": "Generating",
     "render": "Rendering",
+    "poses": "Finding poses",
+    "upload": "Uploading",
+    "download": "Downloading",
+    "read": "Reading",
 }
 _DONE = {
     "load": ("Loaded", "photograph"),
@@ -40,6 +44,10 @@ _DONE = {
     "export": ("Exported", "file"),
     "generate": ("Generated", "photograph"),
     "render": ("Rendered", "image"),
+    "poses": ("Found the poses", "photograph"),
+    "upload": ("Uploaded", "kB"),
+    "download": ("Downloaded", "kB"),
+    "read": ("Read", "file"),
 }
 
 
@@ -63,7 +71,7 @@ class _State:
 
     def finished(self, event: StageFinished) -> str:
         verb, what = _DONE.get(event.stage, (f"Finished {event.stage}", "step"))
-        count = f" {self.step:,} {what}{'' if self.step == 1 else 's'}" if self.step else ""
+        count = f" {self.step:,} {what}{'' if self.step == 1 or what == 'kB' else 's'}" if self.step else ""
         line = f"{verb}{count} in {duration(event.seconds)}"
         if event.stage == "train" and self.training is not None:
             line += f": {training_state(self.training, self.held_out)}"

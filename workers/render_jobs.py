@@ -10,6 +10,7 @@ from jaxtyping import Float64
 
 from engine.config import read_config
 from engine.errors import OutputError
+from engine.events import Listener
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply
 from engine.pipeline import CONFIG, SCENE, run_scene
@@ -29,10 +30,12 @@ from engine.render.jobs import (
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
 from engine.scene import SceneModel, load_scene, scene_extent, split_views
-from engine.trace.embree import EmbreeTracer
+from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings
 from engine.train.trainer import trace_settings
+from workers.options import is_run
 from workers.progress import show_progress, staged
+from workers.scene_files import open_scene
 
 DEFAULT_FPS = 30.0
 DEFAULT_FRAMES = 120
@@ -51,11 +54,23 @@ class _Source:
 
 
 def run_render(mode: str, options: dict[str, Any]) -> None:
+    """Render as the options of the command say, with the progress shown; see :func:`render_files`."""
+    with show_progress(quiet=options["quiet"]) as listener:
+        files = render_files(mode, options, listener)
+    if not options["quiet"]:
+        click.echo(f"Wrote {files[0]}" + (f" and {len(files) - 1} more." if len(files) > 1 else "."))
+
+
+def render_files(mode: str, options: dict[str, Any], listener: Listener) -> tuple[Path, ...]:
     """Render as the options of the command say.
 
     Args:
         mode: ``views``, ``turntable`` or ``camera_path``.
         options: the options of the command by parameter name.
+        listener: hears the progress.
+
+    Returns:
+        The files written.
 
     Raises:
         OctasplatError: the source cannot be read or the output not written.
@@ -65,22 +80,18 @@ def run_render(mode: str, options: dict[str, Any]) -> None:
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
         cameras, fps = path.cameras, options["fps"] or path.fps
-    source = _read_run(options) if options["source"].is_dir() else _read_ply(options["source"])
+    source = _read_run(options) if is_run(options["source"]) else _read_file(options)
     if mode == "turntable":
         cameras = _turntable(source, options, fps)
-    tracer = EmbreeTracer(source.settings, threads=options["threads"], build_quality=2)
+    tracer = CpuTracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
     background = background_colour(options["background"] or source.background)
-    with show_progress(quiet=options["quiet"]) as listener, staged("render", listener) as progress:
+    with staged("render", listener) as progress:
         if cameras is not None and output.suffix.lower() == ".mp4":
             render_video(tracer, cameras, output, fps, background, progress)
-            files: tuple[Path, ...] = (output,)
-        else:
-            shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
-            names = _FileNames(output, options["exr"])
-            files = render_images(tracer, shots, names, background, progress)
-    if not options["quiet"]:
-        click.echo(f"Wrote {files[0]}" + (f" and {len(files) - 1} more." if len(files) > 1 else "."))
+            return (output,)
+        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
+        return render_images(tracer, shots, _FileNames(output, options["exr"]), background, progress)
 
 
 @dataclass(frozen=True)
@@ -117,8 +128,8 @@ def _read_run(options: dict[str, Any]) -> _Source:
     )
 
 
-def _read_ply(path: Path) -> _Source:
-    return _Source(read_gaussian_ply(path)[0], TraceSettings())
+def _read_file(options: dict[str, Any]) -> _Source:
+    return _Source(open_scene(options["source"], quiet=options["quiet"]), TraceSettings())
 
 
 def _turntable(source: _Source, options: dict[str, Any], fps: float) -> tuple[RenderCamera, ...]:

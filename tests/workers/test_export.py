@@ -1,6 +1,7 @@
 """``octasplat export``."""
 
 import json
+import re
 import struct
 
 import numpy as np
@@ -19,6 +20,39 @@ def test_scene_to_glb(run, octasplat, tmp_path):
     length, kind = struct.unpack("<I4s", content[12:20])
     assert (content[:4], kind) == (b"glTF", b"JSON")
     assert json.loads(content[20 : 20 + length])["meshes"]
+
+
+def glb_json(path):
+    content = path.read_bytes()
+    (length,) = struct.unpack("<I", content[12:16])
+    return json.loads(content[20 : 20 + length])
+
+
+def test_options_reach_a_glb(run, octasplat, tmp_path):
+    target = tmp_path / "scene.glb"
+    options = ("--opaque", "--chunks", 1, "--texture", 16, "--no-ids")
+    result = octasplat("export", run.output / "scene.ply", target, *options)
+    assert result.exit_code == 0, result.output
+    document = glb_json(target)
+    assert document["materials"][0]["alphaMode"] == "MASK"
+    (mesh,) = document["meshes"]
+    assert "_GID" not in mesh["primitives"][0]["attributes"]
+    image = target.read_bytes()[28 + struct.unpack("<I", target.read_bytes()[12:16])[0] :]
+    assert struct.unpack(">II", image[16:24]) == (16, 16)  # the PNG's header
+
+
+def test_help_lists_every_format(octasplat):
+    from engine.export.registry import exporters
+
+    text = octasplat("export", "--help").stdout
+    for exporter in exporters():
+        assert re.search(rf"\n  {exporter.name} +{re.escape(exporter.patterns[0])}[,:]", text)
+
+
+def test_opaque_is_refused_where_it_means_nothing(run, octasplat, tmp_path):
+    result = octasplat("export", run.output / "scene.ply", tmp_path / "scene.obj", "--opaque")
+    assert result.exit_code == 2 and "--opaque is for GLB" in result.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_all_files_of_an_obj_are_named(run, octasplat, tmp_path):

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from workers.options import background_option, quiet_option, threads_option
+from workers.options import background_option, is_run, quiet_option, threads_option
 
 AXES = ("x", "-x", "y", "-y", "z", "-z")
 
@@ -35,7 +35,7 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
 @click.option("--height", type=click.IntRange(16, 16384), default=480, show_default=True, help="Turntable.")
 @click.option("--fov", type=click.FloatRange(1, 170), help="Turntable: angle from top to bottom, degrees.")
 @click.option(
-    "--up", type=click.Choice(AXES), help="Turntable of a .ply: the axis that points up.  [default: -y]"
+    "--up", type=click.Choice(AXES), help="Turntable of a file: the axis that points up.  [default: -y]"
 )
 @click.option("--exr", is_flag=True, help="Write EXR with linear RGB, A, Z and normals instead of PNG.")
 @background_option("Behind the scene.  [default: that of the run's evaluation, or black]")
@@ -46,19 +46,19 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
 @threads_option
 @quiet_option
 def render(**options: Any) -> None:
-    """Render new views of IN, the folder of a run or a .ply of Gaussians.
+    """Render new views of IN, the folder of a run or a file of Gaussians in any splat format.
 
-    Without --views, --turntable or --path: the held-out views of a run, a turntable of a .ply.
+    Without --views, --turntable or --path: the held-out views of a run, a turntable of a file.
     """
     modes = [name for name in ("views", "turntable", "camera_path") if options[name]]
     if len(modes) > 1:
         raise click.UsageError("Choose one of --views, --turntable and --path.")
     if options["frames"] and options["seconds"]:
         raise click.UsageError("Choose one of --frames and --seconds.")
-    is_run = options["source"].is_dir()
-    mode = modes[0] if modes else "views" if is_run else "turntable"
-    if mode == "views" and not is_run:
-        raise click.UsageError("--views needs the folder of a run; a .ply has --turntable and --path.")
+    of_run = is_run(options["source"])
+    mode = modes[0] if modes else "views" if of_run else "turntable"
+    if mode == "views" and not of_run:
+        raise click.UsageError("--views needs the folder of a run; a file has --turntable and --path.")
     if mode == "views" and options["output"].suffix.lower() == ".mp4":
         raise click.UsageError("--views gives images; name a folder.")
     _check_output(options["output"], options["exr"])

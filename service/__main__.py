@@ -1,0 +1,100 @@
+"""``python -m service``: the front end alone, configured by the environment.
+
+On SIGTERM requests under way are finished and streams end.
+"""
+
+import asyncio
+import contextlib
+import logging
+import socket
+import sys
+
+import uvicorn
+from fastapi import FastAPI
+
+from engine.errors import OctasplatError
+from service.app import create_app
+from service.settings import ServiceSettings
+from workers.logs import log_to_stderr
+from workers.parent import die_with_server
+from workers.settings import load_settings
+
+GRACE_SECONDS = 10
+KEEP_ALIVE_SECONDS = 75
+
+
+class _Server(uvicorn.Server):
+    """Ends streams first when asked to stop, as they would never end by themselves."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self.address = ""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and say where."""
+        await super().startup(sockets)
+        if self.started:
+            sys.stdout.write(f"{self.address}\n")
+            sys.stdout.flush()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop."""
+        state = getattr(self.config.loaded_app, "state", None)
+        service = getattr(state, "service", None)
+        if service is not None:
+            service.draining = True
+            service.hub.close()
+        await super().shutdown(sockets)
+
+
+def main() -> int:
+    """Serve until asked to stop; the address goes to stdout once requests are taken."""
+    log_to_stderr()
+    die_with_server()
+    try:
+        settings = load_settings(ServiceSettings)
+        app = create_app(settings)
+        family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+        # With the protocol named, asyncio turns Nagle's algorithm off; answers would take 40 ms more.
+        listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((settings.host, settings.port))
+        except OSError as error:
+            where = f"{settings.host}:{settings.port}"
+            sys.stderr.write(f"Error: {where} cannot be listened at ({error.strerror}).\n")
+            return 1
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            lifespan="on",
+            timeout_graceful_shutdown=GRACE_SECONDS,
+            timeout_keep_alive=KEEP_ALIVE_SECONDS,
+            server_header=False,
+            proxy_headers=False,
+        )
+        server = _Server(config)
+        name = f"[{settings.host}]" if family == socket.AF_INET6 else settings.host
+        server.address = f"http://{name}:{listener.getsockname()[1]}"
+        log = logging.getLogger("uvicorn.error")
+        log.setLevel(logging.WARNING)
+        log.addFilter(lambda _record: _failure(app) is None)
+        with contextlib.suppress(SystemExit):
+            asyncio.run(server.serve(sockets=[listener]))
+        if (failure := _failure(app)) is not None:
+            raise failure
+    except OctasplatError as error:
+        sys.stderr.write(f"Error: {error}\n")
+        return 1
+    return 0 if server.started else 1
+
+
+def _failure(app: FastAPI) -> OctasplatError | None:
+    """Why the application did not start, if it could say so; a traceback would add nothing."""
+    failure: OctasplatError | None = getattr(app.state, "failure", None)
+    return failure
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,131 @@
+"""The application: routes, guards, and what lives as long as it does."""
+
+import asyncio
+import importlib
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+
+import engine
+from engine.errors import OctasplatError
+from service.guards import BodyGuard, HostGuard, OriginGuard, SafeHeaders
+from service.hub import EventHub
+from service.problems import ProblemDocument, add_problem_handlers
+from service.routes import artifacts, datasets, jobs, journal, metrics, system, webhooks
+from service.settings import ServiceSettings
+from service.state import Service
+from service.web import mount_pages
+from workers.queue.database import open_pool
+from workers.queue.migrate import migrate
+from workers.queue.procrastinate_slips import ProcrastinateSlips
+from workers.queue.tokens import add_token, any_token
+from workers.storage.opening import open_storage
+
+DESCRIPTION = """Photographs in, scenes of flat Gaussians and their octagon meshes out.
+
+1. `POST /v1/datasets`, then `PUT` each file to `/v1/datasets/{id}/files/images/...` (and the COLMAP model to
+   `sparse/0/...`), or one ZIP file to `/archive`; `GET .../files` says what has arrived.
+2. `POST /v1/datasets/{id}/commit` checks it.
+3. `POST /v1/jobs`, then poll its `Location` or listen to `/events`.
+4. `GET /v1/jobs/{id}/artifacts`.
+
+Errors are problem documents (RFC 9457).
+"""
+
+
+def create_app(settings: ServiceSettings | None = None) -> FastAPI:
+    """The application.
+
+    Args:
+        settings: by default those of the environment.
+
+    Raises:
+        ConfigError: the settings do not fit together.
+    """
+    settings = settings or ServiceSettings()
+    settings.checked()
+    for module in settings.kind_modules:
+        importlib.import_module(module)
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        try:
+            async with _running(settings) as service:
+                app.state.service = service
+                yield
+                service.draining = True
+        except OctasplatError as error:
+            app.state.failure = error  # for whoever started it, as the server knows a traceback only
+            raise
+
+    app = FastAPI(
+        title="octasplat",
+        version=engine.__version__,
+        summary="A reconstruction service",
+        description=DESCRIPTION,
+        lifespan=lifespan,
+        docs_url=None,  # the pages have their own, which needs nothing from elsewhere
+        redoc_url=None,
+        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
+    )
+    for module_router in (
+        datasets.router, jobs.router, journal.router, artifacts.router, webhooks.router, system.router,
+        system.health_router, metrics.router,
+    ):  # fmt: skip
+        app.include_router(module_router)
+    mount_pages(app)
+    add_problem_handlers(app)
+    _describe_problems(app)
+    app.add_middleware(BodyGuard, max_body_bytes=settings.max_body_bytes)
+    app.add_middleware(OriginGuard)
+    if settings.is_private:
+        app.add_middleware(HostGuard, names=settings.allowed_hosts)
+    app.add_middleware(SafeHeaders)
+    return app
+
+
+@asynccontextmanager
+async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
+    """Database, store and listener for as long as the application lives."""
+    conninfo = settings.conninfo()
+    await asyncio.to_thread(migrate, conninfo)
+    storage = await asyncio.to_thread(
+        lambda: open_storage(settings.storage_address, floor_bytes=settings.floor_bytes)
+    )
+    async with open_pool(conninfo, max_size=settings.pool_size, wait_seconds=10) as pool:
+        async with pool.connection() as connection:
+            if settings.token is not None:
+                await add_token(
+                    connection,
+                    settings.token.get_secret_value(),
+                    owner="admin",
+                    name="OCTASPLAT_TOKEN",
+                    scopes=["admin"],
+                )
+            settings.check_public(await any_token(connection))
+        hub = EventHub(conninfo, listen=settings.listen)
+        listening = asyncio.create_task(hub.run())
+        try:
+            yield Service(settings, pool, ProcrastinateSlips(), storage, hub)
+        finally:
+            hub.close()
+            listening.cancel()
+            await asyncio.gather(listening, return_exceptions=True)
+
+
+def _describe_problems(app: FastAPI) -> None:
+    """Put the problem document into the schemas, in the place of FastAPI's own errors."""
+    original = app.openapi
+
+    def openapi() -> dict[str, object]:
+        if app.openapi_schema is None:
+            schema = original()
+            schemas = schema["components"]["schemas"]
+            schemas["ProblemDocument"] = ProblemDocument.model_json_schema()
+            for name in ("HTTPValidationError", "ValidationError"):
+                schemas.pop(name, None)
+            app.openapi_schema = schema
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]

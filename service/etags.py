@@ -1,0 +1,24 @@
+"""ETags: cheap polling and no lost updates."""
+
+from fastapi import Request
+
+from service.problems import Problem
+
+
+def matches(header: str | None, etag: str) -> bool:
+    """Whether a header ``If-Match`` or ``If-None-Match`` names ``etag``; weak marks do not matter here."""
+    if header is None:
+        return False
+    named = [part.strip().removeprefix("W/") for part in header.split(",")]
+    return "*" in named or etag in named
+
+
+def check_precondition(request: Request, etag: str) -> None:
+    """Refuse a change of something that has changed since it was seen.
+
+    Raises:
+        Problem: 412.
+    """
+    header = request.headers.get("if-match")
+    if header is not None and not matches(header, etag):
+        raise Problem(412, "precondition", "It has changed since; look at it again.")

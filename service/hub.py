@@ -1,0 +1,84 @@
+"""Tells streams when a job has new events: one listening connection for all of them."""
+
+import asyncio
+import contextlib
+import logging
+import uuid
+from collections.abc import Iterator
+
+import psycopg
+
+from workers.queue.journal import CHANNEL
+
+logger = logging.getLogger(__name__)
+_RECONNECT_SECONDS = 1.0
+
+
+class EventHub:
+    """Wakes who waits for a job's events.
+
+    Args:
+        conninfo: how to connect.
+        listen: False where notifications do not arrive; streams then look by themselves.
+    """
+
+    def __init__(self, conninfo: str, *, listen: bool = True) -> None:
+        self._conninfo = conninfo
+        self._listen = listen
+        self._waiting: dict[uuid.UUID, set[asyncio.Event]] = {}
+        self._closing = asyncio.Event()
+
+    @property
+    def streams(self) -> int:
+        """Number of streams that wait."""
+        return sum(len(events) for events in self._waiting.values())
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether streams should end."""
+        return self._closing.is_set()
+
+    def close(self) -> None:
+        """Wake everybody for the last time."""
+        self._closing.set()
+        self._wake_all()
+
+    @contextlib.contextmanager
+    def waiting(self, job_id: uuid.UUID) -> Iterator[asyncio.Event]:
+        """An event that is set whenever the job has something new, until the block ends."""
+        event = asyncio.Event()
+        self._waiting.setdefault(job_id, set()).add(event)
+        try:
+            yield event
+        finally:
+            events = self._waiting[job_id]
+            events.discard(event)
+            if not events:
+                del self._waiting[job_id]
+
+    async def run(self) -> None:
+        """Listen until cancelled, again after every loss of the connection."""
+        while self._listen:
+            try:
+                await self._listen_once()
+            except (psycopg.Error, OSError) as error:
+                logger.info("not hearing of events for a moment: %s", error)
+            self._wake_all()
+            await asyncio.sleep(_RECONNECT_SECONDS)
+
+    async def _listen_once(self) -> None:
+        connection = await psycopg.AsyncConnection.connect(
+            self._conninfo, autocommit=True, connect_timeout=10
+        )
+        async with connection:
+            await connection.execute(f"LISTEN {CHANNEL}")
+            self._wake_all()  # something may have happened while nobody listened
+            async for notification in connection.notifies():
+                with contextlib.suppress(ValueError):
+                    for event in self._waiting.get(uuid.UUID(notification.payload), ()):
+                        event.set()
+
+    def _wake_all(self) -> None:
+        for events in self._waiting.values():
+            for event in events:
+                event.set()

@@ -1,0 +1,81 @@
+"""``Idempotency-Key``: the same request twice makes one thing."""
+
+import hashlib
+import json
+import uuid
+from collections.abc import Awaitable, Callable
+from typing import Annotated, Any
+
+from fastapi import Header
+
+from service.auth import Principal
+from service.problems import Problem
+from workers.queue.database import Connection
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=255,
+        pattern=r"^[\x21-\x7e]+$",
+        description="A text of your choice; the same request sent again with it makes nothing new.",
+    ),
+]
+
+
+def fingerprint(*parts: Any) -> str:
+    """Names the content of a request."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+
+
+async def once(
+    connection: Connection,
+    who: Principal,
+    key: str | None,
+    request: str,
+    make: Callable[[], Awaitable[uuid.UUID]],
+) -> tuple[uuid.UUID, bool]:
+    """Make something, or find what the same request has made before, in one transaction.
+
+    A twin that comes while the first is under way waits for it.
+
+    Args:
+        connection: of the caller's transaction.
+        who: asks.
+        key: the header; without one it is always made.
+        request: fingerprint of the request.
+        make: makes it and returns its id.
+
+    Returns:
+        The id, and whether it was made now.
+
+    Raises:
+        Problem: 422 if the key was used for another request.
+    """
+    if key is None:
+        return await make(), True
+    placeholder = uuid.UUID(int=0)
+    cursor = await connection.execute(
+        """
+        INSERT INTO idempotency_keys (owner, key, fingerprint, resource_id) VALUES (%s, %s, %s, %s)
+        ON CONFLICT DO NOTHING
+        """,
+        [who.owner, key, request, placeholder],
+    )
+    if cursor.rowcount:
+        made = await make()
+        await connection.execute(
+            "UPDATE idempotency_keys SET resource_id = %s WHERE owner = %s AND key = %s",
+            [made, who.owner, key],
+        )
+        return made, True
+    cursor = await connection.execute(
+        "SELECT fingerprint, resource_id FROM idempotency_keys WHERE owner = %s AND key = %s",
+        [who.owner, key],
+    )
+    row = await cursor.fetchone()
+    if row is None or row["fingerprint"] != request:
+        detail = "This Idempotency-Key was used for another request; choose a new one."
+        raise Problem(422, "idempotency-key", detail)
+    return row["resource_id"], False

@@ -1,0 +1,246 @@
+"""Is this a scene? Checks of single files as they arrive, and of the whole when it is committed."""
+
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from service.intake.faults import Fault, IntakeRefused
+from service.intake.images import ImageHeader, ImageLimits, read_image_header
+from service.intake.layout import Part, model_files, part_of
+from service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
+from service.intake.model_child import ModelAnswer
+from workers.storage.names import NameRefused, NameSet, check_name, shown_name
+from workers.storage.protocol import Storage
+from workers.storage.trees import TreeFile
+
+_MAX_FAULTS = 100
+DEFAULT_IMAGE_LIMITS = ImageLimits()
+
+
+@dataclass(frozen=True)
+class DatasetFile:
+    """A file of a dataset, as the table knows it.
+
+    Attributes:
+        path: name in the dataset, e.g. ``images/a.jpg``.
+        sha256: digest of its content.
+        size_bytes: length of its content.
+        width_px: width of an image, None where it is not known yet.
+        height_px: height of an image.
+        warning: what was odd about it when it came.
+    """
+
+    path: str
+    sha256: str
+    size_bytes: int
+    width_px: int | None = None
+    height_px: int | None = None
+    warning: str | None = None
+
+
+@dataclass(frozen=True)
+class DatasetLimits:
+    """What a dataset may ask for, part by part."""
+
+    image: ImageLimits = field(default_factory=ImageLimits)
+    model: ModelLimits = field(default_factory=ModelLimits)
+    max_photographs: int = 20_000
+
+
+DEFAULT_LIMITS = DatasetLimits()
+
+
+@dataclass(frozen=True)
+class DatasetSummary:
+    """What a dataset without faults holds.
+
+    Attributes:
+        photographs: files in ``images/``.
+        pixels: pixels of all of them.
+        size_bytes: length of all files.
+        masks: files in ``masks/``.
+        has_model: whether there is a COLMAP model; without one, poses are yet to be found.
+        views: posed photographs.
+        cameras: cameras in use.
+        camera_models: their models, by COLMAP's names.
+        points: sparse points.
+        warnings: one sentence each on what is odd but usable.
+    """
+
+    photographs: int
+    pixels: int
+    size_bytes: int
+    masks: int
+    has_model: bool
+    views: int = 0
+    cameras: int = 0
+    camera_models: tuple[str, ...] = ()
+    points: int = 0
+    warnings: tuple[str, ...] = ()
+
+
+def check_file_name(name: str) -> Part:
+    """What a file of that name is in a dataset.
+
+    Raises:
+        IntakeRefused: the name is refused (``name-...``), or is that of no part of a scene
+            (``name-unexpected``).
+    """
+    try:
+        check_name(name)
+    except NameRefused as error:
+        raise IntakeRefused(Fault(error.code, str(error), name)) from None
+    part = part_of(name)
+    if part is Part.OTHER:
+        raise IntakeRefused(
+            Fault(
+                "name-unexpected",
+                f"{shown_name(name)} is no part of a scene; these are images/, masks/ and the COLMAP model "
+                "in sparse/0.",
+                name,
+            )
+        )
+    return part
+
+
+def check_file_content(
+    storage: Storage, name: str, sha256: str, limits: ImageLimits = DEFAULT_IMAGE_LIMITS
+) -> ImageHeader | None:
+    """Check a stored file before it is entered into a dataset; the header of an image, else None.
+
+    Raises:
+        IntakeRefused: the name or the header is refused.
+        StorageError: the content cannot be had.
+    """
+    if check_file_name(name) is Part.MODEL:
+        return None
+    with storage.open(sha256) as file:
+        return read_image_header(file, name, limits)
+
+
+def check_dataset(
+    storage: Storage, files: Sequence[DatasetFile], limits: DatasetLimits = DEFAULT_LIMITS
+) -> DatasetSummary:
+    """Check a whole dataset, the COLMAP model in a child process; takes a second or more.
+
+    Args:
+        storage: holds the contents.
+        files: all files of the dataset.
+        limits: what it may ask for.
+
+    Raises:
+        IntakeRefused: with all faults that were found.
+        StorageError: contents cannot be had.
+    """
+    faults: list[Fault] = []
+    warnings: list[str] = []
+    _check_names(files, faults)
+    if faults:
+        raise IntakeRefused(*faults[:_MAX_FAULTS])
+    sizes = _image_sizes(storage, files, limits.image, faults, warnings)
+    photographs = {path.removeprefix("images/"): s for path, s in sizes.items() if path.startswith("images/")}
+    count = sum(part_of(file.path) is Part.IMAGE for file in files)
+    if not MIN_VIEWS <= count <= limits.max_photographs:
+        wanted = (
+            f"at least {MIN_VIEWS} are needed"
+            if count < MIN_VIEWS
+            else f"{limits.max_photographs} are allowed"
+        )
+        faults.append(Fault("dataset-photographs", f"There are {count} photographs in images/; {wanted}."))
+    masks = _check_masks(files, sizes, faults, warnings)
+    by_name = {file.path: file for file in files}
+    model = [
+        TreeFile(path=name, sha256=by_name[name].sha256, size_bytes=by_name[name].size_bytes)
+        for name in model_files(list(by_name)).values()
+    ]
+    answer = ModelAnswer()
+    if model and not faults:
+        answer = check_model(storage, model, photographs, limits.model)
+        faults += answer.faults
+        warnings += answer.warnings
+    if faults:
+        raise IntakeRefused(*faults[:_MAX_FAULTS])
+    return DatasetSummary(
+        photographs=count,
+        pixels=sum(width * height for width, height in photographs.values()),
+        size_bytes=sum(file.size_bytes for file in files),
+        masks=masks,
+        has_model=bool(model),
+        views=answer.views,
+        cameras=answer.cameras,
+        camera_models=tuple(answer.camera_models),
+        points=answer.points,
+        warnings=tuple(warnings),
+    )
+
+
+def _check_names(files: Sequence[DatasetFile], faults: list[Fault]) -> None:
+    known = NameSet()
+    for file in files:
+        try:
+            check_file_name(file.path)
+            known.add(file.path)
+        except IntakeRefused as error:
+            faults += error.faults
+        except NameRefused as error:
+            faults.append(Fault(error.code, str(error), file.path))
+
+
+def _image_sizes(
+    storage: Storage,
+    files: Sequence[DatasetFile],
+    limits: ImageLimits,
+    faults: list[Fault],
+    warnings: list[str],
+) -> dict[str, tuple[int, int]]:
+    sizes: dict[str, tuple[int, int]] = {}
+    for file in files:
+        if part_of(file.path) is Part.MODEL:
+            continue
+        if file.width_px is not None and file.height_px is not None:
+            sizes[file.path] = file.width_px, file.height_px
+            if file.warning is not None and len(warnings) < _MAX_FAULTS:
+                warnings.append(file.warning)
+            continue
+        try:
+            header = check_file_content(storage, file.path, file.sha256, limits)
+        except IntakeRefused as error:
+            faults += error.faults
+            continue
+        if header is not None:
+            sizes[file.path] = header.width_px, header.height_px
+            if header.warning is not None and len(warnings) < _MAX_FAULTS:
+                warnings.append(header.warning)
+    return sizes
+
+
+def _check_masks(
+    files: Sequence[DatasetFile],
+    sizes: dict[str, tuple[int, int]],
+    faults: list[Fault],
+    warnings: list[str],
+) -> int:
+    """Masks against their photographs, which are named alike but for ``.png`` at the end."""
+    photographs = {unicodedata.normalize("NFC", path): size for path, size in sizes.items()}
+    masks = [file.path for file in files if part_of(file.path) is Part.MASK]
+    alone = 0
+    for path in masks:
+        of_image = path.removeprefix("masks/").removesuffix(".png")
+        photograph = photographs.get(unicodedata.normalize("NFC", f"images/{of_image}"))
+        if photograph is None or not path.endswith(".png"):
+            alone += 1
+        elif path in sizes and sizes[path] != photograph:
+            width, height = sizes[path]
+            faults.append(
+                Fault(
+                    "mask-size",
+                    f"{shown_name(path)} is {width}x{height} but its photograph is "
+                    f"{photograph[0]}x{photograph[1]}; make the mask as large as the photograph.",
+                    path,
+                )
+            )
+    if alone:
+        warnings.append(
+            f"{alone} masks belong to no photograph; a mask is named like its photograph with .png added."
+        )
+    return len(masks) - alone

@@ -1,0 +1,45 @@
+"""What is wrong with something that came from outside, in a form for programs and for people."""
+
+from dataclasses import dataclass
+
+from engine.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Attributes:
+        code: stable name of the reason, e.g. ``name-traversal``.
+        detail: one sentence that says what is wrong and what to do.
+        file: name of the file in the dataset or archive that it concerns, if it is one.
+    """
+
+    code: str
+    detail: str
+    file: str | None = None
+
+    @property
+    def pointer(self) -> str:
+        """JSON pointer (RFC 6901, as a fragment) to the file among the files of the dataset."""
+        if self.file is None:
+            return "#/files"
+        return f"#/files/{self.file.replace('~', '~0').replace('/', '~1')}"
+
+    def as_dict(self) -> dict[str, str]:
+        """As an element of ``errors`` of a problem document (RFC 9457)."""
+        facts = {"code": self.code, "detail": self.detail, "pointer": self.pointer}
+        return facts if self.file is None else {**facts, "file": self.file}
+
+
+class IntakeRefused(DatasetError):
+    """Something from outside is refused; ``faults`` say why, the text is that of the first."""
+
+    def __init__(self, *faults: Fault) -> None:
+        super().__init__(faults[0].detail)
+        self.faults = faults
+
+    @property
+    def code(self) -> str:
+        """Reason of the first fault."""
+        return self.faults[0].code

@@ -1,0 +1,122 @@
+"""Asking a child process, under limits, whether a COLMAP model can be used."""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from service.intake.faults import Fault
+from service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
+from workers.storage.protocol import Storage
+from workers.storage.trees import TreeFile, fetch_tree
+
+MIN_VIEWS = 3
+"""Fewer photographs do not make a scene; as in the engine."""
+
+_log = logging.getLogger(__name__)
+_LIBRARY_VARIABLES = ("PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "SYSTEMROOT")
+
+
+@dataclass(frozen=True)
+class ModelLimits:
+    """What parsing a model may take.
+
+    Attributes:
+        memory_bytes: address space of the child; some 0.6 GB of it are the libraries.
+        seconds: time.
+        max_model_bytes: length of the model's files together.
+    """
+
+    memory_bytes: int = 6 << 30
+    seconds: int = 120
+    max_model_bytes: int = 4 << 30
+
+
+def check_model(
+    storage: Storage,
+    model: Sequence[TreeFile],
+    sizes_px: Mapping[str, tuple[int, int]],
+    limits: ModelLimits = ModelLimits(),
+) -> ModelAnswer:
+    """Check a COLMAP model against the photographs of its dataset.
+
+    Args:
+        storage: holds the files of the model.
+        model: files of one model, named as in the dataset.
+        sizes_px: width and height of every photograph, by its name below ``images/``.
+        limits: what parsing may take.
+
+    Returns:
+        What is wrong, or else what the model holds. Never raises for what the model contains.
+
+    Raises:
+        StorageError: the files cannot be had.
+    """
+    total = sum(file.size_bytes for file in model)
+    if total > limits.max_model_bytes:
+        detail = f"The COLMAP model has {total} bytes; {limits.max_model_bytes} are allowed."
+        return ModelAnswer(faults=[Fault("model-too-large", detail)])
+    with tempfile.TemporaryDirectory(prefix="octasplat-model-") as folder:
+        root = Path(folder)
+        fetch_tree(storage, model, root, writable=True)  # copies, as the child is not trusted
+        request = ModelRequest(
+            root=root,
+            files={file.path.rpartition("/")[2]: file.path for file in model},
+            sizes_px=dict(sizes_px),
+            min_views=MIN_VIEWS,
+            memory_bytes=limits.memory_bytes,
+            cpu_seconds=limits.seconds,
+        )
+        return _ask(request, limits)
+
+
+def _ask(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
+    # Files, not pipes: the child's limit on the length of files then bounds what it can say.
+    with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as noise:
+        child = subprocess.Popen(
+            [sys.executable, "-I", "-m", "service.intake.model_child"],
+            stdin=subprocess.PIPE,
+            stdout=answer,
+            stderr=noise,
+            env=child_environment(),
+            start_new_session=True,
+        )
+        try:
+            child.communicate(request.model_dump_json().encode(), timeout=limits.seconds)
+        except subprocess.TimeoutExpired:
+            return _failed("model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s.")
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+        answer.seek(0)
+        text = answer.read(MAX_ANSWER_BYTES)
+        noise.seek(max(0, noise.seek(0, os.SEEK_END) - 2000))
+        said = noise.read(2000)
+    if child.returncode == -signal.SIGXCPU or child.returncode == -signal.SIGKILL:
+        return _failed("model-timeout", f"Reading the COLMAP model took more than {limits.seconds} s.")
+    try:
+        return ModelAnswer.model_validate_json(text)
+    except ValidationError:
+        _log.warning("the reader of a COLMAP model ended with %s: %a", child.returncode, said)
+        return _failed(
+            "model-crash", "The COLMAP model cannot be read (its reader crashed); write it anew with COLMAP."
+        )
+
+
+def child_environment() -> dict[str, str]:
+    """What a child that parses foreign bytes may know: how to find libraries, and no secrets."""
+    kept = {name: os.environ[name] for name in _LIBRARY_VARIABLES if name in os.environ}
+    return {**kept, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+def _failed(code: str, detail: str) -> ModelAnswer:
+    return ModelAnswer(faults=[Fault(code, detail)])

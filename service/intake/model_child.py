@@ -1,0 +1,267 @@
+"""The child process that parses a COLMAP model from somebody who may mean harm.
+
+    python -I -m service.intake.model_child < request.json > answer.json
+
+It limits its own memory, time and output before it imports anything that parses. Only this module's ``main``
+imports pycolmap. The parent is :mod:`service.intake.model_check`; what it sends and receives is defined here.
+"""
+
+import contextlib
+import os
+import resource
+import signal
+import sys
+import unicodedata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
+
+from service.intake.faults import Fault
+from workers.storage.names import NameRefused, check_name, shown_name
+
+if TYPE_CHECKING:
+    from engine.scene.colmap import ColmapModel
+
+MAX_ANSWER_BYTES = 4 << 20
+MAX_FAULTS = 100
+_MAX_COORDINATE = 1e12
+_UNIT_TOLERANCE = 1e-3
+_PARENT_DIED = 1  # PR_SET_PDEATHSIG
+
+
+class ModelRequest(BaseModel):
+    """What the child is asked.
+
+    Attributes:
+        root: folder of the scene, which holds the model and nothing else.
+        files: names of the model's files in the dataset, by their last part.
+        sizes_px: width and height of every photograph, by its name below ``images/``.
+        min_views: fewer posed photographs do not make a scene.
+        memory_bytes: address space.
+        cpu_seconds: processor time.
+    """
+
+    root: Path
+    files: dict[str, str]
+    sizes_px: dict[str, tuple[int, int]]
+    min_views: int
+    memory_bytes: int
+    cpu_seconds: int
+
+
+class ModelAnswer(BaseModel):
+    """What the child found: faults, or else what the model holds."""
+
+    faults: list[Fault] = []
+    views: int = 0
+    cameras: int = 0
+    camera_models: list[str] = []
+    points: int = 0
+    warnings: list[str] = []
+
+
+def main() -> None:
+    """Read the request from stdin, parse, and write the answer to stdout."""
+    answer_fd = os.dup(1)
+    os.dup2(2, 1)  # libraries that talk do so to stderr
+    request = ModelRequest.model_validate_json(sys.stdin.buffer.read())
+    _limit(request)
+    try:
+        answer = check(request)
+    except MemoryError:
+        answer = _one_fault("model-memory", "The COLMAP model takes too much memory to read.")
+    text = answer.model_dump_json().encode()
+    with os.fdopen(answer_fd, "wb") as out:
+        out.write(text)
+
+
+def check(request: ModelRequest) -> ModelAnswer:
+    """Parse the model and list all that is wrong with it."""
+    from engine.errors import DatasetError
+    from engine.scene.binary import check_binary_model
+    from engine.scene.colmap import find_model_folder, read_colmap_model
+
+    checker = _Checker(request)
+    try:
+        folder = find_model_folder(request.root)
+        check_binary_model(folder)
+        reconstruction = _load(folder)
+        if reconstruction is not None:
+            checker.check_images(reconstruction)
+            checker.check_cameras(reconstruction)
+        if checker.faults:
+            return ModelAnswer(faults=checker.faults)
+        model = read_colmap_model(request.root)
+    except DatasetError as error:
+        return _one_fault(
+            "model-damaged", _relative(str(error), request.root), _named_file(str(error), request)
+        )
+    return checker.summary(model)
+
+
+def _load(folder: Path) -> Any:
+    """The model as pycolmap reads it, or None where it does not; the engine then says why."""
+    import pycolmap
+
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except MemoryError:
+        raise
+    except Exception:  # noqa: BLE001 - whatever a parser of foreign bytes may raise
+        return None
+
+
+class _Checker:
+    """Collects faults, a bounded number of them."""
+
+    def __init__(self, request: ModelRequest) -> None:
+        self.request = request
+        self.faults: list[Fault] = []
+        self._sizes = {unicodedata.normalize("NFC", name): size for name, size in request.sizes_px.items()}
+
+    def _fault(self, part: str, code: str, detail: str) -> None:
+        if len(self.faults) < MAX_FAULTS:
+            self.faults.append(Fault(code, detail, _file_of(part, self.request)))
+
+    def check_images(self, reconstruction: Any) -> None:
+        """Names against the photographs, and poses."""
+        import numpy as np
+
+        known: set[str] = set()
+        posed = 0
+        for image_id, image in sorted(reconstruction.images.items()):
+            try:
+                name = check_name(_name(image, int(image_id)))
+            except NameRefused as error:
+                self._fault("images", error.code, f"The COLMAP model names an image so: {error}")
+                continue
+            if not image.has_pose:
+                continue
+            shown = shown_name(name)
+            posed += 1
+            key = unicodedata.normalize("NFC", name)
+            if key in known:
+                self._fault("images", "model-image-twice", f"The COLMAP model has the image {shown} twice.")
+            known.add(key)
+            if key not in self._sizes:
+                self._fault(
+                    "images",
+                    "model-image-missing",
+                    f"The image {shown} of the COLMAP model is not among the photographs in images/; "
+                    "upload it or run COLMAP without it.",
+                )
+            pose = image.cam_from_world()
+            quat, translation = np.array(pose.rotation.quat), np.array(pose.translation)
+            # A quaternion of zeros would pass for the identity further on.
+            if not (np.isfinite(quat).all() and abs(float(np.linalg.norm(quat)) - 1.0) <= _UNIT_TOLERANCE):
+                self._fault("images", "model-pose", f"The rotation of {shown} is not a unit quaternion.")
+            if not (np.isfinite(translation).all() and (abs(translation) < _MAX_COORDINATE).all()):
+                self._fault("images", "model-pose", f"The translation of {shown} is not a usable number.")
+        if posed < self.request.min_views:
+            self._fault(
+                "images",
+                "model-too-few-views",
+                f"The COLMAP model has {posed} posed images; at least {self.request.min_views} are needed.",
+            )
+
+    def check_cameras(self, reconstruction: Any) -> None:
+        """Parameters, and sizes against those of the photographs."""
+        import numpy as np
+
+        bad: set[int] = set()
+        for camera_id, camera in sorted(reconstruction.cameras.items()):
+            params = np.array(camera.params, dtype=np.float64)
+            facts = f"{camera.model_name}, {camera.width}x{camera.height}, {params.tolist()}"
+            problem = ""
+            if not (params.size and camera.verify_params() and np.isfinite(params).all()):
+                problem = "has parameters that are no usable numbers"
+            elif not (params[list(camera.focal_length_idxs())] > 0).all():
+                problem = "has a focal length that is not positive"
+            elif camera.width < 1 or camera.height < 1:
+                problem = "has no size"
+            if problem:
+                bad.add(int(camera_id))
+                self._fault("cameras", "model-camera", f"Camera {camera_id} {problem} ({facts[:200]}).")
+        for image_id, image in sorted(reconstruction.images.items()):
+            try:
+                name = _name(image, int(image_id))
+            except NameRefused:
+                continue  # told already
+            size = self._sizes.get(unicodedata.normalize("NFC", name))
+            if size is None or not image.has_pose or int(image.camera_id) in bad:
+                continue
+            camera = reconstruction.cameras[image.camera_id]
+            if not same_shape((int(camera.width), int(camera.height)), size):
+                self._fault(
+                    "cameras",
+                    "model-size",
+                    f"{shown_name(name)} is {size[0]}x{size[1]} but its camera {image.camera_id} "
+                    f"is {camera.width}x{camera.height}; use the photographs COLMAP was given.",
+                )
+
+    def summary(self, model: "ColmapModel") -> ModelAnswer:
+        """The answer for a model without faults."""
+        posed = {unicodedata.normalize("NFC", image.name) for image in model.images}
+        warnings = [_relative(warning, self.request.root) for warning in model.warnings]
+        unposed = len(self._sizes) - len(posed)
+        if unposed:
+            warnings.append(f"{unposed} photographs have no pose in the COLMAP model and are left out.")
+        return ModelAnswer(
+            views=len(model.images),
+            cameras=len(model.cameras),
+            camera_models=sorted({camera.model for camera in model.cameras.values()}),
+            points=len(model.points),
+            warnings=warnings[:MAX_FAULTS],
+        )
+
+
+def _name(image: Any, image_id: int) -> str:
+    try:
+        return str(image.name)
+    except UnicodeDecodeError:
+        raise NameRefused("name-not-text", f"The name of image {image_id} is not UTF-8.") from None
+
+
+def same_shape(camera_px: tuple[int, int], image_px: tuple[int, int]) -> bool:
+    """Whether an image is that of the camera but for its scale, to a pixel, as the engine demands."""
+    expected_height = camera_px[1] * image_px[0] / camera_px[0]
+    expected_width = camera_px[0] * image_px[1] / camera_px[1]
+    return min(abs(expected_height - image_px[1]), abs(expected_width - image_px[0])) <= 1
+
+
+def _one_fault(code: str, detail: str, file: str | None = None) -> ModelAnswer:
+    return ModelAnswer(faults=[Fault(code, detail, file)])
+
+
+def _file_of(part: str, request: ModelRequest) -> str | None:
+    return request.files.get(f"{part}.bin") or request.files.get(f"{part}.txt")
+
+
+def _named_file(sentence: str, request: ModelRequest) -> str | None:
+    return next((name for name in request.files.values() if name in sentence), None)
+
+
+def _relative(sentence: str, root: Path) -> str:
+    """The sentence without the folder of this machine that the model was put into."""
+    return sentence.replace(f"{root}/", "").replace(str(root), "the dataset")
+
+
+def _limit(request: ModelRequest) -> None:
+    """Give up what a parser does not need, for good."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PARENT_DIED, signal.SIGKILL)
+    for kind, value in (
+        (resource.RLIMIT_AS, request.memory_bytes),
+        (resource.RLIMIT_CPU, request.cpu_seconds),
+        (resource.RLIMIT_FSIZE, MAX_ANSWER_BYTES),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        with contextlib.suppress(ValueError):  # already lower
+            resource.setrlimit(kind, (value, value))
+
+
+if __name__ == "__main__":
+    main()

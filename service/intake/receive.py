@@ -1,0 +1,276 @@
+"""Taking in bodies of any length with constant memory: single files, and archives of whole scenes."""
+
+import asyncio
+import base64
+import binascii
+import re
+import tempfile
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
+from service.intake.dataset import DatasetLimits, check_file_content, check_file_name
+from service.intake.faults import Fault, IntakeRefused
+from service.intake.images import ImageHeader
+from workers.storage.counting import CountingWriter
+from workers.storage.os_errors import told
+from workers.storage.protocol import Blob, BlobWriter, Storage
+
+PIECE_BYTES = 1 << 20
+_CHECK_EVERY_BYTES = 64 << 20
+_SHA256 = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:([A-Za-z0-9+/=]*):\s*(?:;[^,]*)?(?=,|$)")
+
+
+@dataclass(frozen=True)
+class ReceivedFile:
+    """A file that is stored and passed the checks that a single file can pass.
+
+    Attributes:
+        path: name in the dataset.
+        blob: its content.
+        facts: what its header says: ``kind``, ``width_px``, ``height_px``, ``warning``; empty for a model.
+    """
+
+    path: str
+    blob: Blob
+    facts: Mapping[str, str | int | None]
+
+
+@dataclass(frozen=True)
+class ReceivedArchive:
+    """A scene that came as an archive.
+
+    Attributes:
+        files: its files, stored and checked one by one.
+        left_out: names of files that are no part of a scene.
+        size_bytes: length of the archive.
+    """
+
+    files: tuple[ReceivedFile, ...]
+    left_out: tuple[str, ...]
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class UploadLimits:
+    """What an upload may ask for.
+
+    Attributes:
+        max_file_bytes: one file.
+        max_archive_bytes: an archive as it is sent.
+        idle_seconds: silence after which an upload is given up.
+        archive: what an archive may unpack to.
+        dataset: what a dataset may be.
+    """
+
+    max_file_bytes: int = 4 << 30
+    max_archive_bytes: int = 64 << 30
+    idle_seconds: float = 60.0
+    archive: ArchiveLimits = field(default_factory=ArchiveLimits)
+    dataset: DatasetLimits = field(default_factory=DatasetLimits)
+
+
+DEFAULT_LIMITS = UploadLimits()
+
+
+def parse_digest(repr_digest: str | None) -> str | None:
+    """The SHA-256, in hexadecimal digits, of a header ``Repr-Digest`` (RFC 9530); None without the header.
+
+    Raises:
+        IntakeRefused: ``digest-malformed``.
+    """
+    if repr_digest is None:
+        return None
+    found = _SHA256.search(repr_digest)
+    try:
+        digest = base64.b64decode(found[1], validate=True) if found else b""
+    except binascii.Error:
+        digest = b""
+    if len(digest) != 32:
+        raise IntakeRefused(
+            Fault(
+                "digest-malformed",
+                "The header Repr-Digest holds no SHA-256; write it as sha-256=:<base64 of the 32 bytes>:.",
+            )
+        )
+    return digest.hex()
+
+
+def format_digest(sha256: str) -> str:
+    """The header ``Repr-Digest`` of a SHA-256 in hexadecimal digits."""
+    return f"sha-256=:{base64.b64encode(bytes.fromhex(sha256)).decode()}:"
+
+
+async def receive(stream: AsyncIterator[bytes], writer: BlobWriter, *, idle_seconds: float = 60.0) -> Blob:
+    """Write a body to ``writer`` in threads, about a megabyte at a time, and commit it.
+
+    Args:
+        stream: the body, in pieces of any length.
+        writer: where to; it is aborted on any error.
+        idle_seconds: silence after which the upload is given up.
+
+    Raises:
+        IntakeRefused: ``upload-stalled``.
+        StorageError: the content is not as announced, too large, or there is no room.
+    """
+    pending = bytearray()
+    try:
+        pieces = aiter(stream)
+        while True:
+            try:
+                async with asyncio.timeout(idle_seconds):
+                    piece = await anext(pieces)
+            except StopAsyncIteration:
+                break
+            except TimeoutError:
+                detail = f"Nothing came for {idle_seconds:g} s; send the file again."
+                raise IntakeRefused(Fault("upload-stalled", detail)) from None
+            pending += piece
+            if len(pending) >= PIECE_BYTES:
+                await asyncio.to_thread(writer.write, bytes(pending))
+                pending.clear()
+        if pending:
+            await asyncio.to_thread(writer.write, bytes(pending))
+        return await asyncio.to_thread(writer.commit)
+    except BaseException:
+        await asyncio.shield(asyncio.to_thread(writer.abort))
+        raise
+
+
+async def receive_file(
+    storage: Storage,
+    path: str,
+    stream: AsyncIterator[bytes],
+    *,
+    sha256: str | None = None,
+    size_bytes: int | None = None,
+    limits: UploadLimits = DEFAULT_LIMITS,
+    max_bytes: int | None = None,
+) -> ReceivedFile:
+    """Take in one file of a dataset. It is stored, but belongs to nothing yet.
+
+    Args:
+        storage: where to.
+        path: name in the dataset.
+        stream: the body.
+        sha256: digest that was announced.
+        size_bytes: length that was announced.
+        limits: what is taken.
+        max_bytes: a lower limit than that of ``limits``, e.g. what a quota leaves.
+
+    Raises:
+        IntakeRefused: the name, the digest's form or the header of the image is refused.
+        StorageError: as by :func:`receive`.
+    """
+    check_file_name(path)
+    most = limits.max_file_bytes if max_bytes is None else min(limits.max_file_bytes, max_bytes)
+    writer = await asyncio.to_thread(storage.begin, sha256=sha256, size_bytes=size_bytes, max_bytes=most)
+    blob = await receive(stream, writer, idle_seconds=limits.idle_seconds)
+    header = await asyncio.to_thread(check_file_content, storage, path, blob.sha256, limits.dataset.image)
+    return ReceivedFile(path, blob, header_facts(header))
+
+
+async def receive_archive(
+    storage: Storage,
+    stream: AsyncIterator[bytes],
+    spool: Path,
+    *,
+    sha256: str | None = None,
+    size_bytes: int | None = None,
+    limits: UploadLimits = DEFAULT_LIMITS,
+    max_bytes: int | None = None,
+) -> ReceivedArchive:
+    """Take in a scene as an archive. Its files are stored, but belong to nothing yet.
+
+    Args:
+        storage: where to.
+        stream: the body.
+        spool: folder for the archive while it is read; the file there has no name and ends with the process.
+        sha256: digest that was announced.
+        size_bytes: length that was announced.
+        limits: what is taken.
+        max_bytes: what the contents may have together, e.g. what a quota leaves.
+
+    Raises:
+        IntakeRefused: the archive or a file in it is refused.
+        StorageError: as by :func:`receive`.
+    """
+    most = limits.max_archive_bytes if max_bytes is None else min(limits.max_archive_bytes, max_bytes)
+    with told(spool):
+        spool.mkdir(parents=True, exist_ok=True, mode=0o700)
+        file = tempfile.TemporaryFile(dir=spool)  # noqa: SIM115 - closed below
+    with file:
+        writer = _SpoolWriter(file, spool, storage, sha256, size_bytes, most)
+        blob = await receive(stream, writer, idle_seconds=limits.idle_seconds)
+        files, left_out = await asyncio.to_thread(_unpack, storage, file, limits, max_bytes)
+    return ReceivedArchive(files, left_out, blob.size_bytes)
+
+
+def header_facts(header: ImageHeader | None) -> dict[str, str | int | None]:
+    """What the table keeps of the header of an image."""
+    if header is None:
+        return {}
+    facts: dict[str, str | int | None] = {
+        "kind": header.kind,
+        "width_px": header.width_px,
+        "height_px": header.height_px,
+    }
+    return facts if header.warning is None else {**facts, "warning": header.warning}
+
+
+def _unpack(
+    storage: Storage, file: BinaryIO, limits: UploadLimits, max_bytes: int | None
+) -> tuple[tuple[ReceivedFile, ...], tuple[str, ...]]:
+    listing = list_archive(file, limits.archive)
+    if max_bytes is not None and listing.size_bytes > max_bytes:
+        detail = f"The archive unpacks to {listing.size_bytes} bytes; {max_bytes} are left of your quota."
+        raise IntakeRefused(Fault("archive-too-large", detail))
+    storage.ensure_room(listing.size_bytes)
+    files: list[ReceivedFile] = []
+
+    def begin(entry: ArchiveFile) -> BlobWriter:
+        return storage.begin(size_bytes=entry.size_bytes, max_bytes=limits.max_file_bytes)
+
+    def on_file(entry: ArchiveFile, blob: Blob) -> None:
+        header = check_file_content(storage, entry.name, blob.sha256, limits.dataset.image)
+        files.append(ReceivedFile(entry.name, blob, header_facts(header)))
+
+    unpack_archive(file, listing, begin, on_file)
+    return tuple(files), listing.left_out
+
+
+class _SpoolWriter(CountingWriter):
+    """Writes an archive into a nameless file of this machine."""
+
+    def __init__(
+        self,
+        file: BinaryIO,
+        folder: Path,
+        storage: Storage,
+        sha256: str | None,
+        size_bytes: int | None,
+        max_bytes: int | None,
+    ) -> None:
+        self._file = file
+        self._folder = folder
+        self._storage = storage
+        self._until_check = 0
+        super().__init__(sha256, size_bytes, max_bytes)
+        storage.ensure_room(size_bytes or 0)
+
+    def _put(self, data: bytes | memoryview) -> None:
+        self._until_check -= len(data)
+        if self._until_check < 0:
+            self._storage.ensure_room(len(data))
+            self._until_check = _CHECK_EVERY_BYTES
+        with told(self._folder):
+            self._file.write(data)
+
+    def _publish(self, blob: Blob) -> None:
+        with told(self._folder):
+            self._file.flush()
+
+    def _discard(self) -> None:
+        """The file goes when it is closed."""

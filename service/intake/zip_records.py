@@ -1,0 +1,324 @@
+"""The records of a ZIP file, read strictly: every byte of the file must belong to exactly one of them.
+
+Readers of ZIP files disagree about files whose two lists of contents, the local headers and the central
+directory, do not agree. So this reads both and takes only files in which they say the same, in which the
+entries follow each other without gap or overlap, and after which nothing comes. Facts: APPNOTE.TXT 6.3.10.
+"""
+
+import os
+import struct
+from dataclasses import dataclass
+from typing import BinaryIO, NoReturn
+
+from service.intake.faults import Fault, IntakeRefused
+from workers.storage.names import shown_name
+
+STORED, DEFLATED = 0, 8
+IS_ENCRYPTED, HAS_DESCRIPTOR, IS_PATCHED, IS_STRONG, IS_UTF8, IS_MASKED = 1, 8, 32, 64, 2048, 8192
+
+_LOCAL = struct.Struct("<4s5H3I2H")
+_CENTRAL = struct.Struct("<4s6H3I5H2I")
+_END = struct.Struct("<4s4H2IH")
+_END_64 = struct.Struct("<4sQ2H2I4Q")
+_LOCATOR_64 = struct.Struct("<4sIQI")
+_MAX_COMMENT = 65_535
+_NEWEST_VERSION = 63
+_UNKNOWN_16, _UNKNOWN_32 = 0xFFFF, 0xFFFFFFFF
+_EXTRA_ZIP64, _EXTRA_NAME = 0x0001, 0x7075
+
+
+@dataclass(frozen=True)
+class Record:
+    """One entry, as both lists say.
+
+    Attributes:
+        name: as stored, a folder's with its final slash.
+        method: :data:`STORED` or whatever else the file says.
+        flags: general purpose bits.
+        crc32: checksum of the content.
+        packed_bytes: length of the data in the file.
+        size_bytes: announced length of the content.
+        header_start: where the local header begins.
+        data_start: where the data begins.
+        unix_mode: mode bits of the file's home, 0 where it had none.
+    """
+
+    name: str
+    method: int
+    flags: int
+    crc32: int
+    packed_bytes: int
+    size_bytes: int
+    header_start: int
+    data_start: int
+    unix_mode: int
+
+
+@dataclass(frozen=True)
+class _End:
+    entries: int
+    directory_start: int
+    directory_bytes: int
+    end_of_directory: int
+
+
+def refuse(code: str, detail: str, name: str | None = None) -> NoReturn:
+    """Refuse the archive.
+
+    Raises:
+        IntakeRefused: always.
+    """
+    raise IntakeRefused(Fault(code, detail, name))
+
+
+def read_records(file: BinaryIO, *, max_entries: int, max_directory_bytes: int) -> list[Record]:
+    """All entries of a ZIP file in the order of their data.
+
+    Args:
+        file: seekable.
+        max_entries: more are refused before they are read.
+        max_directory_bytes: a longer central directory is refused before it is read.
+
+    Raises:
+        IntakeRefused: with a code that begins with ``archive-`` or ``name-``.
+    """
+    length = file.seek(0, os.SEEK_END)
+    end = _read_end(file, length)
+    if end.entries > max_entries:
+        refuse(
+            "archive-too-many-entries", f"The archive has {end.entries} entries; {max_entries} are allowed."
+        )
+    if end.directory_bytes > max_directory_bytes:
+        refuse("archive-directory-too-long", "The list of contents of the archive is too long.")
+    if end.directory_start + end.directory_bytes != end.end_of_directory:
+        refuse(
+            "archive-gap",
+            "The archive holds bytes that belong to none of its entries (before its beginning or between its "
+            "parts); write it anew with an ordinary ZIP program.",
+        )
+    file.seek(end.directory_start)
+    directory = file.read(end.directory_bytes)
+    if (directory + file.read(_END.size + _MAX_COMMENT)).count(b"PK\x05\x06") != 1:
+        refuse("archive-ambiguous", "The archive has two end records; write it anew without a comment.")
+    records = [_with_local_header(file, *entry) for entry in _central_entries(directory, end.entries)]
+    records.sort(key=lambda record: record.header_start)
+    _check_coverage(file, records, end.directory_start)
+    return records
+
+
+def _read_end(file: BinaryIO, length: int) -> _End:
+    tail_start = max(0, length - _END.size - _MAX_COMMENT)
+    file.seek(tail_start)
+    tail = file.read(length - tail_start)
+    position = tail.rfind(b"PK\x05\x06")
+    if position < 0 or position + _END.size > len(tail):
+        refuse("archive-damaged", "The archive has no end record; it was cut short or is not a ZIP file.")
+    _, disk, directory_disk, entries_here, entries, size, start, comment = _END.unpack_from(tail, position)
+    if position + _END.size + comment != len(tail):
+        refuse("archive-data-after-end", "The archive goes on after its end record; write it anew.")
+    end_start = tail_start + position
+    locator = _locator_64(file, end_start)
+    if locator is None:
+        if disk or directory_disk or entries_here != entries:
+            refuse("archive-several-disks", "The archive is split into several files; send it as one.")
+        if _UNKNOWN_32 in (size, start) or entries == _UNKNOWN_16:
+            refuse("archive-damaged", "The archive lacks its ZIP64 record; write it anew.")
+        return _End(entries, start, size, end_start)
+    return _read_end_64(file, locator, end_start - _LOCATOR_64.size, (entries, size, start))
+
+
+def _locator_64(file: BinaryIO, end_start: int) -> int | None:
+    if end_start < _LOCATOR_64.size:
+        return None
+    file.seek(end_start - _LOCATOR_64.size)
+    signature, disk, where, disks = _LOCATOR_64.unpack(file.read(_LOCATOR_64.size))
+    if signature != b"PK\x06\x07":
+        return None
+    if disk != 0 or disks > 1:
+        refuse("archive-several-disks", "The archive is split into several files; send it as one.")
+    return int(where)
+
+
+def _read_end_64(file: BinaryIO, where: int, must_end: int, short: tuple[int, int, int]) -> _End:
+    if where + _END_64.size != must_end:
+        refuse("archive-gap", "The ZIP64 record of the archive is not where it must be; write it anew.")
+    file.seek(where)
+    signature, length, _, _, disk, directory_disk, here, entries, size, start = _END_64.unpack(
+        file.read(_END_64.size)
+    )
+    if signature != b"PK\x06\x06" or length != _END_64.size - 12:
+        refuse("archive-damaged", "The ZIP64 record of the archive is damaged; write it anew.")
+    if disk or directory_disk or here != entries:
+        refuse("archive-several-disks", "The archive is split into several files; send it as one.")
+    for old, new, unknown in zip(
+        short, (entries, size, start), (_UNKNOWN_16, _UNKNOWN_32, _UNKNOWN_32), strict=True
+    ):
+        if old not in (new, unknown):
+            refuse("archive-mismatch", "The two end records of the archive contradict each other.")
+    return _End(entries, start, size, where)
+
+
+def _central_entries(directory: bytes, count: int) -> list[tuple[Record, bytes]]:
+    """Records without ``data_start``, with their names as bytes."""
+    entries: list[tuple[Record, bytes]] = []
+    position = 0
+    for _ in range(count):
+        if position + _CENTRAL.size > len(directory):
+            refuse("archive-damaged", "The list of contents of the archive ends early; write it anew.")
+        (
+            signature, _, version, flags, method, _, _, crc32, packed, size,
+            name_length, extra_length, comment_length, disk, _, attributes, start,
+        ) = _CENTRAL.unpack_from(directory, position)  # fmt: skip
+        position += _CENTRAL.size
+        after = position + name_length + extra_length + comment_length
+        if signature != b"PK\x01\x02" or after > len(directory):
+            refuse("archive-damaged", "The list of contents of the archive is damaged; write it anew.")
+        raw_name = directory[position : position + name_length]
+        name = _decoded(raw_name)
+        _check_version(version, name)
+        extra = _extra_fields(directory[position + name_length : after - comment_length], name)
+        size, packed, start, disk = _widened(
+            extra,
+            name,
+            (size, _UNKNOWN_32, 8), (packed, _UNKNOWN_32, 8), (start, _UNKNOWN_32, 8), (disk, _UNKNOWN_16, 4),
+        )  # fmt: skip
+        if disk != 0:
+            refuse("archive-several-disks", "The archive is split into several files; send it as one.")
+        if extra.get(_EXTRA_NAME, b"\1" + bytes(4) + raw_name)[5:] != raw_name:
+            refuse("archive-second-name", f"The entry {shown_name(name)} carries a second name.", name)
+        # The upper half of the attributes is the mode on Unix; some programs read it whatever the home.
+        entries.append(
+            (Record(name, method, flags, crc32, packed, size, start, 0, attributes >> 16), raw_name)
+        )
+        position = after
+    if position != len(directory):
+        refuse(
+            "archive-gap", "The list of contents of the archive is longer than its entries; write it anew."
+        )
+    return entries
+
+
+def _with_local_header(file: BinaryIO, record: Record, raw_name: bytes) -> Record:
+    file.seek(record.header_start)
+    header = file.read(_LOCAL.size)
+    if len(header) < _LOCAL.size or header[:4] != b"PK\x03\x04":
+        refuse(
+            "archive-mismatch",
+            f"The entry {shown_name(record.name)} is listed but is not where it should be.",
+            record.name,
+        )
+    _, version, flags, method, _, _, crc32, packed, size, name_length, extra_length = _LOCAL.unpack(header)
+    _check_version(version, record.name)
+    name = file.read(name_length)
+    extra = _extra_fields(file.read(extra_length), record.name)
+    size, packed = _widened(extra, record.name, (size, _UNKNOWN_32, 8), (packed, _UNKNOWN_32, 8))
+    compared = IS_ENCRYPTED | HAS_DESCRIPTOR | IS_PATCHED | IS_STRONG | IS_UTF8 | IS_MASKED
+    same = (name, method, flags & compared) == (raw_name, record.method, record.flags & compared)
+    facts, announced = (crc32, packed, size), (record.crc32, record.packed_bytes, record.size_bytes)
+    # Where a descriptor follows the data, the header may leave each of the three at zero.
+    deferred = record.flags & HAS_DESCRIPTOR
+    same &= all(
+        here == there or (deferred and here == 0) for here, there in zip(facts, announced, strict=True)
+    )
+    if extra.get(_EXTRA_NAME, b"\1" + bytes(4) + raw_name)[5:] != raw_name:
+        refuse(
+            "archive-second-name", f"The entry {shown_name(record.name)} carries a second name.", record.name
+        )
+    if not same:
+        refuse(
+            "archive-mismatch",
+            f"The archive describes {shown_name(record.name)} in two ways that contradict each other.",
+            record.name,
+        )
+    data_start = record.header_start + _LOCAL.size + name_length + extra_length
+    return Record(
+        record.name, record.method, record.flags, record.crc32, record.packed_bytes, record.size_bytes,
+        record.header_start, data_start, record.unix_mode,
+    )  # fmt: skip
+
+
+def _check_version(needed: int, name: str) -> None:
+    if needed > _NEWEST_VERSION:
+        detail = (
+            f"{shown_name(name)} needs a newer reader of ZIP files than there is; write the archive anew."
+        )
+        refuse("archive-version", detail, name)
+
+
+def _check_coverage(file: BinaryIO, records: list[Record], directory_start: int) -> None:
+    position = 0
+    starts = [record.header_start for record in records] + [directory_start]
+    for record, after in zip(records, starts[1:], strict=True):
+        name = shown_name(record.name)
+        data_end = record.data_start + record.packed_bytes
+        if record.header_start != position:
+            refuse(
+                "archive-gap", "The archive holds bytes that belong to none of its entries; write it anew."
+            )
+        if data_end > after:
+            refuse("archive-overlap", f"The entry {name} shares its bytes with another.", record.name)
+        if record.flags & HAS_DESCRIPTOR:
+            file.seek(data_end)
+            if not _is_descriptor(file.read(min(24, after - data_end)), after - data_end, record):
+                refuse(
+                    "archive-mismatch", f"The entry {name} is not followed by what describes it.", record.name
+                )
+        elif data_end != after:
+            refuse(
+                "archive-gap", "The archive holds bytes that belong to none of its entries; write it anew."
+            )
+        position = after
+    if position != directory_start:
+        refuse("archive-gap", "The archive holds bytes but no entries.")
+
+
+def _is_descriptor(data: bytes, length: int, record: Record) -> bool:
+    facts = (record.crc32, record.packed_bytes, record.size_bytes)
+    for layout in ("<3I", "<I2Q"):
+        for signature in (b"PK\x07\x08", b""):
+            if length == len(signature) + struct.calcsize(layout) and data[: len(signature)] == signature:
+                return struct.unpack_from(layout, data, len(signature)) == facts
+    return False
+
+
+def _decoded(name: bytes) -> str:
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        refuse(
+            "name-not-text",
+            f"The archive holds a file name that is not UTF-8 ({ascii(name)[2:82]}); write it with a program "
+            "that stores names as UTF-8.",
+        )
+
+
+def _extra_fields(data: bytes, name: str) -> dict[int, bytes]:
+    fields: dict[int, bytes] = {}
+    position = 0
+    while position < len(data):
+        if position + 4 > len(data):
+            break  # some programs fill up with up to three zeros
+        kind, length = struct.unpack_from("<2H", data, position)
+        position += 4
+        if position + length > len(data) or (kind in (_EXTRA_ZIP64, _EXTRA_NAME) and kind in fields):
+            refuse(
+                "archive-damaged", f"The extra data of {shown_name(name)} in the archive are damaged.", name
+            )
+        fields[kind] = data[position : position + length]
+        position += length
+    return fields
+
+
+def _widened(extra: dict[int, bytes], name: str, *values: tuple[int, int, int]) -> tuple[int, ...]:
+    """Replace values that are full by those of the ZIP64 field; each is (value, full, width in bytes)."""
+    field = extra.get(_EXTRA_ZIP64, b"")
+    position = 0
+    found: list[int] = []
+    for value, full, width in values:
+        if value == full:
+            if position + width > len(field):
+                refuse("archive-damaged", f"The archive lacks the length of {shown_name(name)}.", name)
+            value = int.from_bytes(field[position : position + width], "little")
+            position += width
+        found.append(value)
+    return tuple(found)

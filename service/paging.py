@@ -1,0 +1,51 @@
+"""Long lists in parts: an opaque cursor, and a link to the next part (RFC 8288)."""
+
+import base64
+import binascii
+import uuid
+from typing import Annotated
+
+from fastapi import Query, Request, Response
+
+from service.problems import Problem
+
+Limit = Annotated[int, Query(ge=1, le=200, description="Most entries of one answer.")]
+Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the answer before.")]
+
+
+def write_cursor(place: str) -> str:
+    """A cursor that stands for a place in a list."""
+    return base64.urlsafe_b64encode(place.encode()).decode().rstrip("=")
+
+
+def read_cursor(cursor: str | None) -> str | None:
+    """The place that a cursor stands for.
+
+    Raises:
+        Problem: 422 if it is none of ours.
+    """
+    if cursor is None:
+        return None
+    try:
+        padded = cursor + "=" * (-len(cursor) % 4)
+        place = base64.b64decode(padded, altchars=b"-_", validate=True).decode()
+        if "\0" in place:
+            raise ValueError("no place has a NUL")
+        return place
+    except (binascii.Error, ValueError):
+        raise Problem(422, "cursor", "The cursor is none that this service gave out.") from None
+
+
+def read_id_cursor(cursor: str | None) -> uuid.UUID | None:
+    """As :func:`read_cursor`, for a list that is ordered by id."""
+    place = read_cursor(cursor)
+    try:
+        return None if place is None else uuid.UUID(place)
+    except ValueError:
+        raise Problem(422, "cursor", "The cursor is none that this service gave out.") from None
+
+
+def link_next(request: Request, response: Response, cursor: str | None) -> None:
+    """Say where the next part is."""
+    if cursor is not None:
+        response.headers["Link"] = f'<{request.url.include_query_params(cursor=cursor)}>; rel="next"'

@@ -1,0 +1,77 @@
+"""Settings of the front end, in one place; those of the workers come first."""
+
+import ipaddress
+
+from pydantic import Field, SecretStr
+
+from engine.errors import ConfigError
+from service.intake.receive import UploadLimits
+from workers.queue.quotas import Quota
+from workers.settings import PREFIX, WorkerSettings
+
+DEFAULT_PORT = 8642
+
+
+class ServiceSettings(WorkerSettings):
+    """Settings of the front end; each can be given as ``OCTASPLAT_<NAME>``.
+
+    Attributes:
+        host: address to listen at.
+        port: port to listen at; 0 takes a free one.
+        token: a token that lets its owner do everything; any other is made with ``octasplat token``.
+        allowed_hosts: further names under which the service is reached while it listens at this machine only.
+        max_upload_bytes: length of one uploaded file.
+        max_archive_bytes: length of an uploaded archive.
+        max_body_bytes: length of any other request.
+        quota_bytes: contents that an owner may store, unless ``octasplat quota`` says otherwise.
+        quota_datasets: datasets that an owner may have.
+        quota_jobs: jobs of an owner that may be queued or running.
+        ping_seconds: how often a quiet stream of events gives a sign of life.
+        max_streams: streams of events at once.
+        pool_size: connections to the database.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = Field(DEFAULT_PORT, ge=0, le=65535)
+    token: SecretStr | None = None
+    allowed_hosts: tuple[str, ...] = ()
+    max_upload_bytes: int = Field(4 << 30, gt=0)
+    max_archive_bytes: int = Field(64 << 30, gt=0)
+    max_body_bytes: int = Field(1 << 20, gt=0)
+    quota_bytes: int | None = Field(None, ge=0)
+    quota_datasets: int | None = Field(None, ge=0)
+    quota_jobs: int | None = Field(None, ge=0)
+    ping_seconds: float = Field(15.0, gt=0)
+    max_streams: int = Field(500, gt=0)
+    pool_size: int = Field(12, gt=1)
+
+    @property
+    def is_private(self) -> bool:
+        """Whether only this machine can reach the service."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    @property
+    def quota(self) -> Quota:
+        """What an owner may take who has no limits of their own."""
+        return Quota(self.quota_bytes, self.quota_datasets, self.quota_jobs)
+
+    def upload_limits(self) -> UploadLimits:
+        """What the intake takes."""
+        return UploadLimits(max_file_bytes=self.max_upload_bytes, max_archive_bytes=self.max_archive_bytes)
+
+    def check_public(self, has_token: bool) -> None:
+        """Refuse to be reached from elsewhere by everybody.
+
+        Raises:
+            ConfigError: the address is public and nobody has a token.
+        """
+        if not self.is_private and not has_token and self.token is None:
+            raise ConfigError(
+                f"{self.host} can be reached from other machines, so a token is needed: set {PREFIX}TOKEN, "
+                "or make one with octasplat token create, or listen at 127.0.0.1."
+            )

@@ -1,0 +1,52 @@
+"""What all requests share."""
+
+import time
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from service.hub import EventHub
+from service.metrics import Metrics
+from service.settings import ServiceSettings
+from workers.queue.database import Pool
+from workers.queue.port import Slips
+from workers.storage.protocol import Storage
+
+
+@dataclass
+class Service:
+    """The service while it runs.
+
+    Attributes:
+        settings: its settings.
+        pool: connections to the database.
+        slips: the queue.
+        storage: the store.
+        hub: tells of events.
+        metrics: counts what this process does.
+        has_tokens: whether anybody has a token, as of ``tokens_seen``.
+        tokens_seen: monotonic time.
+        draining: whether it is about to stop.
+        started: monotonic time.
+    """
+
+    settings: ServiceSettings
+    pool: Pool
+    slips: Slips
+    storage: Storage
+    hub: EventHub
+    metrics: Metrics = field(default_factory=Metrics)
+    has_tokens: bool = True
+    tokens_seen: float = -1e9
+    draining: bool = False
+    started: float = field(default_factory=time.monotonic)
+
+
+def service_of(request: Request) -> Service:
+    """The service that a request has reached."""
+    service: Service = request.app.state.service
+    return service
+
+
+ServiceDep = Annotated[Service, Depends(service_of)]

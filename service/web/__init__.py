@@ -1,0 +1,14 @@
+"""The web page: rendered here, with htmx, uPlot and a viewer on three.js that come along as static files."""
+
+from fastapi import FastAPI
+
+
+def mount_pages(app: FastAPI) -> None:
+    """Add the pages and their static files to the application."""
+    from service.web import api_page, pages, session
+    from service.web.assets import Assets
+
+    app.include_router(session.router)
+    app.include_router(pages.router)
+    app.include_router(api_page.router)
+    app.mount("/static", Assets(), name="static")

@@ -1,0 +1,105 @@
+"""The API described on a page, from its OpenAPI document."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+
+from service.web.routing import PageRoute
+from service.web.templating import page
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+
+_METHODS = ("get", "post", "put", "patch", "delete")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter: where it goes, its name, what it is and whether it must be given."""
+
+    place: str
+    name: str
+    kind: str
+    text: str
+    required: bool
+
+
+@dataclass(frozen=True)
+class Operation:
+    """One thing that can be asked for.
+
+    Attributes:
+        method: of HTTP.
+        path: with its parameters in braces.
+        text: what it does.
+        parameters: of path, query and header.
+        body: media types of what is sent.
+        answers: what each status means.
+    """
+
+    method: str
+    path: str
+    text: str
+    parameters: list[Parameter]
+    body: list[str]
+    answers: list[tuple[str, str]]
+
+
+@dataclass
+class Group:
+    """Operations that belong together."""
+
+    name: str
+    operations: list[Operation] = field(default_factory=list)
+
+
+@router.get("/docs")
+async def show_api(request: Request) -> Response:
+    """The API."""
+    document = request.app.openapi()
+    return page(request, "api.html", groups=groups_of(document), info=document["info"])
+
+
+def groups_of(document: Mapping[str, Any]) -> list[Group]:
+    """All operations of an OpenAPI document, by their first tag."""
+    groups: dict[str, Group] = {}
+    for path, item in document["paths"].items():
+        for method in _METHODS:
+            if method in item:
+                operation = item[method]
+                name = operation.get("tags", ["other"])[0]
+                groups.setdefault(name, Group(name)).operations.append(_operation(method, path, operation))
+    return list(groups.values())
+
+
+def _operation(method: str, path: str, operation: Mapping[str, Any]) -> Operation:
+    return Operation(
+        method.upper(),
+        path,
+        operation.get("description") or operation.get("summary", ""),
+        [
+            Parameter(
+                parameter["in"],
+                parameter["name"],
+                _kind(parameter.get("schema", {})),
+                parameter.get("description", ""),
+                parameter.get("required", False),
+            )
+            for parameter in operation.get("parameters", ())
+            if parameter["in"] != "cookie"
+        ],
+        list(operation.get("requestBody", {}).get("content", {})),
+        [(status, answer.get("description", "")) for status, answer in operation["responses"].items()],
+    )
+
+
+def _kind(schema: Mapping[str, Any]) -> str:
+    """The type of a parameter in a word or two."""
+    if "anyOf" in schema:
+        return " or ".join(_kind(option) for option in schema["anyOf"] if option.get("type") != "null")
+    if "enum" in schema:
+        return " | ".join(map(str, schema["enum"]))
+    if schema.get("type") == "array":
+        return f"list of {_kind(schema.get('items', {}))}"
+    return str(schema.get("format") or schema.get("type", "any"))

@@ -1,0 +1,245 @@
+"""Where the photographs were taken: read from the COLMAP model of a job, for the viewer to start from.
+
+The model was checked by a child process when its dataset was committed, or was written by our own worker.
+Only the heads of its records are read here, with bounds on all of them; numbers that make no sense leave a
+camera out.
+"""
+
+import io
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import IO, Any
+
+import numpy as np
+from jaxtyping import Float64
+
+MAX_CAMERAS = 20_000
+MAX_VIEWS = 400
+"""Views that the viewer offers; of more, every so manieth."""
+_MAX_NAME_BYTES = 4096
+_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
+"""Number of parameters by COLMAP's camera model number."""
+_ONE_FOCAL = frozenset({0, 2, 3, 8, 9})
+_ONE_FOCAL_NAMES = frozenset(
+    {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+)
+
+
+class CamerasUnreadable(Exception):
+    """The files are not as expected."""
+
+
+@dataclass(frozen=True)
+class PhotographPose:
+    """A photograph's camera.
+
+    Attributes:
+        name: of the photograph.
+        rotation_cam_from_world: rows are the camera's right, down and forward in the world.
+        centre_world: where it stood.
+        fov_y_degrees: angle from top to bottom.
+        aspect: width over height.
+    """
+
+    name: str
+    rotation_cam_from_world: Float64[np.ndarray, "3 3"]
+    centre_world: Float64[np.ndarray, "3"]
+    fov_y_degrees: float
+    aspect: float
+
+
+def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[PhotographPose]:
+    """The posed photographs of a model, by name.
+
+    Args:
+        cameras: ``cameras.bin`` or ``cameras.txt``.
+        images: ``images.bin`` or ``images.txt``; the observations in it are skipped.
+        binary: which of the two.
+
+    Raises:
+        CamerasUnreadable: the files are cut short or hold something else.
+    """
+    try:
+        optics = _binary_optics(cameras) if binary else _text_optics(cameras)
+        records = _binary_images(images) if binary else _text_images(images)
+        poses = [pose for record in records if (pose := _pose(record, optics)) is not None]
+    except (struct.error, ValueError, UnicodeDecodeError, OverflowError, IndexError, EOFError) as error:
+        raise CamerasUnreadable(str(error)) from None
+    return sorted(poses, key=lambda pose: pose.name)
+
+
+def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) -> dict[str, object]:
+    """What the viewer needs: the up direction, a point to look at, and the views, as JSON values.
+
+    The point is the one nearest to all their optical axes; it
+    is pulled before the cameras where these look the same way and share no such point.
+    """
+    centres = np.stack([pose.centre_world for pose in poses])
+    rotations = np.stack([pose.rotation_cam_from_world for pose in poses])
+    forwards = rotations[:, 2]
+    up = _up(rotations)
+    middle = centres.mean(axis=0)
+    spread = float(np.linalg.norm(centres - middle, axis=1).mean()) or 1.0
+    # Least squares of the distances to the axes; the small term keeps parallel axes solvable.
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    ahead = middle + forwards.mean(axis=0) * spread
+    weight = 1e-3 * len(poses)
+    target = np.linalg.solve(
+        across.sum(axis=0) + weight * np.eye(3),
+        (across @ centres[:, :, None]).sum(axis=0)[:, 0] + weight * ahead,
+    )
+    depth = np.einsum("ij,ij->i", target - centres, forwards)
+    if np.median(depth) < 0.1 * spread:
+        target, depth = ahead, np.einsum("ij,ij->i", ahead - centres, forwards)
+    held = set(held_out)
+    step = -(-len(poses) // MAX_VIEWS)
+    shown = [pose for k, pose in enumerate(poses) if k % step == 0 or pose.name in held][:MAX_VIEWS]
+    return {
+        "up": _numbers(up),
+        "target": _numbers(target),
+        "radius": round(float(np.median(np.linalg.norm(target - centres, axis=1))) or 1.0, 6),
+        "views": [
+            {
+                "name": pose.name,
+                "position": _numbers(pose.centre_world),
+                "forward": _numbers(pose.rotation_cam_from_world[2]),
+                "up": _numbers(-pose.rotation_cam_from_world[1]),
+                "fov_y_degrees": round(pose.fov_y_degrees, 4),
+                "aspect": round(pose.aspect, 5),
+                "held_out": pose.name in held,
+            }
+            for pose in shown
+        ],
+    }
+
+
+def _up(rotations_cam_from_world: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, " 3"]:
+    """The direction against gravity.
+
+    People tilt cameras up and down but seldom roll them, so it is the direction that is closest to square to
+    what all cameras have to their right; a little of their mean up decides where that leaves a choice.
+    """
+    rights, ups = rotations_cam_from_world[:, 0], -rotations_cam_from_world[:, 1]
+    mean = ups.mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    if length < 1e-3:
+        return np.array([0.0, -1.0, 0.0])  # COLMAP's y points down
+    mean = mean / length
+    spread = rights.T @ rights / len(rights) + 0.01 * (np.eye(3) - np.outer(mean, mean))
+    up = np.linalg.eigh(spread)[1][:, 0]
+    agreement = float(up @ mean)
+    return np.asarray(up * np.sign(agreement) if abs(agreement) > 0.5 else mean)
+
+
+@dataclass(frozen=True)
+class _Optics:
+    fov_y_degrees: float
+    aspect: float
+
+
+_Record = tuple[list[float], int, str]
+"""Seven numbers of the pose, the camera's id, the name."""
+
+
+def _optics(width: float, height: float, fy: float) -> _Optics | None:
+    if not (width > 0 and height > 0 and fy > 0 and np.isfinite([width, height, fy]).all()):
+        return None
+    return _Optics(float(np.degrees(2 * np.arctan(height / (2 * fy)))), width / height)
+
+
+def _pose(record: _Record, optics: dict[int, _Optics]) -> PhotographPose | None:
+    numbers, camera_id, name = record
+    quat_wxyz, translation = np.array(numbers[:4]), np.array(numbers[4:7])
+    length = np.linalg.norm(quat_wxyz)
+    seen = optics.get(camera_id)
+    if seen is None or not np.isfinite(numbers).all() or length < 1e-6:
+        return None
+    w, x, y, z = quat_wxyz / length
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return PhotographPose(name, rotation, -rotation.T @ translation, seen.fov_y_degrees, seen.aspect)
+
+
+def _binary_optics(file: IO[bytes]) -> dict[int, _Optics]:
+    (count,) = _unpack(file, "<Q")
+    _check_count(count)
+    optics = {}
+    for _ in range(count):
+        camera_id, model, width, height = _unpack(file, "<iiQQ")
+        if model not in _PARAMETERS:
+            raise ValueError(f"camera model {model}")
+        parameters = _unpack(file, f"<{_PARAMETERS[model]}d")
+        found = _optics(width, height, parameters[0 if model in _ONE_FOCAL else 1])
+        if found is not None:
+            optics[camera_id] = found
+    return optics
+
+
+def _binary_images(file: IO[bytes]) -> Iterator[_Record]:
+    (count,) = _unpack(file, "<Q")
+    _check_count(count)
+    for _ in range(count):
+        _, *numbers, camera_id = _unpack(file, "<i7di")
+        name = bytearray()
+        while (letter := _exactly(file, 1)) != b"\0":
+            name += letter
+            if len(name) > _MAX_NAME_BYTES:
+                raise ValueError("a name without end")
+        (points,) = _unpack(file, "<Q")
+        file.seek(24 * points, io.SEEK_CUR)
+        yield [float(number) for number in numbers], camera_id, name.decode()
+
+
+def _text_optics(file: IO[bytes]) -> dict[int, _Optics]:
+    optics = {}
+    for line in _text_lines(file):
+        words = line.split()
+        if not words:
+            continue
+        parameters = [float(word) for word in words[4:]]
+        fy = parameters[0 if words[1] in _ONE_FOCAL_NAMES else 1]
+        found = _optics(float(words[2]), float(words[3]), fy)
+        if found is not None:
+            optics[int(words[0])] = found
+        _check_count(len(optics))
+    return optics
+
+
+def _text_images(file: IO[bytes]) -> Iterator[_Record]:
+    lines = _text_lines(file)
+    for line in lines:
+        words = line.split(maxsplit=9)
+        if not words:
+            continue
+        yield [float(word) for word in words[1:8]], int(words[8]), words[9].strip()
+        next(lines, "")  # its observations
+
+
+def _text_lines(file: IO[bytes]) -> Iterator[str]:
+    return (line for raw in file if not (line := raw.decode()).startswith("#"))
+
+
+def _unpack(file: IO[bytes], layout: str) -> tuple[Any, ...]:
+    return struct.unpack(layout, _exactly(file, struct.calcsize(layout)))
+
+
+def _exactly(file: IO[bytes], count: int) -> bytes:
+    data = file.read(count)
+    if len(data) < count:
+        raise EOFError("it ends too early")
+    return data
+
+
+def _check_count(count: float) -> None:
+    if count > MAX_CAMERAS:
+        raise ValueError(f"{count} records")
+
+
+def _numbers(values: Float64[np.ndarray, " n"]) -> list[float]:
+    return [round(float(value), 6) for value in values]

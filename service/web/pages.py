@@ -1,0 +1,262 @@
+"""The pages: jobs, one job with its result, a new job; and the parts of them that renew themselves."""
+
+import asyncio
+import json
+import uuid
+from pathlib import PurePosixPath
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import HTMLResponse, JSONResponse
+
+from service.auth import Principal, Reader, Writer
+from service.downloads import send_blob
+from service.paging import read_id_cursor, write_cursor
+from service.problems import not_found
+from service.routes import jobs as api
+from service.schemas import JobChange, RetryRequest
+from service.state import Service, ServiceDep
+from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
+from service.web.forms import options_form
+from service.web.reading import JobDetail, job_counts, job_detail, job_lines
+from service.web.results import (
+    CONFIG,
+    HELD_OUT,
+    METRICS,
+    REPORT,
+    SCENE,
+    downloads,
+    measured,
+    read_json,
+    read_names,
+)
+from service.web.routing import PageRoute, go_to, is_part
+from service.web.templating import page
+from workers.kinds import job_kinds, kind_named
+from workers.queue.database import Connection
+from workers.queue.datasets import files_of, list_datasets
+from workers.queue.jobs import artifacts_of, get_artifact
+from workers.queue.rows import Artifact, DatasetFile
+from workers.queue.workers import live_workers
+from workers.storage.errors import StorageError
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+
+PAGE_LENGTH = 30
+MAX_DATASETS = 50
+Shown = Literal["all", "active", "done", "failed"]
+Cursor = Annotated[str | None, Query(max_length=200)]
+
+# The report brings its script along: it runs, but as nobody, and can reach nothing.
+_REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
+
+
+@router.get("/")
+async def show_jobs(
+    request: Request, who: Reader, service: ServiceDep, show: Shown = "all", cursor: Cursor = None
+) -> Response:
+    """The list of jobs."""
+    values = await _list_values(service, who, show, cursor)
+    return page(request, "jobs.html", who, **values)
+
+
+@router.get("/parts/jobs")
+async def show_job_list(
+    request: Request, who: Reader, service: ServiceDep, show: Shown = "all", cursor: Cursor = None
+) -> Response:
+    """The list alone."""
+    return page(request, "_jobs.html", who, **await _list_values(service, who, show, cursor))
+
+
+@router.get("/jobs/{job_id}")
+async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
+    """A job: how it fares, and its result once it has one."""
+    detail = await job_detail(service, who, job_id)
+    async with service.pool.connection() as connection:
+        artifacts = await artifacts_of(connection, job_id)
+        photographs = await _photographs(connection, detail)
+    by_name = {row.name: row for row in artifacts}
+    metrics, config = await asyncio.to_thread(
+        lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)]
+    )
+    preview = detail.line.job.preview or {}
+    shown = f"images/{preview.get('view')}"
+    extra = [kind for kind in job_kinds() if kind.needs == "result" and _fits(kind.source_files, by_name)]
+    return page(
+        request,
+        "job.html",
+        who,
+        detail=detail,
+        measured=measured(metrics, artifacts, photographs),
+        groups=downloads(artifacts),
+        scene=by_name.get(SCENE),
+        report=by_name.get(REPORT),
+        video=next((row for row in artifacts if row.media_type == "video/mp4"), None),
+        q=_octagon_q(config),
+        background=config.get("reconstruction", {}).get("evaluate_background", "black"),
+        photograph=shown if any(file.path == shown for file in photographs) else None,
+        further=[options_form(kind) for kind in extra] if who.may("write") else [],
+    )
+
+
+@router.get("/parts/jobs/{job_id}")
+async def show_job_status(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
+    """How a job fares."""
+    return page(request, "_status.html", who, detail=await job_detail(service, who, job_id))
+
+
+@router.get("/jobs/{job_id}/report")
+async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
+    """The report of a job as a page."""
+    async with service.pool.connection() as connection:
+        await api.owned_job(connection, who, job_id)
+        row = await get_artifact(connection, job_id, REPORT)
+    if row is None:
+        raise not_found("report")
+    response = await asyncio.to_thread(
+        lambda: send_blob(
+            service, request, sha256=row.sha256, size_bytes=row.size_bytes, media_type="text/html",
+            name=REPORT, inline=True,
+        )
+    )  # fmt: skip
+    response.headers["Content-Security-Policy"] = _REPORT_POLICY
+    return response
+
+
+@router.get("/jobs/{job_id}/cameras.json")
+async def get_cameras(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> JSONResponse:
+    """Where the photographs of a job were taken, for the viewer."""
+    async with service.pool.connection() as connection:
+        job = await api.owned_job(connection, who, job_id)
+        artifacts = await artifacts_of(connection, job_id)
+        files = await files_of(connection, job.dataset_id) if job.dataset_id else []
+    held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
+    content = await asyncio.to_thread(_cameras, service, artifacts, files, held_out)
+    headers = {"Cache-Control": "private, max-age=300"}
+    return JSONResponse(content, headers=headers)
+
+
+@router.get("/new")
+async def show_new(
+    request: Request, who: Writer, service: ServiceDep, dataset: uuid.UUID | None = None
+) -> Response:
+    """Send photographs and queue their reconstruction."""
+    async with service.pool.connection() as connection:
+        datasets = await list_datasets(connection, owner=who.sees, limit=MAX_DATASETS)
+        workers = await live_workers(connection, service.settings.stale_seconds)
+    return page(
+        request,
+        "new.html",
+        who,
+        form=options_form(kind_named("reconstruct")),
+        datasets=[row for row in datasets if row.state == "committed"],
+        chosen=dataset,
+        queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),
+        max_file_bytes=service.settings.max_upload_bytes,
+        max_archive_bytes=service.settings.max_archive_bytes,
+    )
+
+
+@router.post("/jobs/{job_id}/cancel")
+async def cancel(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
+    """Stop a job."""
+    await api.cancel_job(job_id, who, service, Response())
+    return await _after(request, job_id, who, service)
+
+
+@router.post("/jobs/{job_id}/retry")
+async def retry(
+    request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep,
+    start: Literal["checkpoint", "start"] = "checkpoint",
+) -> Response:  # fmt: skip
+    """Queue a job again."""
+    await api.retry_job(job_id, who, service, Response(), RetryRequest(start=start))
+    return await _after(request, job_id, who, service)
+
+
+@router.post("/jobs/{job_id}/pin")
+async def pin(
+    request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep, keep: bool = True
+) -> Response:
+    """Keep a job whatever its age, or no longer."""
+    await api.change_job(job_id, JobChange(pinned=keep), who, service, request)
+    return await _after(request, job_id, who, service)
+
+
+@router.post("/jobs/{job_id}/delete")
+async def delete(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
+    """Delete a job with its results."""
+    await api.delete_job(job_id, who, service, Response())
+    return go_to(request, "/")
+
+
+async def _after(request: Request, job_id: uuid.UUID, who: Principal, service: Service) -> Response:
+    """What has changed on the page that asked."""
+    if not is_part(request):
+        return go_to(request, f"/jobs/{job_id}")
+    if request.query_params.get("in") == "list":
+        return Response(status_code=200, headers={"HX-Reswap": "none", "HX-Trigger": "jobs-changed"})
+    detail = await job_detail(service, who, job_id)
+    response: HTMLResponse = page(request, "_status.html", who, detail=detail)
+    response.headers["HX-Trigger"] = json.dumps({"job-changed": {"state": detail.line.job.state}})
+    return response
+
+
+async def _list_values(service: Service, who: Principal, show: Shown, cursor: str | None) -> dict[str, Any]:
+    lines = await job_lines(service, who, show, read_id_cursor(cursor), PAGE_LENGTH + 1)
+    return {
+        "lines": lines[:PAGE_LENGTH],
+        "next": write_cursor(str(lines[PAGE_LENGTH - 1].job.id)) if len(lines) > PAGE_LENGTH else None,
+        "counts": await job_counts(service, who),
+        "show": show,
+        "cursor": cursor,
+    }
+
+
+async def _photographs(connection: Connection, detail: JobDetail) -> list[DatasetFile]:
+    return await files_of(connection, detail.dataset.id) if detail.dataset is not None else []
+
+
+def _fits(source_files: tuple[str, ...], names: dict[str, Artifact]) -> bool:
+    return not source_files or source_files[0] in names
+
+
+def _octagon_q(config: dict[str, object]) -> float | None:
+    found: object = config
+    for key in ("reconstruction", "train", "trace", "q"):
+        found = found.get(key) if isinstance(found, dict) else None
+    return float(found) if isinstance(found, int | float) and found > 0 else None
+
+
+def _cameras(
+    service: Service, artifacts: list[Artifact], files: list[DatasetFile], held_out: Artifact | None
+) -> dict[str, object]:
+    """The cameras of the poses that the job found, or else of its dataset; none where there is no model."""
+    found = {PurePosixPath(row.name).name: row.sha256 for row in artifacts if row.name.startswith("poses/")}
+    if not found:
+        found = {name: row.sha256 for name, row in _model(files).items()}
+    names = read_names(service.storage, held_out)
+    for suffix in (".bin", ".txt"):
+        if f"cameras{suffix}" not in found or f"images{suffix}" not in found:
+            continue
+        try:
+            with (
+                service.storage.open(found[f"cameras{suffix}"]) as cameras,
+                service.storage.open(found[f"images{suffix}"]) as images,
+            ):
+                poses = read_poses(cameras, images, binary=suffix == ".bin")
+        except (CamerasUnreadable, StorageError):
+            break
+        if poses:
+            return viewer_cameras(poses, names)
+    return {"views": []}
+
+
+def _model(files: list[DatasetFile]) -> dict[str, DatasetFile]:
+    from service.intake.layout import model_files
+
+    by_path = {file.path: file for file in files}
+    return {part: by_path[path] for part, path in model_files(list(by_path)).items()}

@@ -1,0 +1,220 @@
+"""What the pages show of jobs, gathered from the tables and the store."""
+
+import asyncio
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from psycopg.rows import class_row
+
+from service.auth import Principal
+from service.routes.jobs import owned_job, stages_of
+from service.schemas import JobView
+from service.state import Service
+from service.web.results import METRICS, mean_psnr, read_json
+from service.web.templating import short_id
+from workers.queue import jobs as rows
+from workers.queue.database import Connection
+from workers.queue.datasets import get_dataset
+from workers.queue.rows import Artifact, Dataset, Job, JobEvent, JobState
+
+ACTIVE: tuple[JobState, ...] = ("queued", "running", "canceling")
+SHOWN: dict[str, tuple[JobState, ...]] = {
+    "all": (),
+    "active": ACTIVE,
+    "done": ("succeeded",),
+    "failed": ("failed", "canceled"),
+}
+_MAX_EVENTS = 400
+
+
+@dataclass(frozen=True)
+class JobLine:
+    """A job in the list.
+
+    Attributes:
+        job: the job.
+        name: what people call it.
+        psnr: of the held-out views once there is a result, of the training before, dB.
+        gaussians: how many there are.
+        picture: address of a small picture.
+    """
+
+    job: JobView
+    name: str
+    psnr: float | None
+    gaussians: int | None
+    picture: str | None
+
+
+@dataclass(frozen=True)
+class StageLine:
+    """A stage of a job: ``done``, ``now`` or ``later``, and how long it took."""
+
+    name: str
+    state: str
+    seconds: float | None
+
+
+@dataclass(frozen=True)
+class JobDetail:
+    """A job on its own page."""
+
+    line: JobLine
+    dataset: Dataset | None
+    stages: list[StageLine]
+    notes: list[JobEvent]
+    warnings: list[str]
+
+
+async def job_lines(
+    service: Service, who: Principal, shown: str, before: uuid.UUID | None, limit: int
+) -> list[JobLine]:
+    """The newest jobs, of one kind of state."""
+    async with service.pool.connection() as connection:
+        found = await rows.list_jobs(
+            connection, owner=who.sees, states=SHOWN[shown], before=before, limit=limit
+        )
+        return await _lines(service, connection, found)
+
+
+async def job_counts(service: Service, who: Principal) -> dict[str, int]:
+    """How many jobs there are of each kind of state."""
+    async with service.pool.connection() as connection:
+        cursor = await connection.execute(
+            """
+            SELECT state, count(*) AS n FROM jobs WHERE %(owner)s::text IS NULL OR owner = %(owner)s
+            GROUP BY state
+            """,
+            {"owner": who.sees},
+        )
+        by_state = {row["state"]: row["n"] for row in await cursor.fetchall()}
+    return {
+        name: sum(n for state, n in by_state.items() if not states or state in states)
+        for name, states in SHOWN.items()
+    }
+
+
+async def job_detail(service: Service, who: Principal, job_id: uuid.UUID) -> JobDetail:
+    """A job with what has happened to it.
+
+    Raises:
+        Problem: 404.
+    """
+    async with service.pool.connection() as connection:
+        job = await owned_job(connection, who, job_id)
+        [line] = await _lines(service, connection, [job])
+        dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
+        async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
+            await cursor.execute(
+                """
+                SELECT * FROM job_events
+                WHERE job_id = %s AND kind NOT IN ('progress', 'preview', 'checkpoint')
+                ORDER BY id DESC LIMIT %s
+                """,
+                [job_id, _MAX_EVENTS],
+            )
+            events = (await cursor.fetchall())[::-1]
+    # After a start from nothing, or by another worker, stages are gone through again.
+    current = [event for event in events if event.attempt == job.attempt]
+    spent = {str(e.data.get("stage")): e.data.get("seconds") for e in current if e.kind == "stage_finished"}
+    warnings = [str(e.data.get("message")) for e in events if e.kind == "warning"]
+    if dataset is not None:
+        warnings = [*dataset.facts.get("warnings", ()), *warnings]
+    return JobDetail(
+        line,
+        dataset,
+        _stage_lines(line.job, spent),
+        [event for event in events if event.kind in ("rescued", "handed_back", "resumed")],
+        list(dict.fromkeys(warnings)),
+    )
+
+
+async def _lines(service: Service, connection: Connection, jobs: Sequence[Job]) -> list[JobLine]:
+    ids = [job.id for job in jobs]
+    names = await _dataset_names(connection, jobs)
+    counts = await _gaussian_counts(connection, ids)
+    metrics = await _artifacts(connection, ids, METRICS)
+    renders = await _artifacts(connection, ids, "renders/%.png")
+    contents = await asyncio.to_thread(
+        lambda: {job_id: read_json(service.storage, row) for job_id, row in metrics.items()}
+    )
+    lines = []
+    for job in jobs:
+        view = JobView.of(job, stages_of(job), await rows.queue_position(connection, job))
+        measured = contents.get(job.id, {})
+        gaussians = measured.get("gaussians")
+        psnr = mean_psnr(measured)
+        lines.append(
+            JobLine(
+                view,
+                _name(job, names),
+                job.psnr if psnr is None else psnr,
+                gaussians if isinstance(gaussians, int) else counts.get(job.id),
+                _picture(job, renders.get(job.id)),
+            )
+        )
+    return lines
+
+
+def _name(job: Job, names: dict[uuid.UUID, str]) -> str:
+    named = job.label or (names.get(job.dataset_id) if job.dataset_id else None)
+    if named and job.kind != "reconstruct" and not job.label:
+        return f"{named} · {job.kind}"
+    return named or f"{job.kind} {short_id(job.id)}"
+
+
+def _picture(job: Job, render: Artifact | None) -> str | None:
+    if job.preview is not None:
+        return f"/v1/jobs/{job.id}/preview?step={job.preview.get('step', 0)}"
+    return None if render is None else f"/v1/jobs/{job.id}/artifacts/{render.name}"
+
+
+def _stage_lines(job: JobView, spent: dict[str, Any]) -> list[StageLine]:
+    over = job.state == "succeeded"
+    place = job.stages.index(job.stage) if job.stage in job.stages else -1
+    lines = []
+    for k, name in enumerate(job.stages):
+        state = "done" if over or k < place else "now" if k == place else "later"
+        if state == "now" and job.state not in ACTIVE:
+            state = "stopped"
+        seconds = spent.get(name)
+        lines.append(StageLine(name, state, seconds if isinstance(seconds, int | float) else None))
+    return lines
+
+
+async def _dataset_names(connection: Connection, jobs: Sequence[Job]) -> dict[uuid.UUID, str]:
+    ids = list({job.dataset_id for job in jobs if job.dataset_id is not None})
+    cursor = await connection.execute("SELECT id, name FROM datasets WHERE id = ANY(%s)", [ids])
+    return {row["id"]: row["name"] for row in await cursor.fetchall()}
+
+
+async def _gaussian_counts(connection: Connection, ids: list[uuid.UUID]) -> dict[uuid.UUID, int]:
+    """The newest number of Gaussians that each job has told."""
+    cursor = await connection.execute(
+        """
+        SELECT wanted.id, (
+            SELECT data->'gaussians' FROM job_events
+            WHERE job_id = wanted.id AND kind = 'progress' AND data ? 'gaussians' ORDER BY id DESC LIMIT 1
+        ) AS gaussians
+        FROM unnest(%s::uuid[]) AS wanted(id)
+        """,
+        [ids],
+    )
+    return {
+        row["id"]: row["gaussians"] for row in await cursor.fetchall() if isinstance(row["gaussians"], int)
+    }
+
+
+async def _artifacts(connection: Connection, ids: list[uuid.UUID], like: str) -> dict[uuid.UUID, Artifact]:
+    """The first result of each job whose name fits."""
+    async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
+        await cursor.execute(
+            """
+            SELECT DISTINCT ON (job_id) * FROM artifacts WHERE job_id = ANY(%s) AND name LIKE %s
+            ORDER BY job_id, name
+            """,
+            [ids, like],
+        )
+        return {row.job_id: row for row in await cursor.fetchall()}

@@ -1,0 +1,252 @@
+"""What a finished job has to show: figures, views, downloads and what opens them."""
+
+import json
+import logging
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import PurePosixPath
+from typing import Any, cast
+
+from workers.queue.rows import Artifact, DatasetFile
+from workers.storage.errors import StorageError
+from workers.storage.protocol import Storage
+
+logger = logging.getLogger(__name__)
+
+MAX_JSON_BYTES = 16 << 20
+SCENE, METRICS, REPORT, CONFIG, HELD_OUT = (
+    "scene.ply", "metrics.json", "report.html", "config.json", "held_out.json",
+)  # fmt: skip
+_SHOWN_BY_BROWSERS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp"})
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of merit: its key in ``metrics.json``, and how it is shown."""
+
+    key: str
+    heading: str
+    decimals: int
+    unit: str
+    help: str
+    higher_is_better: bool = True
+
+
+METRIC_LIST = (
+    Metric("psnr", "PSNR", 2, "dB", "Peak signal-to-noise ratio; higher is better"),
+    Metric("ssim", "SSIM", 4, "", "Structural similarity, as 3DGS computes it; higher is better"),
+    Metric("ms_ssim", "MS-SSIM", 4, "", "Structural similarity at several scales; higher is better"),
+    Metric("flip", "FLIP", 4, "", "Perceived difference; lower is better", higher_is_better=False),
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """A held-out view: its figures, its render and its photograph.
+
+    Attributes:
+        name: of the photograph.
+        values: by the key of the metric; None where it could not be measured.
+        render: name of the result that shows it, if there is one.
+        photograph: name in the dataset, if a browser can show it.
+        width: of the render, px.
+        height: of the render, px.
+    """
+
+    name: str
+    values: Mapping[str, float | None]
+    render: str | None
+    photograph: str | None
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What ``metrics.json`` says."""
+
+    columns: tuple[Metric, ...]
+    mean: Mapping[str, float | None]
+    interval: tuple[float, float] | None
+    gaussians: int | None
+    seconds: float | None
+    views: tuple[View, ...]
+
+
+@dataclass(frozen=True)
+class Download:
+    """A result to save, and what opens it."""
+
+    name: str
+    size_bytes: int
+    opens_in: str
+
+
+@dataclass(frozen=True)
+class DownloadGroup:
+    """Downloads that belong together; a folded group opens on request."""
+
+    title: str
+    files: list[Download]
+    folded: bool
+
+    @property
+    def size_bytes(self) -> int:
+        """Length of all of them."""
+        return sum(file.size_bytes for file in self.files)
+
+
+def read_json(storage: Storage, row: Artifact | None) -> dict[str, Any]:
+    """The content of a small JSON result; empty if it cannot be had."""
+    content = _json(storage, row)
+    return content if isinstance(content, dict) else {}
+
+
+def read_names(storage: Storage, row: Artifact | None) -> list[str]:
+    """The names in a small JSON result; none if it cannot be had."""
+    content = _json(storage, row)
+    return [str(name) for name in content] if isinstance(content, list) else []
+
+
+def _json(storage: Storage, row: Artifact | None) -> object:
+    if row is None or row.size_bytes > MAX_JSON_BYTES:
+        return None
+    try:
+        text = _text(cast(Hashable, storage), row.sha256)
+    except StorageError as error:
+        logger.info("%s of job %s cannot be shown: %s", row.name, row.job_id, error)
+        return None
+    try:
+        return json.loads(text)
+    except ValueError:
+        return None
+
+
+@lru_cache(maxsize=256)
+def _text(storage: Hashable, sha256: str) -> bytes:
+    """Contents never change under their digest, so that lists need not read them again."""
+    return b"".join(cast(Storage, storage).read(sha256))
+
+
+def measured(
+    metrics: Mapping[str, Any], artifacts: Sequence[Artifact], photographs: Sequence[DatasetFile]
+) -> Measured | None:
+    """The figures of a result, the worst view first; None if there are none."""
+    mean = _mapping(metrics.get("mean"))
+    rows = {str(name): _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
+    if not mean:
+        return None
+    results = {row.name for row in artifacts}
+    files = {file.path for file in photographs}
+    views = []
+    for name, row in rows.items():
+        render = f"renders/{PurePosixPath(name).with_suffix('.png')}"
+        photograph = f"images/{name}"
+        shown = photograph in files and PurePosixPath(name).suffix.lower() in _SHOWN_BY_BROWSERS
+        views.append(
+            View(
+                name,
+                {metric.key: _number(row.get(metric.key)) for metric in METRIC_LIST},
+                render if render in results else None,
+                photograph if shown else None,
+                int(_number(row.get("width")) or 4),
+                int(_number(row.get("height")) or 3),
+            )
+        )
+    views.sort(key=lambda view: (_or(view.values["psnr"], math.inf), view.name))
+    interval = metrics.get("mean_psnr_ci95")
+    bounds = [_number(bound) for bound in interval] if isinstance(interval, list) else []
+    low, high = bounds if len(bounds) == 2 else (None, None)
+    gaussians = _number(metrics.get("gaussians"))
+    return Measured(
+        tuple(metric for metric in METRIC_LIST if _number(mean.get(metric.key)) is not None),
+        {metric.key: _number(mean.get(metric.key)) for metric in METRIC_LIST},
+        (low, high) if low is not None and high is not None else None,
+        None if gaussians is None else int(gaussians),
+        _number(metrics.get("seconds")),
+        tuple(views),
+    )
+
+
+def mean_psnr(metrics: Mapping[str, Any]) -> float | None:
+    """The mean PSNR of the held-out views, dB."""
+    return _number(_mapping(metrics.get("mean")).get("psnr"))
+
+
+def downloads(artifacts: Sequence[Artifact]) -> list[DownloadGroup]:
+    """The results by what they are for."""
+    groups = {title: DownloadGroup(title, [], folded) for title, folded in _GROUPS.items()}
+    for row in sorted(artifacts, key=lambda row: (_rank(row.name), row.name)):
+        group, opens_in = _use_of(row.name)
+        groups[group].files.append(Download(row.name, row.size_bytes, opens_in))
+    return [group for group in groups.values() if group.files]
+
+
+_SCENE, _FIGURES, _IMAGES, _RECORDS = "Scene and meshes", "Report and figures", "Images", "Records of the run"
+_GROUPS = {_SCENE: False, _FIGURES: False, _IMAGES: True, _RECORDS: True}
+_NAMED = {
+    SCENE: (_SCENE, "SuperSplat, PlayCanvas, Spark, Unity and Unreal splat plug-ins; octasplat itself"),
+    "mesh.ply": (_SCENE, "Blender, MeshLab, CloudCompare: for editing, as it keeps every Gaussian's number"),
+    "mesh_alpha.png": (_SCENE, "the texture that mesh.obj uses"),
+    METRICS: (_FIGURES, "any program that reads JSON"),
+    REPORT: (_FIGURES, "a browser; one file, to keep or to send"),
+    CONFIG: (_RECORDS, "a text editor: every setting of the run"),
+    HELD_OUT: (_RECORDS, "a text editor: the photographs that training never saw"),
+    "events.jsonl": (_RECORDS, "a text editor: what happened when, a line each"),
+    "training.json": (_RECORDS, "a text editor"),
+}
+_SUFFIXES = {
+    ".glb": (
+        _SCENE,
+        "Blender, three.js, model-viewer, any glTF viewer: looks as it should, fall-off included",
+    ),
+    ".obj": (_SCENE, "Blender, MeshLab, most 3D programs: geometry and colours, without opacity"),
+    ".mtl": (_SCENE, "goes with the OBJ of that name"),
+    ".spz": (_SCENE, "Niantic Scaniverse, Spark, PlayCanvas: small, for the web"),
+    ".sog": (_SCENE, "PlayCanvas and SuperSplat: the smallest, for the web"),
+    ".splat": (_SCENE, "web viewers such as antimatter15/splat"),
+    ".usdz": (_SCENE, "OpenUSD 26 and later, as a particle field"),
+    ".usdc": (_SCENE, "OpenUSD 26 and later, as a particle field"),
+    ".usda": (_SCENE, "OpenUSD 26 and later, as a particle field"),
+    ".usd": (_SCENE, "OpenUSD 26 and later, as a particle field"),
+    ".ply": (_SCENE, "splat viewers, if it holds Gaussians; Blender and MeshLab, if it holds a mesh"),
+    ".stl": (_SCENE, "Blender, MeshLab, 3D printing"),
+    ".mp4": (_FIGURES, "any video player or browser"),
+    ".png": (_IMAGES, "any image viewer"),
+    ".exr": (_IMAGES, "Blender, Nuke, DJV: linear colour, depth and normals"),
+    ".bin": (_RECORDS, "COLMAP"),
+    ".txt": (_RECORDS, "COLMAP or a text editor"),
+}
+_OTHER = (_RECORDS, "a text editor")
+
+
+def _use_of(name: str) -> tuple[str, str]:
+    lower = name.lower()
+    if name in _NAMED:
+        return _NAMED[name]
+    if lower.endswith((".splats.glb", "_splats.glb", "-splats.glb")):
+        return _SCENE, "three.js, PlayCanvas, Babylon.js: Gaussians by KHR_gaussian_splatting"
+    if lower.endswith("mesh.ply"):
+        return _NAMED["mesh.ply"]
+    return _SUFFIXES.get(PurePosixPath(lower).suffix, _OTHER)
+
+
+def _rank(name: str) -> int:
+    order = [SCENE, "mesh.glb", "mesh.ply", "mesh.obj", REPORT, METRICS]
+    return order.index(name) if name in order else len(order)
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _number(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value

@@ -1,0 +1,29 @@
+// What every page does: notices, and quiet polling.
+
+export function notify(text, bad = false) {
+    const notice = document.createElement("p");
+    notice.className = bad ? "notice bad" : "notice";
+    notice.textContent = text;
+    document.getElementById("notices").append(notice);
+    setTimeout(() => notice.remove(), bad ? 9000 : 5000);
+}
+
+document.addEventListener("notice", ({ detail }) => notify(detail.text, detail.bad));
+
+// A page that nobody looks at asks for nothing.
+document.addEventListener("htmx:config:request", (event) => {
+    if (document.hidden && event.target.matches("[data-poll]")) event.preventDefault();
+});
+
+let lost = null;
+document.addEventListener("htmx:error", () => {
+    if (lost) return;
+    lost = document.createElement("p");
+    lost.className = "notice bad";
+    lost.textContent = "The service does not answer; trying again.";
+    document.getElementById("notices").append(lost);
+});
+document.addEventListener("htmx:after:swap", () => {
+    lost?.remove();
+    lost = null;
+});

@@ -1,0 +1,84 @@
+// Forms of options: what is filled in becomes the options of a job; what is left empty stays as it is.
+
+import { notify } from "./app.js";
+
+/** The options that a form asks for, nested. */
+export function readOptions(form) {
+    const options = {};
+    for (const field of form.querySelectorAll("[data-path]")) {
+        const value = valueOf(field);
+        if (value === undefined) continue;
+        const path = field.dataset.path.split(".");
+        const last = path.pop();
+        path.reduce((section, name) => (section[name] ??= {}), options)[last] = value;
+    }
+    return options;
+}
+
+function valueOf(field) {
+    if (field.dataset.type === "files") return [...field.querySelectorAll("input:checked")].map((box) => box.value);
+    const text = field.value.trim();
+    if (text === "") return undefined;
+    if (field.dataset.type === "number") return Number(text);
+    if (field.dataset.type === "yes_no") return text === "true";
+    if (field.dataset.type === "list") return text.split(",").map((part) => part.trim()).filter(Boolean);
+    return text;
+}
+
+/** Defaults that depend on the preset follow it. */
+export function followPreset(form) {
+    const preset = form.querySelector("[data-path=preset]");
+    if (!preset) return;
+    const show = () => {
+        const name = preset.value || preset.dataset.default;
+        for (const field of form.querySelectorAll("[data-defaults]:not([data-defaults=''])")) {
+            const text = JSON.parse(field.dataset.defaults)[name] ?? "";
+            if (field.tagName === "SELECT") field.options[0].textContent = `${text || "as is"} (default)`;
+            else field.placeholder = text || "–";
+        }
+    };
+    preset.addEventListener("change", show);
+    show();
+}
+
+/** Queues a job; returns its id. Throws an error whose `faults` are single sentences. */
+export async function queueJob(body, key) {
+    const response = await fetch("/v1/jobs", {
+        method: "POST",
+        headers: { "Content-Type": "application/json", "Idempotency-Key": key },
+        body: JSON.stringify(body),
+    });
+    return (await answer(response)).id;
+}
+
+/** The JSON of an answer, or an error with the problem's words. */
+export async function answer(response) {
+    if (response.ok) return response.json();
+    if (response.status === 401) location.href = `/sign-in?next=${encodeURIComponent(location.pathname)}`;
+    const problem = await response.json().catch(() => ({}));
+    const error = new Error(problem.detail ?? `The service answered ${response.status}.`);
+    error.status = response.status;
+    error.faults = (problem.errors ?? []).map((fault) => {
+        const where = (fault.pointer ?? "").replace(/^#\/options\//, "").replaceAll("/", ".");
+        return problem.type?.endsWith(":options") ? `${where}: ${fault.detail}` : fault.detail;
+    });
+    throw error;
+}
+
+for (const form of document.querySelectorAll("form.options[data-source]")) {
+    form.addEventListener("submit", async (event) => {
+        event.preventDefault();
+        const fault = form.querySelector(".fault"), button = form.querySelector("[type=submit]");
+        button.disabled = true;
+        fault.hidden = true;
+        try {
+            const body = { kind: form.dataset.kind, source_id: form.dataset.source, options: readOptions(form) };
+            location.href = `/jobs/${await queueJob(body, crypto.randomUUID?.() ?? String(Math.random()))}`;
+        } catch (error) {
+            fault.textContent = [error.message, ...(error.faults ?? [])].join(" ");
+            fault.hidden = false;
+            button.disabled = false;
+            notify("It was not queued.", true);
+        }
+    });
+}

@@ -1,0 +1,220 @@
+// The viewer on a job's page: loads the scene, starts from the photographs' cameras, listens to all controls.
+
+import { OrbitControls, PerspectiveCamera, Vector3 } from "../vendor/three.js";
+import { Walking } from "./walking.js";
+import { CHI2_2_99, Sorting, SplatRenderer } from "./splats.js";
+
+const AUTOMATIC_BYTES = 80e6;
+const MAX_PIXEL_RATIO = 2;
+const SLOW_MS = 60;
+const BACKGROUNDS = { black: [0, 0, 0], white: [1, 1, 1] };
+
+class Viewer {
+    constructor(box) {
+        this.box = box;
+        this.canvas = box.querySelector("canvas");
+        this.veil = box.querySelector(".veil");
+        this.place = box.querySelector(".place");
+        this.q = Number(box.dataset.q) || CHI2_2_99;
+        this.background = box.dataset.background in BACKGROUNDS ? box.dataset.background : "black";
+        this.needsFrame = true;
+        this.slow = 0;
+        this.lastFrame = 0;
+        this.view = -1;
+        const button = this.veil.querySelector("button");
+        if (Number(box.dataset.size) <= AUTOMATIC_BYTES && !navigator.connection?.saveData) this.start();
+        else {
+            this.say("");
+            button.hidden = false;
+            button.addEventListener("click", () => { button.hidden = true; this.start(); });
+        }
+    }
+
+    say(text) {
+        this.veil.querySelector(".veil-text").textContent = text;
+    }
+
+    fail(error) {
+        this.veil.hidden = false;
+        this.veil.querySelector("progress").hidden = true;
+        this.say(error.message);
+        this.box.dataset.ready = "failed";
+    }
+
+    async start() {
+        this.say("Loading the scene");
+        try {
+            this.splats = new SplatRenderer(this.canvas);
+        } catch {
+            this.fail(new Error("This browser has no WebGL 2, so the scene cannot be shown here; the downloads open elsewhere."));
+            return;
+        }
+        try {
+            const [scene, cameras] = await Promise.all([this.load(), this.loadCameras()]);
+            this.splats.setScene(scene, this.q);
+            this.setUp(scene, cameras);
+        } catch (error) {
+            this.fail(error);
+        }
+    }
+
+    load() {
+        const bar = this.veil.querySelector("progress");
+        bar.hidden = false;
+        this.worker = new Worker(new URL("./scene_worker.js", import.meta.url), { type: "module" });
+        return new Promise((resolve, reject) => {
+            this.worker.onerror = () => reject(new Error("The scene cannot be loaded."));
+            this.worker.onmessage = ({ data }) => {
+                if (data.scene) resolve(data.scene);
+                else if (data.error) reject(new Error(data.error));
+                else if (data.total) {
+                    bar.max = data.total;
+                    bar.value = data.loaded;
+                    this.say(`Loading the scene: ${(data.loaded / 1e6).toFixed(1)} of ${(data.total / 1e6).toFixed(1)} MB`);
+                }
+            };
+            this.worker.postMessage({ load: new URL(this.box.dataset.scene, location.href).href });
+        });
+    }
+
+    async loadCameras() {
+        try {
+            const response = await fetch(this.box.dataset.cameras);
+            return response.ok ? await response.json() : { views: [] };
+        } catch {
+            return { views: [] };
+        }
+    }
+
+    setUp(scene, cameras) {
+        this.frame = cameras.views.length ? cameras : frameOf(scene);
+        this.camera = new PerspectiveCamera(50, 1, this.frame.radius * 2e-3, this.frame.radius * 1e4);
+        this.camera.up.fromArray(this.frame.up);
+        this.controls = new OrbitControls(this.camera, this.canvas);
+        Object.assign(this.controls, { enableDamping: true, dampingFactor: 0.12, zoomSpeed: 1.2, minDistance: this.frame.radius * 0.01 });
+        this.controls.addEventListener("change", () => this.wake());
+        this.controls.addEventListener("start", () => { this.place.textContent = ""; });
+        this.walking = new Walking(this.canvas, this.camera, this.controls, this.frame.radius, (action) => this.do(action), () => this.wake());
+        this.sorting = new Sorting(this.worker, scene.count, this.q, (order, count) => {
+            this.splats.setOrder(order, count);
+            this.box.dataset.ready = "yes";
+            this.veil.hidden = true;
+            this.wake();
+        });
+        const tools = this.box.querySelector(".tools");
+        tools.hidden = false;
+        tools.addEventListener("click", ({ target }) => target.dataset.do && this.do(target.dataset.do));
+        tools.querySelector("[data-do=previous]").parentElement.hidden = !this.frame.views.length;
+        tools.querySelector("[data-do=full]").hidden = !document.fullscreenEnabled;
+        tools.querySelector(".count").textContent = `${scene.count.toLocaleString("en")} Gaussians`;
+        this.splats.setBackground(...BACKGROUNDS[this.background]);
+        new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
+        this.resize();
+        this.do("reset");
+        this.place.textContent = "";
+        requestAnimationFrame((now) => this.tick(now));
+    }
+
+    do(action) {
+        if (action === "orbit" || action === "fly") {
+            this.walking.setFlying(action === "fly");
+            this.box.querySelectorAll("[data-do=orbit], [data-do=fly]").forEach((button) => button.setAttribute("aria-pressed", String(button.dataset.do === action)));
+        } else if (action === "toggle-fly") this.do(this.walking.flying ? "orbit" : "fly");
+        else if (action === "next" || action === "previous") this.stepView(action === "next" ? 1 : -1);
+        else if (action === "background") {
+            this.background = this.background === "black" ? "white" : "black";
+            this.splats.setBackground(...BACKGROUNDS[this.background]);
+        } else if (action === "full") {
+            if (document.fullscreenElement) document.exitFullscreen();
+            else this.box.requestFullscreen();
+        } else if (action === "reset") {
+            const held = this.frame.views.findIndex((view) => view.held_out);
+            if (this.frame.views.length) this.showView(Math.max(0, held));
+            else this.lookFrom(this.frame.start, new Vector3().fromArray(this.frame.target), 50, 1);
+            this.do("orbit");
+            this.place.textContent = "";
+        }
+        this.wake();
+    }
+
+    stepView(step) {
+        const count = this.frame.views.length;
+        if (count) this.showView((this.view + step + count) % count);
+    }
+
+    showView(index) {
+        const view = this.frame.views[index];
+        this.view = index;
+        const position = new Vector3().fromArray(view.position), forward = new Vector3().fromArray(view.forward);
+        // Turn about what the photograph looks at: the scene's middle, as far along the view as that is.
+        const depth = new Vector3().fromArray(this.frame.target).sub(position).dot(forward);
+        const distance = Math.max(depth, 0.1 * this.frame.radius);
+        this.lookFrom(view.position, position.clone().addScaledVector(forward, distance), view.fov_y_degrees, view.aspect);
+        this.place.textContent = `${view.name}${view.held_out ? " (held out)" : ""}`;
+    }
+
+    lookFrom(position, target, fovY, aspect) {
+        this.camera.position.fromArray(position);
+        this.controls.target.copy(target);
+        this.fovY = Math.min(100, fovY);
+        this.aspect = aspect;
+        this.controls.update();
+        this.resize();
+    }
+
+    resize() {
+        const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
+        if (!width || !height) return;
+        this.splats.setSize(width, height, Math.min(devicePixelRatio, MAX_PIXEL_RATIO));
+        this.camera.aspect = width / height;
+        // The whole photograph fits into the window.
+        const fits = Math.max(1, (this.aspect ?? 1) / this.camera.aspect);
+        this.camera.fov = (360 / Math.PI) * Math.atan(Math.tan(((this.fovY ?? 50) * Math.PI) / 360) * fits);
+        this.camera.updateProjectionMatrix();
+        this.wake();
+    }
+
+    wake() {
+        this.needsFrame = true;
+    }
+
+    /** Draws when something has changed; while that is slow, with fewer pixels. */
+    tick(now) {
+        requestAnimationFrame((next) => this.tick(next));
+        const seconds = Math.min(0.1, (now - this.lastFrame) / 1000);
+        const moves = this.walking.step(seconds);
+        if (!this.walking.flying) this.controls.update();
+        const gap = now - this.lastFrame;
+        this.lastFrame = now;
+        if (!this.needsFrame && !moves) {
+            if (this.splats.scale < 1) {
+                this.splats.scale = 1;
+                this.draw();
+            }
+            return;
+        }
+        this.slow = gap > SLOW_MS ? Math.min(this.slow + 1, 6) : Math.max(this.slow - 0.2, 0);
+        this.splats.scale = this.slow > 3 ? 0.5 : 1;
+        this.draw();
+    }
+
+    draw() {
+        this.needsFrame = false;
+        this.camera.updateMatrixWorld();
+        this.sorting.see(this.camera, this.camera.position.distanceTo(this.controls.target));
+        this.splats.render(this.camera);
+    }
+}
+
+/** Where to look from when the cameras are not known: COLMAP's y is down. */
+function frameOf({ count, geometry }) {
+    const axis = (k) => Float32Array.from({ length: count }, (_, i) => geometry[12 * i + k]).sort();
+    const sorted = [axis(0), axis(1), axis(2)];
+    const at = (share) => sorted.map((values) => values[Math.min(count - 1, Math.floor(share * count))]);
+    const target = at(0.5), low = at(0.1), high = at(0.9);
+    const radius = Math.hypot(...high.map((value, k) => value - low[k])) || 1;
+    return { up: [0, -1, 0], target, radius, views: [], start: [target[0], target[1] - 0.3 * radius, target[2] - 1.4 * radius] };
+}
+
+const box = document.getElementById("viewer");
+if (box) new Viewer(box);

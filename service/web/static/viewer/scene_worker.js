@@ -1,0 +1,68 @@
+// Loads a scene and keeps it in order, beside the page: {load}, then {position, forward, reach, order} again
+// and again; answers are {loaded, total}, {scene}, {order, count} or {error}.
+
+import { readGaussians } from "./ply.js";
+import { makeSorter } from "./sorting.js";
+
+const TRIES = 5;
+let sort = null;
+
+/** All bytes of a file; a download that breaks off goes on where it was. */
+async function download(url, tell) {
+    let pieces = [], loaded = 0, etag = null;
+    for (let attempt = 0; ; attempt++) {
+        try {
+            const headers = loaded > 0 && etag ? { Range: `bytes=${loaded}-`, "If-Range": etag } : {};
+            const response = await fetch(url, { headers });
+            if (!response.ok) throw Object.assign(new Error(`The scene cannot be loaded (status ${response.status}).`), { final: response.status < 500 });
+            if (response.status !== 206) [pieces, loaded] = [[], 0];
+            etag = response.headers.get("etag");
+            const rest = Number(response.headers.get("content-length") ?? NaN);
+            const total = loaded + rest;
+            for (const reader = response.body.getReader(); ;) {
+                const { done, value } = await reader.read();
+                if (done) break;
+                pieces.push(value);
+                loaded += value.length;
+                tell(loaded, total);
+            }
+            if (loaded < total) throw new Error("The connection broke off.");
+            return joined(pieces, loaded);
+        } catch (error) {
+            if (error.final || attempt >= TRIES) throw error;
+            await new Promise((resolve) => setTimeout(resolve, 500 * 2 ** attempt));
+        }
+    }
+}
+
+function joined(pieces, length) {
+    const bytes = new Uint8Array(length);
+    let at = 0;
+    for (const piece of pieces) {
+        bytes.set(piece, at);
+        at += piece.length;
+    }
+    return bytes;
+}
+
+async function load(url) {
+    let told = 0;
+    const bytes = await download(url, (loaded, total) => {
+        if (loaded < total && performance.now() - told < 50) return;
+        told = performance.now();
+        postMessage({ loaded, total });
+    });
+    const scene = readGaussians(bytes);
+    // The sorter keeps its own copy: what is sent to the page is gone from here.
+    sort = makeSorter({ count: scene.count, geometry: scene.geometry.slice(), bounds: scene.bounds.slice() });
+    postMessage({ scene }, [scene.geometry.buffer, scene.harmonics.buffer, scene.bounds.buffer]);
+}
+
+onmessage = ({ data }) => {
+    if (data.load) {
+        load(data.load).catch((error) => postMessage({ error: error.message }));
+        return;
+    }
+    const count = sort(data.position, data.forward, data.reach, data.order);
+    postMessage({ order: data.order, count }, [data.order.buffer]);
+};

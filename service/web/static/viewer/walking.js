@@ -1,0 +1,115 @@
+// Keys, and flying: what OrbitControls leaves out.
+
+import { Vector3 } from "../vendor/three.js";
+
+const TURN_PER_SECOND = 1.1;
+const LOOK_PER_PIXEL = 0.004;
+const ACTIONS = { KeyN: "next", KeyP: "previous", KeyR: "reset", KeyF: "toggle-fly", KeyB: "background" };
+const HELD = new Set(["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Equal", "Minus", "NumpadAdd", "NumpadSubtract"]);
+
+/** Moves a camera by keys, and turns it on the spot by dragging while it flies. */
+export class Walking {
+    constructor(canvas, camera, controls, radius, act, wake) {
+        Object.assign(this, { canvas, camera, controls, radius, wake });
+        this.flying = false;
+        this.keys = new Set();
+        this.fast = false;
+        this.distance = radius;
+        canvas.addEventListener("keydown", (event) => {
+            if (event.ctrlKey || event.metaKey || event.altKey) return;
+            this.fast = event.shiftKey;
+            if (HELD.has(event.code)) {
+                this.keys.add(event.code);
+                event.preventDefault();
+                wake();
+            } else if (event.code in ACTIONS && !event.repeat) act(ACTIONS[event.code]);
+        });
+        canvas.addEventListener("keyup", (event) => {
+            this.fast = event.shiftKey;
+            this.keys.delete(event.code);
+        });
+        canvas.addEventListener("blur", () => this.keys.clear());
+        canvas.addEventListener("pointermove", (event) => this.drag(event));
+        canvas.addEventListener("wheel", (event) => {
+            if (!this.flying) return;
+            event.preventDefault();
+            this.move(new Vector3(0, 0, -Math.sign(event.deltaY)), 0.08 * this.radius);
+        }, { passive: false });
+    }
+
+    setFlying(flying) {
+        if (flying === this.flying) return;
+        this.flying = flying;
+        this.controls.enabled = !flying;
+        if (flying) this.distance = this.camera.position.distanceTo(this.controls.target);
+        else this.aim();
+    }
+
+    /** Puts what orbiting turns about in front of the camera. */
+    aim() {
+        const forward = this.camera.getWorldDirection(new Vector3());
+        this.controls.target.copy(this.camera.position).addScaledVector(forward, this.distance);
+    }
+
+    drag(event) {
+        if (!this.flying || !(event.buttons & 1)) return;
+        this.look(-event.movementX * LOOK_PER_PIXEL, -event.movementY * LOOK_PER_PIXEL);
+        this.wake();
+    }
+
+    /** Turns the camera on the spot: to the left and upwards, radians. */
+    look(left, upwards) {
+        const up = this.camera.up;
+        const forward = this.camera.getWorldDirection(new Vector3());
+        const right = new Vector3().crossVectors(forward, up).normalize();
+        forward.applyAxisAngle(up, left);
+        const tilted = forward.clone().applyAxisAngle(right.applyAxisAngle(up, left), upwards);
+        if (Math.abs(tilted.dot(up)) < 0.995) forward.copy(tilted);
+        this.camera.lookAt(this.camera.position.clone().add(forward));
+        this.aim();
+    }
+
+    /** Turns the camera about the target: to the left and upwards, radians. */
+    orbit(left, upwards) {
+        const { camera, controls } = this;
+        const offset = camera.position.clone().sub(controls.target);
+        const right = new Vector3().crossVectors(offset, camera.up).normalize().negate();
+        offset.applyAxisAngle(camera.up, -left);
+        const tilted = offset.clone().applyAxisAngle(right.applyAxisAngle(camera.up, -left), -upwards);
+        if (Math.abs(tilted.clone().normalize().dot(camera.up)) < 0.995) offset.copy(tilted);
+        camera.position.copy(controls.target).add(offset);
+        camera.lookAt(controls.target);
+    }
+
+    /** Moves camera and target: `where` is to the right, upwards and forward in the camera's frame. */
+    move(where, length) {
+        const forward = this.camera.getWorldDirection(new Vector3());
+        const right = new Vector3().crossVectors(forward, this.camera.up).normalize();
+        const step = right.multiplyScalar(where.x).addScaledVector(this.camera.up, where.y).addScaledVector(forward, where.z).multiplyScalar(length);
+        this.camera.position.add(step);
+        this.controls.target.add(step);
+        this.wake();
+    }
+
+    /** What the held keys do in `seconds`; whether they do anything. */
+    step(seconds) {
+        if (!this.keys.size) return false;
+        const axis = (plus, minus) => (this.keys.has(plus) ? 1 : 0) - (this.keys.has(minus) ? 1 : 0);
+        const speed = this.radius * seconds * (this.fast ? 2 : 0.6);
+        const where = new Vector3(axis("KeyD", "KeyA"), axis("KeyE", "KeyQ"), axis("KeyW", "KeyS"));
+        if (where.lengthSq() > 0) this.move(where, speed);
+        const left = axis("ArrowLeft", "ArrowRight") * TURN_PER_SECOND * seconds, upwards = axis("ArrowUp", "ArrowDown") * TURN_PER_SECOND * seconds;
+        if (left || upwards) {
+            if (this.flying) this.look(left, upwards);
+            else this.orbit(left, upwards);
+        }
+        const nearer = axis("Equal", "Minus") + axis("NumpadAdd", "NumpadSubtract");
+        if (nearer && this.flying) this.move(new Vector3(0, 0, nearer), speed);
+        else if (nearer) {
+            const offset = this.camera.position.clone().sub(this.controls.target).multiplyScalar(Math.exp(-nearer * 1.5 * seconds));
+            this.camera.position.copy(this.controls.target).add(offset);
+        }
+        this.wake();
+        return true;
+    }
+}

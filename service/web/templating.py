@@ -1,0 +1,101 @@
+"""Templates, and the headers that every page has."""
+
+import json
+import uuid
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+from fastapi import Request
+from fastapi.responses import HTMLResponse
+
+import engine
+from service.auth import COOKIE, Principal
+from service.web import wording
+
+PAGE_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+        "connect-src 'self'; worker-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    ),
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
+}
+STATE_WORDS = {
+    "queued": "Queued",
+    "running": "Running",
+    "canceling": "Stopping",
+    "succeeded": "Done",
+    "failed": "Failed",
+    "canceled": "Cancelled",
+}
+
+
+def page(
+    request: Request, template: str, who: Principal | None = None, *, status: int = 200, **values: object
+) -> HTMLResponse:
+    """A rendered template.
+
+    Args:
+        request: what it answers.
+        template: file in ``templates/``.
+        who: asks; None where nobody has signed in.
+        status: of the answer.
+        values: what the template shows.
+    """
+    text = (
+        _environment()
+        .get_template(template)
+        .render(
+            who=who,
+            signed_in=COOKIE in request.cookies,
+            path=request.url.path,
+            version=engine.__version__,
+            **values,
+        )
+    )
+    return HTMLResponse(text, status, headers=PAGE_HEADERS)
+
+
+@cache
+def _environment() -> Any:
+    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+    environment = Environment(
+        loader=PackageLoader("service.web"),
+        autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        size=wording.size,
+        duration=wording.duration,
+        thousands=wording.thousands,
+        ago=wording.ago,
+        short=short_id,
+        flat=flattened,
+        words=lambda name: str(name).replace("_", " "),
+    )
+    environment.globals["state_words"] = STATE_WORDS
+    return environment
+
+
+def short_id(job_id: uuid.UUID) -> str:
+    """The end of an id; its beginning is the time, which many share."""
+    return str(job_id)[-6:]
+
+
+def flattened(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Nested settings as dotted names and short texts."""
+    rows: list[tuple[str, str]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            rows += flattened(value, f"{prefix}{key}.")
+        elif isinstance(value, list) and all(isinstance(item, str) for item in value):
+            rows.append((f"{prefix}{key}", ", ".join(value)))
+        else:
+            text = "–" if value is None else value if isinstance(value, str) else json.dumps(value)
+            rows.append((f"{prefix}{key}", text))
+    return rows

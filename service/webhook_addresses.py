@@ -1,0 +1,18 @@
+"""Addresses of webhooks, refused before anything is stored."""
+
+from service.problems import Problem
+from service.state import Service
+from workers.webhooks.addresses import AddressRefused, check_url
+
+
+def check_address(service: Service, url: str, pointer: str = "#/url") -> None:
+    """Refuse an address that messages are not sent to.
+
+    Raises:
+        Problem: 422.
+    """
+    try:
+        check_url(url, service.settings.webhook_hosts)
+    except AddressRefused as error:
+        errors = [{"pointer": pointer, "detail": str(error)}]
+        raise Problem(422, "webhook-address", str(error), errors=errors) from None

@@ -1,0 +1,161 @@
+"""What the API takes and gives about webhooks, with examples."""
+
+import uuid
+from datetime import datetime
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from workers.webhooks.addresses import MAX_URL
+from workers.webhooks.rows import ENDS, Delivery, DeliveryState, Endpoint, EventName
+from workers.webhooks.signing import check_secret
+
+_ID = "01a1fcac-4f59-764b-97e6-1be68502c58f"
+_TIME = "2026-11-21T05:55:13.369313Z"
+_SECRET = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSwMfKQ9r8GKYo="  # noqa: S105 - an example
+
+Secret = Annotated[str, Field(max_length=200), AfterValidator(check_secret)]
+Url = Annotated[str, Field(min_length=1, max_length=MAX_URL)]
+Events = Annotated[list[EventName], Field(min_length=1, max_length=6)]
+
+
+class JobWebhook(BaseModel):
+    """Where to tell of one job."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    url: Url
+    secret: Secret = Field(
+        description="`whsec_` and the base64 of 24 to 64 random bytes; signs the messages."
+    )
+    events: Events = list(ENDS)
+
+
+class NewWebhook(BaseModel):
+    """Where to tell of jobs."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"url": "https://example.org/hook", "events": ["job.succeeded"]}]},
+    )
+
+    url: Url = Field(description="https, port 443 or 8443, reachable from everywhere.")
+    events: Events = Field(list(ENDS), description="By default the ends of jobs.")
+    job_id: uuid.UUID | None = Field(None, description="Tell of this job only.")
+    secret: Secret | None = Field(None, description="By default one is made.")
+
+
+class WebhookChange(BaseModel):
+    """What may be changed of a webhook."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"enabled": True}]})
+
+    url: Url | None = None
+    events: Events | None = None
+    secret: Secret | None = None
+    enabled: bool | None = None
+
+
+class WebhookView(BaseModel):
+    """Where somebody is told of jobs."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": _ID,
+                    "url": "https://example.org/hook",
+                    "events": ["job.succeeded", "job.failed", "job.canceled"],
+                    "job_id": None,
+                    "enabled": True,
+                    "disabled_reason": None,
+                    "created_at": _TIME,
+                }
+            ]
+        }
+    )
+
+    id: uuid.UUID
+    url: str
+    events: list[str]
+    job_id: uuid.UUID | None
+    enabled: bool
+    disabled_reason: str | None
+    created_at: datetime
+
+    @classmethod
+    def of(cls, row: Endpoint) -> "WebhookView":
+        """From its row."""
+        return cls.model_validate(row, from_attributes=True)
+
+
+class MadeWebhook(WebhookView):
+    """A new webhook; its secret is shown this once."""
+
+    secret: str
+
+
+class WebhookPage(BaseModel):
+    """A part of the list of webhooks."""
+
+    webhooks: list[WebhookView]
+    next: str | None
+
+
+class DeliveryView(BaseModel):
+    """A message and what became of it. What the address answered is not shown."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": _ID,
+                    "message_id": "msg_01a1fcac4f59764b97e61be68502c58f",
+                    "kind": "job.succeeded",
+                    "payload": {
+                        "type": "job.succeeded",
+                        "timestamp": _TIME,
+                        "data": {
+                            "job_id": _ID,
+                            "kind": "reconstruct",
+                            "label": None,
+                            "state": "succeeded",
+                            "attempt": 1,
+                        },
+                    },
+                    "state": "delivered",
+                    "tries": 1,
+                    "due_at": None,
+                    "status": 200,
+                    "error": None,
+                    "created_at": _TIME,
+                    "tried_at": _TIME,
+                }
+            ]
+        }
+    )
+
+    id: uuid.UUID
+    message_id: str = Field(description="The header webhook-id; the same at every try.")
+    kind: str
+    payload: dict[str, Any]
+    state: DeliveryState
+    tries: int
+    due_at: datetime | None = Field(description="When it is sent next.")
+    status: int | None = Field(description="HTTP status of the last try.")
+    error: str | None
+    created_at: datetime
+    tried_at: datetime | None
+
+    @classmethod
+    def of(cls, row: Delivery) -> "DeliveryView":
+        """From its row."""
+        values = {name: getattr(row, name) for name in cls.model_fields if name != "message_id"}
+        values["due_at"] = row.due_at if row.state == "pending" else None
+        return cls(**values, message_id=f"msg_{row.id.hex}")
+
+
+class DeliveryList(BaseModel):
+    """The newest messages of a webhook."""
+
+    deliveries: list[DeliveryView]

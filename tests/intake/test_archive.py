@@ -1,0 +1,483 @@
+"""Archives: the good ones come out whole, each kind of bad one is refused for its own reason."""
+
+import io
+import os
+import shutil
+import stat
+import struct
+import subprocess
+import tarfile
+import time
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from zip_builder import Member, build, deflated
+
+from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
+from service.intake.faults import IntakeRefused
+from workers.storage.local import LocalStorage
+from workers.storage.protocol import Blob
+
+PHOTO = b"\xff\xd8\xff\xe0 not much of a photograph " * 40
+MODEL = struct.pack("<Q", 0x088B1F) + bytes(300)  # a count that looks like gzip
+LIMITS = ArchiveLimits()
+
+
+def good(name: str = "images/a.jpg") -> Member:
+    return Member(name, PHOTO)
+
+
+def take(data: bytes, storage: LocalStorage, limits: ArchiveLimits = LIMITS) -> dict[str, bytes]:
+    listing = list_archive(io.BytesIO(data), limits)
+    found: dict[str, str] = {}
+
+    def on_file(file: ArchiveFile, blob: Blob) -> None:
+        found[file.name] = blob.sha256
+
+    unpack_archive(io.BytesIO(data), listing, lambda file: storage.begin(max_bytes=file.size_bytes), on_file)
+    return {name: b"".join(storage.read(sha256)) for name, sha256 in found.items()}
+
+
+def refusal(data: bytes, storage: LocalStorage, limits: ArchiveLimits = LIMITS) -> str:
+    with pytest.raises(IntakeRefused) as caught:
+        take(data, storage, limits)
+    assert str(caught.value).endswith(".")
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+    assert storage.sweep(-60) == 0  # nothing half-written is left
+    return caught.value.code
+
+
+def written_by_zipfile(stream: bool, **files: bytes) -> bytes:
+    class Pipe(io.RawIOBase):
+        """Cannot seek, so that zipfile writes descriptors."""
+
+        def __init__(self) -> None:
+            self.data = bytearray()
+
+        def writable(self) -> bool:
+            return True
+
+        def write(self, data: object) -> int:
+            self.data += bytes(data)  # type: ignore[call-overload]
+            return len(bytes(data))  # type: ignore[call-overload]
+
+    target = Pipe() if stream else io.BytesIO()
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:  # type: ignore[call-overload]
+        archive.mkdir("images") if hasattr(archive, "mkdir") and not stream else None
+        for name, data in files.items():
+            with archive.open(name, "w", force_zip64=stream) as handle:
+                handle.write(data)
+    return bytes(target.data) if isinstance(target, Pipe) else target.getvalue()
+
+
+@pytest.mark.parametrize("stream", [False, True])
+def test_archives_of_zipfile(local_storage: LocalStorage, stream: bool) -> None:
+    files = {
+        "images/a.jpg": PHOTO,
+        "images/ä/ü.jpg": b"\xff\xd8\xff" + os.urandom(3_000_000),
+        "images/empty.png": b"",
+        "masks/a.jpg.png": b"mask",
+        "sparse/0/points3D.bin": MODEL,
+    }
+    assert take(written_by_zipfile(stream, **files), local_storage) == files
+
+
+def test_everything_may_lie_in_one_folder_beside_clutter(local_storage: LocalStorage) -> None:
+    data = build(
+        Member("fox/", mode=0o40755),
+        good("fox/images/a.jpg"),
+        Member("fox/images/.DS_Store", b"x"),
+        Member("__MACOSX/fox/images/._a.jpg", b"x"),
+        Member("fox/README.md", b"x"),
+        Member("fox/sparse/0/cameras.bin", MODEL),
+    )
+    listing = list_archive(io.BytesIO(data))
+    assert listing.folder == "fox/"
+    assert set(listing.left_out) == {
+        "fox/images/.DS_Store", "__MACOSX/fox/images/._a.jpg", "fox/README.md",
+    }  # fmt: skip
+    assert set(take(data, local_storage)) == {"images/a.jpg", "sparse/0/cameras.bin"}
+
+
+def test_descriptors_with_and_without_signature(local_storage: LocalStorage) -> None:
+    packed = deflated(PHOTO)
+    plain = struct.pack("<3I", zlib.crc32(PHOTO), len(packed), len(PHOTO))
+    for descriptor in (plain, b"PK\x07\x08" + plain):
+        member = replace(good(), flags=0x808, descriptor=descriptor, local={"crc": 0, "packed": 0, "size": 0})
+        assert take(build(member, good("images/b.jpg")), local_storage)["images/a.jpg"] == PHOTO
+
+
+def test_a_comment_is_harmless(local_storage: LocalStorage) -> None:
+    assert take(build(good(), comment=b"0123456789abcdef" * 2), local_storage) == {"images/a.jpg": PHOTO}
+
+
+NAMES = {
+    "../evil.jpg": "name-traversal",
+    "images/../../evil.jpg": "name-traversal",
+    "images/./a.jpg": "name-traversal",
+    "/etc/passwd": "name-absolute",
+    "C:\\evil.jpg": "name-backslash",
+    "C:/evil.jpg": "name-drive",
+    "c:evil.jpg": "name-drive",
+    "\\\\server\\share\\a.jpg": "name-unc",
+    "//server/share/a.jpg": "name-unc",
+    "images\\a.jpg": "name-backslash",
+    "images/a\0.jpg": "name-nul",
+    "images/a\n.jpg": "name-control",
+    "images/a\u202egpj.exe": "name-control",
+    "images/a\u200b.jpg": "name-control",
+    "images/CON": "name-reserved",
+    "images/con.jpg": "name-reserved",
+    "images/Lpt1.tar.jpg": "name-reserved",
+    "images/aux /a.jpg": "name-trailing",
+    "NUL/a.jpg": "name-reserved",
+    "images/COM\u00b9.jpg": "name-reserved",
+    "images/a.jpg.": "name-trailing",
+    "images/a.jpg ": "name-trailing",
+    "images/ a.jpg": "name-trailing",
+    "images./a.jpg": "name-trailing",
+    "images//a.jpg": "name-empty-part",
+    "images/a.jpg:stream": "name-character",
+    "images/a?.jpg": "name-character",
+    "images/" + "a" * 300 + ".jpg": "name-too-long",
+    "images/" + "a/" * 40 + "a.jpg": "name-too-deep",
+    "a" * 50_000: "name-too-long",
+    "": "name-empty",
+    "/": "name-empty",
+    "images/\ud800.jpg": "name-not-text",
+}
+
+
+@pytest.mark.parametrize(("name", "code"), NAMES.items(), ids=[ascii(name)[:40] for name in NAMES])
+def test_hostile_names(local_storage: LocalStorage, name: str, code: str) -> None:
+    assert refusal(build(good(), Member(name, b"" if name == "/" else PHOTO, mode=0)), local_storage) == code
+    assert list(local_storage.blobs()) == []
+
+
+TWINS = {
+    ("images/a.jpg", "images/a.jpg"): "name-duplicate",
+    ("images/a.jpg", "images/A.JPG"): "name-twin",
+    ("images/\u00e4.jpg", "images/a\u0308.jpg"): "name-twin",
+    ("images/straße.jpg", "images/STRASSE.jpg"): "name-twin",
+    ("images/a.jpg", "Images/b.jpg"): "name-twin",
+    ("images/a.jpg", "images/a.jpg/b.jpg"): "name-conflict",
+    ("images/x/b.jpg", "images/X"): "name-conflict",
+}
+
+
+@pytest.mark.parametrize(("pair", "code"), TWINS.items())
+def test_twins(local_storage: LocalStorage, pair: tuple[str, str], code: str) -> None:
+    assert refusal(build(*(good(name) for name in pair)), local_storage) == code
+
+
+def linked_kinds() -> dict[str, tuple[int, str]]:
+    return {
+        "link": (stat.S_IFLNK | 0o777, "archive-link"),
+        "fifo": (stat.S_IFIFO, "archive-special-file"),
+        "character": (stat.S_IFCHR, "archive-special-file"),
+        "block": (stat.S_IFBLK, "archive-special-file"),
+        "socket": (stat.S_IFSOCK, "archive-special-file"),
+        "folder without slash": (stat.S_IFDIR, "archive-special-file"),
+    }
+
+
+@pytest.mark.parametrize(("mode", "code"), linked_kinds().values(), ids=linked_kinds())
+def test_only_regular_files(local_storage: LocalStorage, mode: int, code: str) -> None:
+    member = Member("images/b.jpg", b"/etc/passwd", mode=mode)
+    assert refusal(build(good(), member), local_storage) == code
+
+
+def field_zip64(*values: int) -> bytes:
+    return struct.pack(f"<2H{len(values)}Q", 1, 8 * len(values), *values)
+
+
+STRUCTURES: dict[str, tuple[Callable[[], bytes], str]] = {
+    "data after the end": (lambda: build(good(), suffix=b"x"), "archive-data-after-end"),
+    "archive after the archive": (
+        lambda: build(good(), suffix=build(good("images/b.jpg"))), "archive-gap",
+    ),
+    "data before the beginning": (lambda: build(good(), prefix=b"PK\3\4#!/bin/sh\n"), "archive-gap"),
+    "gap between entries": (
+        lambda: build(good(), replace(good("images/b.jpg"), before=b"hidden")), "archive-gap",
+    ),
+    "gap before the directory": (lambda: build(good(), gap=b"hidden"), "archive-gap"),
+    "bytes in the directory": (lambda: build(good(), directory_extra=b"hidden"), "archive-gap"),
+    "entry that is not listed": (lambda: unlisted(), "archive-gap"),
+    "end record in the comment": (
+        lambda: build(good(), comment=b"PK\5\6" + bytes(30)), "archive-data-after-end",
+    ),
+    "whole end record in the comment": (
+        lambda: build(good(), comment=struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0, 0, 0, 0, 0)),
+        "archive-gap",
+    ),
+    "another name": (lambda: build(replace(good(), local={"name": b"images/x.jpg"})), "archive-mismatch"),
+    "another method": (lambda: build(replace(good(), local={"method": 0})), "archive-mismatch"),
+    "another length": (lambda: build(replace(good(), local={"size": 3})), "archive-mismatch"),
+    "another packed length": (lambda: build(replace(good(), local={"packed": 3})), "archive-mismatch"),
+    "another checksum": (lambda: build(replace(good(), local={"crc": 3})), "archive-mismatch"),
+    "other flags": (lambda: build(replace(good(), local={"flags": 0x801})), "archive-mismatch"),
+    "no local header": (lambda: build(replace(good(), central={"start": 4})), "archive-mismatch"),
+    "start outside": (lambda: build(replace(good(), central={"start": 2**31})), "archive-mismatch"),
+    "second name": (
+        lambda: build(
+            replace(good(), central_extra=struct.pack("<2HBI", 0x7075, 17, 1, 0) + b"images/x.jpg")
+        ),
+        "archive-second-name",
+    ),
+    "second local name": (
+        lambda: build(replace(good(), local_extra=struct.pack("<2HBI", 0x7075, 17, 1, 0) + b"images/x.jpg")),
+        "archive-second-name",
+    ),
+    "descriptor that lies": (
+        lambda: build(replace(good(), flags=0x808, descriptor=struct.pack("<3I", 1, 2, 3))),
+        "archive-mismatch",
+    ),
+    "descriptor missing": (lambda: build(replace(good(), flags=0x808)), "archive-mismatch"),
+    "overlapping entries": (lambda: overlapping(), "archive-overlap"),
+    "quoted overlap": (lambda: same_data_twice(), "archive-overlap"),
+    "several disks": (lambda: build(good(), end={"disk": 1}), "archive-several-disks"),
+    "entry on another disk": (
+        lambda: build(replace(good(), central={"disk": 3})), "archive-several-disks",
+    ),
+    "too few entries announced": (lambda: build(good(), good("b"), end={"entries": 1}), "archive-gap"),
+    "too many entries announced": (lambda: build(good(), end={"entries": 2}), "archive-damaged"),
+    "needs a newer reader": (
+        lambda: build(replace(good(), central={"version": 64})), "archive-version",
+    ),
+    "needs a newer reader locally": (
+        lambda: build(replace(good(), local={"version": 700})), "archive-version",
+    ),
+    "encrypted": (lambda: build(replace(good(), flags=0x801)), "archive-encrypted"),
+    "unknown method": (lambda: build(replace(good(), method=14)), "archive-method"),
+    "zip64 without lengths": (
+        lambda: build(replace(good(), central={"size": 2**32 - 1})), "archive-damaged",
+    ),
+    "zip64 length that lies": (
+        lambda: build(replace(good(), central={"size": 2**32 - 1}, central_extra=field_zip64(2**50))),
+        "archive-mismatch",
+    ),
+    "cut short": (lambda: build(good())[:-30], "archive-damaged"),
+    "only a head": (lambda: b"PK\3\4", "archive-damaged"),
+    "damaged extra data": (
+        lambda: build(replace(good(), central_extra=b"\1\0\xff\xff..")), "archive-damaged",
+    ),
+    "empty": (lambda: build(), "archive-empty"),
+    "no scene inside": (lambda: build(Member("README.md", b"hello")), "archive-empty"),
+    "folder with a content": (
+        lambda: build(good(), Member("images/x/", b"abcdef", method=0, mode=0)), "archive-mismatch",
+    ),
+    "name in another code": (lambda: build(Member(b"images/\x84.jpg", PHOTO, flags=0)), "name-not-text"),
+    "not an archive": (lambda: PHOTO, "archive-damaged"),
+    "nothing": (lambda: b"", "archive-damaged"),
+}  # fmt: skip
+
+
+def unlisted() -> bytes:
+    """Two entries in the file, one in the list of contents."""
+    both = build(good(), good("images/b.jpg"))
+    first_only = build(good())
+    start = both.index(b"PK\1\2")
+    central = first_only[first_only.index(b"PK\1\2") : first_only.index(b"PK\5\6")]
+    end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 1, 1, len(central), start, 0)
+    return both[:start] + central + end
+
+
+def overlapping() -> bytes:
+    """The first entry reaches over the second, as in the bombs that share one kernel."""
+    inner = build(good("images/b.jpg"))
+    inner = inner[: inner.index(b"PK\1\2")]
+    outer = Member("images/a.jpg", inner, method=0)
+    second = Member("images/b.jpg", PHOTO)
+    data = build(outer, second)
+    start = data.index(inner)
+    body = data[: start + len(inner)]
+    whole = build(outer, replace(second, central={"start": start}))
+    central = whole[whole.index(b"PK\1\2") : whole.index(b"PK\5\6")]
+    return body + central + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 2, 2, len(central), len(body), 0)
+
+
+def same_data_twice() -> bytes:
+    return build(good(), replace(good(), central={"start": 0}))
+
+
+@pytest.mark.parametrize("case", STRUCTURES)
+def test_structures_that_lie(local_storage: LocalStorage, case: str) -> None:
+    make, code = STRUCTURES[case]
+    assert refusal(make(), local_storage) == code
+
+
+def test_two_end_records_are_ambiguous(local_storage: LocalStorage) -> None:
+    first = build(good())
+    hidden = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 1, 1, 0, 0, 0)
+    data = build(replace(good(), central_extra=struct.pack("<2H", 0x9999, len(hidden)) + hidden))
+    assert refusal(data, local_storage) == "archive-ambiguous"
+    assert take(first, local_storage)
+
+
+def test_other_kinds_are_refused_by_name(local_storage: LocalStorage) -> None:
+    target = io.BytesIO()
+    with tarfile.open(fileobj=target, mode="w") as archive:
+        link = tarfile.TarInfo("images/a.jpg")
+        link.type = tarfile.SYMTYPE
+        link.linkname = "/etc/passwd"
+        archive.addfile(link)
+    assert refusal(target.getvalue(), local_storage) == "archive-kind"
+    for head in (b"\x1f\x8b\x08\0", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07\0", b"\xfd7zXZ\0", b"BZh9"):
+        assert refusal(head + bytes(600), local_storage) == "archive-kind"
+
+
+def test_contents_that_lie(local_storage: LocalStorage) -> None:
+    zeros = bytes(600_000)
+    cases = {
+        "archive-bomb": Member("images/a.jpg", PHOTO, packed=deflated(PHOTO + zeros)),
+        "archive-checksum": Member("images/a.jpg", PHOTO, packed=deflated(PHOTO[::-1])),
+        "archive-damaged": Member("images/a.jpg", PHOTO, packed=b"\xff" * 50),
+        "archive-mismatch": Member("images/a.jpg", PHOTO, packed=deflated(PHOTO[:-1])),
+    }
+    for code, member in cases.items():
+        assert refusal(build(member), local_storage) == code
+    more = Member("images/a.jpg", PHOTO, packed=deflated(PHOTO) + b"hidden")
+    assert refusal(build(more), local_storage) == "archive-mismatch"
+    cut = Member("images/a.jpg", PHOTO, packed=deflated(PHOTO)[:-4])
+    assert refusal(build(cut), local_storage) == "archive-mismatch"
+    assert list(local_storage.blobs()) == []
+
+
+def test_bombs(local_storage: LocalStorage) -> None:
+    flat = build(Member("images/a.bmp", bytes(50_000_000)))
+    assert len(flat) < 60_000
+    assert refusal(flat, local_storage) == "archive-ratio"
+    many = build(*(Member(f"images/{i}.bmp", bytes(1_000_000)) for i in range(20)))
+    small = replace(LIMITS, max_total_bytes=10_000_000)
+    assert refusal(many, local_storage, small) == "archive-too-large"
+    one = build(Member("images/a.jpg", os.urandom(2000)))
+    assert refusal(one, local_storage, replace(LIMITS, max_file_bytes=1000)) == "archive-file-too-large"
+    assert list(local_storage.blobs()) == []
+
+
+def test_many_entries_are_refused_before_they_are_read(local_storage: LocalStorage) -> None:
+    entries = [Member(f"images/{i}.jpg", b"", method=0) for i in range(200)]
+    limits = replace(LIMITS, max_entries=199)
+    assert refusal(build(*entries), local_storage, limits) == "archive-too-many-entries"
+    assert len(list_archive(io.BytesIO(build(*entries))).files) == 200
+    long_list = build(good(), directory_extra=bytes(70_000))
+    limits = replace(LIMITS, max_directory_bytes=60_000)
+    assert refusal(long_list, local_storage, limits) == "archive-directory-too-long"
+
+
+def test_a_million_entries_take_no_time(local_storage: LocalStorage) -> None:
+    locator = struct.pack("<4sIQI", b"PK\6\7", 0, 4, 1)
+    end = struct.pack("<4sQ2H2I4Q", b"PK\6\6", 44, 45, 45, 0, 0, 10**6, 10**6, 0, 4)
+    data = b"PK\3\4" + end + locator + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 65535, 65535, 0, 4, 0)
+    began = time.perf_counter()
+    assert refusal(data, local_storage) == "archive-too-many-entries"
+    assert time.perf_counter() - began < 0.5
+
+
+@pytest.mark.parametrize("name", ["images/b.zip", "masks/x.tar.gz", "c.7z", "images/b.jpg"])
+def test_nested_archives(local_storage: LocalStorage, name: str) -> None:
+    inner = Member(name, build(good()), method=0)
+    assert refusal(build(good(), inner), local_storage) == "archive-nested"
+
+
+def test_contents_that_only_look_nested(local_storage: LocalStorage) -> None:
+    data = build(good(), Member("sparse/0/points3D.bin", MODEL))
+    assert take(data, local_storage)["sparse/0/points3D.bin"] == MODEL
+
+
+def test_refusal_from_the_outside_stops(local_storage: LocalStorage) -> None:
+    data = build(good(), good("images/b.jpg"))
+    listing = list_archive(io.BytesIO(data))
+    with pytest.raises(RuntimeError, match="quota"):
+        unpack_archive(io.BytesIO(data), listing, lambda _: local_storage.begin(), _no_quota)
+
+
+def _no_quota(_file: ArchiveFile, _blob: Blob) -> None:
+    raise RuntimeError("quota")
+
+
+SAMPLE = build(
+    good(),
+    replace(
+        good("images/b.jpg"),
+        flags=0x808,
+        descriptor=struct.pack("<3I", zlib.crc32(PHOTO), len(deflated(PHOTO)), len(PHOTO)),
+    ),
+    Member("sparse/0/cameras.txt", b"# cameras\n", method=0),
+    comment=b"hello",
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, len(SAMPLE) - 1), st.integers(0, 255)), min_size=1, max_size=6),
+    st.integers(0, 3 * len(SAMPLE)),
+)
+def test_damage_is_refused_or_harmless(changes: list[tuple[int, int]], cut: int) -> None:
+    data = bytearray(SAMPLE)
+    for position, value in changes:
+        data[position] = value
+    file = io.BytesIO(bytes(data[:cut]))
+    contents: dict[str, Memory] = {}
+
+    def begin(entry: ArchiveFile) -> Memory:
+        contents[entry.record.name] = Memory()
+        return contents[entry.record.name]
+
+    try:
+        listing = list_archive(file)
+        unpack_archive(file, listing, begin, lambda _file, _blob: None)
+    except IntakeRefused as error:
+        assert error.code.split("-")[0] in ("archive", "name")
+        return
+    # What is taken means the same to another reader.
+    with zipfile.ZipFile(file) as archive:
+        for name, memory in contents.items():
+            assert archive.read(name) == memory.data
+
+
+class Memory:
+    """A writer into memory."""
+
+    def __init__(self) -> None:
+        self.data = b""
+
+    def write(self, data: bytes | memoryview) -> None:
+        self.data += data
+
+    def commit(self) -> Blob:
+        return Blob("0" * 64, len(self.data))
+
+    def abort(self) -> None: ...
+
+    def __enter__(self) -> "Memory":
+        return self
+
+    def __exit__(self, *exception: object) -> None: ...
+
+
+@pytest.mark.parametrize("streamed", [False, True])
+def test_archives_of_info_zip(local_storage: LocalStorage, tmp_path: Path, streamed: bool) -> None:
+    program = shutil.which("zip")
+    if program is None:
+        pytest.skip("the program zip is not installed")
+    (tmp_path / "fox" / "images").mkdir(parents=True)
+    (tmp_path / "fox" / "images" / "ä b.jpg").write_bytes(PHOTO)
+    (tmp_path / "fox" / "images" / "link.jpg").symlink_to("ä b.jpg")
+    archive = tmp_path / "out.zip"
+
+    def pack(*flags: str) -> bytes:
+        archive.unlink(missing_ok=True)
+        command = [program, "-q", "-r", *flags, "-" if streamed else str(archive), "fox"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, timeout=60)
+        return done.stdout if streamed else archive.read_bytes()
+
+    assert take(pack(), local_storage) == {"images/ä b.jpg": PHOTO, "images/link.jpg": PHOTO}
+    if not streamed:  # it cannot stream links
+        assert refusal(pack("-y"), local_storage) == "archive-link"

@@ -1,0 +1,60 @@
+"""A private Postgres for the tests of the service, and a fresh database for each test."""
+
+import os
+import shutil
+import signal
+import tempfile
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+from psycopg.conninfo import make_conninfo
+
+from workers.queue.embedded_postgres import EmbeddedPostgres
+from workers.queue.migrate import migrate
+
+
+@pytest.fixture(scope="session")
+def short_root() -> Iterator[Path]:
+    """A folder that the database's user can reach, unlike pytest's own when root runs the tests."""
+    root = Path(tempfile.mkdtemp(prefix="octasplat-tests-"))
+    root.chmod(0o711)
+    yield root
+    shutil.rmtree(root, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def postgres(short_root: Path) -> Iterator[EmbeddedPostgres]:
+    """A running private Postgres."""
+    server = EmbeddedPostgres(short_root / "shared")
+    server.start()
+    with psycopg.connect(server.conninfo(), autocommit=True) as connection:
+        connection.execute("ALTER SYSTEM SET fsync = off")
+        connection.execute("SELECT pg_reload_conf()")
+    yield server
+    # At once, as nothing here is worth the flushing.
+    os.kill(int((server.cluster / "postmaster.pid").read_text().split()[0]), signal.SIGQUIT)
+
+
+@pytest.fixture(scope="session")
+def template(postgres: EmbeddedPostgres) -> str:
+    """Name of a database with all tables, to be copied."""
+    migrate(postgres.conninfo())
+    return "octasplat"
+
+
+@pytest.fixture
+def conninfo(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
+    """A database of the test's own, with all tables."""
+    name = f"test_{uuid.uuid4().hex[:12]}"
+    admin = make_conninfo(postgres.conninfo(), dbname="postgres")
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f'CREATE DATABASE "{name}" TEMPLATE "{template}"'.encode())
+    yield make_conninfo(postgres.conninfo(), dbname=name)
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
+
+
+os.environ.pop("DATABASE_URL", None)

@@ -1,0 +1,89 @@
+"""Tables are brought up to date once, from nothing and from what earlier versions left."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+from psycopg.conninfo import make_conninfo
+
+from workers.queue.embedded_postgres import EmbeddedPostgres
+from workers.queue.errors import DatabaseError
+from workers.queue.migrate import all_steps, migrate, missing_steps, queue_steps
+
+
+@pytest.fixture
+def empty(postgres: EmbeddedPostgres, request: pytest.FixtureRequest) -> Iterator[str]:
+    name = f"empty_{abs(hash(request.node.name)) % 10**9}"
+    admin = make_conninfo(postgres.conninfo(), dbname="postgres")
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}".encode())
+    yield make_conninfo(postgres.conninfo(), dbname=name)
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f"DROP DATABASE {name} WITH (FORCE)".encode())
+
+
+def shape(conninfo: str) -> set[tuple[str, ...]]:
+    """Tables, columns, functions and indexes."""
+    with psycopg.connect(conninfo) as connection:
+        columns = connection.execute(
+            "SELECT table_name, column_name, data_type FROM information_schema.columns "
+            "WHERE table_schema = 'public'"
+        ).fetchall()
+        functions = connection.execute(
+            "SELECT proname, pg_get_function_identity_arguments(p.oid), 'function' FROM pg_proc p "
+            "JOIN pg_namespace n ON n.oid = pronamespace WHERE nspname = 'public'"
+        ).fetchall()
+        indexes = connection.execute("SELECT indexname, '', 'index' FROM pg_indexes").fetchall()
+    return {tuple(map(str, row)) for row in (*columns, *functions, *indexes)}
+
+
+def test_second_time_nothing_is_left_to_do(empty: str) -> None:
+    assert "0001_jobs.sql" in migrate(empty)
+    assert migrate(empty) == ()
+    with psycopg.connect(empty) as connection:
+        rows = connection.execute("SELECT component, name FROM schema_steps").fetchall()
+    assert missing_steps({(str(a), str(b)) for a, b in rows}) == []
+
+
+def test_starts_at_once_apply_every_step_once(empty: str) -> None:
+    applied: list[tuple[str, ...]] = []
+    threads = [threading.Thread(target=lambda: applied.append(migrate(empty))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(map(len, applied))[:3] == [0, 0, 0] and sum(map(len, applied)) >= 2
+
+
+def test_database_of_an_earlier_queue_ends_the_same(empty: str, conninfo: str) -> None:
+    """All but the last steps of the queue's library, as an earlier pin had left them, then the rest."""
+    steps = queue_steps()
+    with psycopg.connect(empty, autocommit=True) as connection:
+        connection.execute("CREATE TABLE schema_steps (component text, name text, applied_at timestamptz "
+                           "NOT NULL DEFAULT now(), PRIMARY KEY (component, name))")  # fmt: skip
+        for step in steps[:-6]:
+            connection.execute(step.sql.encode())
+            connection.execute("INSERT INTO schema_steps VALUES (%s, %s)", [step.component, step.name])
+    assert migrate(empty)[:6] == tuple(step.name for step in steps[-6:])
+    fresh, upgraded = shape(conninfo), shape(empty)
+    assert fresh - upgraded == set()
+
+
+def test_newer_database_is_refused(empty: str) -> None:
+    migrate(empty)
+    with psycopg.connect(empty) as connection:
+        connection.execute("INSERT INTO schema_steps VALUES ('octasplat', '9999_future.sql')")
+    with pytest.raises(DatabaseError, match=r"newer version.*9999_future"):
+        migrate(empty)
+
+
+def test_unreachable_database_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(DatabaseError, match="check DATABASE_URL"):
+        migrate(f"host={tmp_path} dbname=x user=y")
+
+
+def test_steps_have_an_order() -> None:
+    names = [step.name for step in all_steps() if step.component == "octasplat"]
+    assert names == sorted(names) and len(names) == len(set(names))

@@ -1,0 +1,268 @@
+"""Jobs and slips are one: written together, fenced, rescued."""
+
+import asyncio
+import uuid
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import psycopg
+import pytest
+
+from workers.queue.attempts import Attempt, Fenced, Result, claim
+from workers.queue.database import Connection, Pool, open_pool
+from workers.queue.ids import new_id
+from workers.queue.jobs import (
+    Conflict,
+    NewJob,
+    artifacts_of,
+    cancel_job,
+    create_job,
+    delete_job,
+    get_job,
+    list_jobs,
+    queue_position,
+    retry_job,
+)
+from workers.queue.port import Slips
+from workers.queue.procrastinate_slips import ProcrastinateSlips
+from workers.queue.rescue import rescue_lost_jobs
+from workers.queue.rows import Job
+
+NEW = NewJob(owner="me", kind="toy", options={}, queue="cpu")
+SLIPS = ProcrastinateSlips(stale_seconds=5)
+
+
+def run(conninfo: str, what: Callable[[Pool], Awaitable[Any]]) -> Any:
+    async def inside() -> Any:
+        async with open_pool(conninfo, max_size=4) as pool:
+            return await what(pool)
+
+    return asyncio.run(inside())
+
+
+def count(conninfo: str, table: str) -> int:
+    with psycopg.connect(conninfo) as connection:
+        row = connection.execute(f"SELECT count(*) FROM {table}".encode()).fetchone()
+    assert row is not None
+    return int(row[0])
+
+
+async def claimed(pool: Pool, new: NewJob = NEW) -> Attempt:
+    async with pool.connection() as connection:
+        job = await create_job(connection, SLIPS, new)
+    assert job.slip is not None
+    attempt = await claim(pool, job.id, job.slip, "w")
+    assert attempt is not None
+    return attempt
+
+
+async def fetched(pool: Pool, job_id: uuid.UUID) -> Job:
+    async with pool.connection() as connection:
+        job = await get_job(connection, job_id)
+    assert job is not None
+    return job
+
+
+def test_rolled_back_transaction_leaves_neither_job_nor_slip(conninfo: str) -> None:
+    class Regret(Exception):
+        pass
+
+    async def what(pool: Pool) -> None:
+        async with pool.connection() as connection, connection.transaction():
+            await create_job(connection, SLIPS, NEW)
+            raise Regret
+
+    with pytest.raises(Regret):
+        run(conninfo, what)
+    assert (count(conninfo, "jobs"), count(conninfo, "procrastinate_jobs")) == (0, 0)
+
+    async def good(pool: Pool) -> None:
+        async with pool.connection() as connection:
+            await create_job(connection, SLIPS, NEW)
+
+    run(conninfo, good)
+    assert (count(conninfo, "jobs"), count(conninfo, "procrastinate_jobs")) == (1, 1)
+
+
+def test_slip_of_another_time_starts_nothing(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await claimed(pool)
+        slip = attempt.job.slip
+        assert slip is not None
+        assert await claim(pool, attempt.job.id, slip, "other") is None
+        await attempt.hand_back(SLIPS, "test")
+        assert await claim(pool, attempt.job.id, slip, "other") is None
+        again = await fetched(pool, attempt.job.id)
+        assert again.slip is not None and again.slip != slip and again.state == "queued"
+        second = await claim(pool, again.id, again.slip, "other")
+        assert second is not None and second.job.attempt == 2
+        assert await claim(pool, new_id(), 1, "w") is None
+
+    run(conninfo, what)
+
+
+def test_ghost_can_write_nothing(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        ghost = await claimed(pool)
+        await ghost.hand_back(SLIPS, "test")
+        job = await fetched(pool, ghost.job.id)
+        assert job.slip is not None
+        attempt = await claim(pool, job.id, job.slip, "second")
+        assert attempt is not None
+        for write in (
+            lambda: ghost.beat(),
+            lambda: ghost.look(),
+            lambda: ghost.tell("x", {}),
+            lambda: ghost.log(["x"]),
+            lambda: ghost.progress(stage="train", step=1, total_steps=2),
+            lambda: ghost.keep_checkpoint({"stage": "train", "step": 9}, advances=True),
+            lambda: ghost.keep_preview({"sha256": "x"}),
+            lambda: ghost.succeed([Result("a", "b" * 64, 1, "text/plain")]),
+            lambda: ghost.fail({"type": "x", "message": "x"}),
+            lambda: ghost.cancel(),
+            lambda: ghost.hand_back(SLIPS, "x"),
+            lambda: ghost.lose(SLIPS, {"type": "x", "message": "x"}),
+        ):
+            with pytest.raises(Fenced):
+                await write()
+        assert (await fetched(pool, job.id)).state == "running"
+        await attempt.succeed([Result("a", "b" * 64, 1, "text/plain")])
+        with pytest.raises(Fenced):
+            await attempt.fail({"type": "x", "message": "x"})
+        async with pool.connection() as connection:
+            assert [artifact.name for artifact in await artifacts_of(connection, job.id)] == ["a"]
+
+    run(conninfo, what)
+
+
+def test_lost_jobs_are_rescued_three_times_then_failed(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await claimed(pool)
+        job_id = attempt.job.id
+        for rescues in (1, 2, 3):
+            assert await rescue_lost_jobs(pool, SLIPS, 5) == 0  # still fresh
+            await make_old(pool, job_id)
+            assert await rescue_lost_jobs(pool, SLIPS, 5) == 1
+            job = await fetched(pool, job_id)
+            assert (job.state, job.rescues) == ("queued", rescues) and job.slip is not None
+            assert await claim(pool, job_id, job.slip, "w") is not None
+        await make_old(pool, job_id)
+        await rescue_lost_jobs(pool, SLIPS, 5)
+        job = await fetched(pool, job_id)
+        assert job.state == "failed" and job.error is not None and "4 times" in job.error["message"]
+        assert job.slip is None
+
+    run(conninfo, what)
+    assert count(conninfo, "procrastinate_jobs") == 0
+
+
+def test_new_checkpoint_forgives_lost_workers(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await claimed(pool)
+        await make_old(pool, attempt.job.id)
+        await rescue_lost_jobs(pool, SLIPS, 5)
+        job = await fetched(pool, attempt.job.id)
+        assert job.rescues == 1 and job.slip is not None
+        second = await claim(pool, job.id, job.slip, "w")
+        assert second is not None
+        await second.keep_checkpoint({"stage": "train", "step": 5}, advances=False)
+        assert (await fetched(pool, job.id)).rescues == 1
+        await second.keep_checkpoint({"stage": "train", "step": 6}, advances=True)
+        assert (await fetched(pool, job.id)).rescues == 0
+
+    run(conninfo, what)
+
+
+def test_lost_job_that_was_to_be_cancelled_is_cancelled(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await claimed(pool)
+        async with pool.connection() as connection:
+            await cancel_job(connection, SLIPS, attempt.job.id)
+        await make_old(pool, attempt.job.id)
+        await rescue_lost_jobs(pool, SLIPS, 5)
+        assert (await fetched(pool, attempt.job.id)).state == "canceled"
+
+    run(conninfo, what)
+
+
+def test_queued_job_without_a_living_slip_gets_one(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        async with pool.connection() as connection:
+            gone, stuck, fine = [await create_job(connection, SLIPS, NEW) for _ in range(3)]
+            await connection.execute("UPDATE jobs SET queued_at = now() - interval '1 hour'")
+            await connection.execute("DELETE FROM procrastinate_jobs WHERE id = %s", [gone.slip])
+            # Fetched by a worker that died before it began; the worker's row is gone as well.
+            await connection.execute(
+                "UPDATE procrastinate_jobs SET status = 'doing' WHERE id = %s", [stuck.slip]
+            )
+        await rescue_lost_jobs(pool, SLIPS, 5)
+        after = [await fetched(pool, job.id) for job in (gone, stuck, fine)]
+        assert [job.state for job in after] == ["queued"] * 3
+        assert after[0].slip != gone.slip and after[1].slip != stuck.slip and after[2].slip == fine.slip
+
+    run(conninfo, what)
+    assert count(conninfo, "procrastinate_jobs") == 3
+
+
+def test_what_is_over_stays_so(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await claimed(pool)
+        await attempt.succeed([])
+        async with pool.connection() as connection:
+            with pytest.raises(Conflict, match="succeeded"):
+                await cancel_job(connection, SLIPS, attempt.job.id)
+            with pytest.raises(Conflict, match="succeeded"):
+                await retry_job(connection, SLIPS, attempt.job.id, fresh=False)
+            running = await claimed(pool)
+            with pytest.raises(Conflict, match="cancel it first"):
+                await delete_job(connection, running.job.id)
+            await delete_job(connection, attempt.job.id)
+            assert await get_job(connection, attempt.job.id) is None
+            with pytest.raises(KeyError):
+                await cancel_job(connection, SLIPS, attempt.job.id)
+
+    run(conninfo, what)
+
+
+def test_list_pages_and_filters(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        async with pool.connection() as connection:
+            made = [
+                await create_job(connection, SLIPS, NewJob("me", "toy", {}, "cpu", label=f"l{n % 2}"))
+                for n in range(6)
+            ]
+            other = await create_job(connection, SLIPS, NewJob("you", "toy", {}, "cpu"))
+            await cancel_job(connection, SLIPS, made[0].id)
+            first = await list_jobs(connection, owner="me", limit=4)
+            rest = await list_jobs(connection, owner="me", limit=4, before=first[-1].id)
+            assert [job.id for job in (*first, *rest)] == [job.id for job in reversed(made)]
+            assert [job.id for job in await list_jobs(connection, owner="you")] == [other.id]
+            assert len(await list_jobs(connection)) == 7
+            assert len(await list_jobs(connection, owner="me", label="l1")) == 3
+            assert [j.id for j in await list_jobs(connection, states=["canceled"])] == [made[0].id]
+            assert await queue_position(connection, made[1]) == 0
+            assert await queue_position(connection, other) == 5
+
+    run(conninfo, what)
+
+
+def test_ids_sort_by_time() -> None:
+    ids = [new_id() for _ in range(2000)]
+    assert len(set(ids)) == 2000
+    assert [i.version for i in ids[:3]] == [7, 7, 7] and ids[0].variant == uuid.RFC_4122
+    assert ids == sorted(ids, key=lambda i: i.int >> 64)
+
+
+def test_port_is_kept() -> None:
+    assert isinstance(SLIPS, Slips)
+
+
+async def make_old(pool: Pool, job_id: uuid.UUID) -> None:
+    async with pool.connection() as connection:
+        await _execute(connection, job_id)
+
+
+async def _execute(connection: Connection, job_id: uuid.UUID) -> None:
+    await connection.execute(
+        "UPDATE jobs SET heartbeat_at = now() - interval '1 minute' WHERE id = %s", [job_id]
+    )

@@ -1,0 +1,144 @@
+"""Quotas hold however many requests come at once."""
+
+import asyncio
+import uuid
+
+import psycopg
+import pytest
+from click.testing import CliRunner
+from psycopg.rows import dict_row
+
+from workers.commands.quota import quota as quota_command
+from workers.queue.database import Connection, open_pool
+from workers.queue.datasets import create_dataset, put_file
+from workers.queue.quotas import (
+    Quota,
+    QuotaExceeded,
+    Usage,
+    bytes_left,
+    check_bytes,
+    check_new_dataset,
+    check_new_job,
+    quota_of,
+    set_quota,
+    usage_of,
+)
+
+
+async def connect(conninfo: str) -> Connection:
+    return await psycopg.AsyncConnection.connect(conninfo, autocommit=True, row_factory=dict_row)
+
+
+async def new_job(connection: Connection, owner: str, state: str = "queued") -> uuid.UUID:
+    job_id = uuid.uuid4()
+    await connection.execute(
+        "INSERT INTO jobs (id, owner, kind, options, queue, state) VALUES (%s, %s, 'x', '{}', 'cpu', %s)",
+        [job_id, owner, state],
+    )
+    return job_id
+
+
+def test_usage_counts_what_an_owner_has(conninfo: str) -> None:
+    async def check() -> None:
+        connection = await connect(conninfo)
+        mine = await create_dataset(connection, "me", "a")
+        other = await create_dataset(connection, "other", "b")
+        await put_file(connection, mine.id, "images/a.jpg", "a" * 64, 100)
+        await put_file(connection, mine.id, "images/copy.jpg", "a" * 64, 100)
+        await put_file(connection, mine.id, "images/b.jpg", "b" * 64, 10)
+        await put_file(connection, other.id, "images/c.jpg", "c" * 64, 1000)
+        done = await new_job(connection, "me", "succeeded")
+        await new_job(connection, "me", "running")
+        await connection.execute(
+            "INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type) "
+            "VALUES (%s, 'x', %s, 7, '')",
+            [done, "d" * 64],
+        )
+        assert await usage_of(connection, "me") == Usage(bytes=117, datasets=1, jobs=1)
+        assert await usage_of(connection, "nobody") == Usage(0, 0, 0)
+        assert await bytes_left(connection, "me") is None
+        assert await bytes_left(connection, "me", Quota(max_bytes=120)) == 3
+        assert await bytes_left(connection, "me", Quota(max_bytes=50)) == 0
+        await connection.close()
+
+    asyncio.run(check())
+
+
+def test_own_limits_go_before_those_of_the_settings(conninfo: str) -> None:
+    async def check() -> None:
+        connection = await connect(conninfo)
+        default = Quota(10, 20, 30)
+        assert await quota_of(connection, "me", default) == default
+        await set_quota(connection, "me", Quota(max_datasets=5))
+        await set_quota(connection, "me", Quota(max_jobs=0))
+        assert await quota_of(connection, "me", default) == Quota(10, 20, 0)
+        with pytest.raises(QuotaExceeded) as caught:
+            await check_new_job(connection, "me", default)
+        assert caught.value.of == "jobs"
+        await check_new_job(connection, "other", default)
+        await connection.close()
+
+    asyncio.run(check())
+
+
+def test_of_many_at_once_only_the_allowed_get_through(conninfo: str) -> None:
+    quota = Quota(max_bytes=1000, max_datasets=3)
+
+    async def make_dataset(number: int) -> bool:
+        connection = await connect(conninfo)
+        try:
+            async with connection.transaction():
+                await check_new_dataset(connection, "me", quota)
+                await create_dataset(connection, "me", str(number))
+        except QuotaExceeded as error:
+            assert error.of == "datasets"
+            return False
+        finally:
+            await connection.close()
+        return True
+
+    async def upload(dataset_id: uuid.UUID, number: int) -> bool:
+        connection = await connect(conninfo)
+        try:
+            async with connection.transaction():
+                await put_file(connection, dataset_id, f"images/{number}.jpg", f"{number:064x}", 300)
+                await check_bytes(connection, "me", quota)
+        except QuotaExceeded as error:
+            assert error.of == "bytes" and "1200 bytes of your 1000" in str(error)
+            return False
+        finally:
+            await connection.close()
+        return True
+
+    async def check() -> None:
+        made = await asyncio.gather(*(make_dataset(number) for number in range(10)))
+        assert sum(made) == 3
+        connection = await connect(conninfo)
+        cursor = await connection.execute("SELECT id FROM datasets")
+        ids = [row["id"] for row in await cursor.fetchall()]
+        stored = await asyncio.gather(*(upload(ids[number % 3], number) for number in range(10)))
+        assert sum(stored) == 3
+        assert (await usage_of(connection, "me")).bytes == 900
+        await connection.close()
+
+    asyncio.run(check())
+
+
+def test_the_command(conninfo: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DATABASE_URL", conninfo)
+    run = CliRunner().invoke
+    shown = run(quota_command, ["me"])
+    assert shown.output.splitlines()[0] == "bytes: 0 of any number", shown.output
+    run(quota_command, ["me", "--bytes", "20G"])
+    lines = run(quota_command, ["me", "--jobs", "4"]).output.splitlines()
+    assert lines == ["bytes: 0 of 20000000000", "datasets: 0 of any number", "unfinished jobs: 0 of 4"]
+    assert "unfinished jobs: 0 of any number" in run(quota_command, ["me", "--clear"]).output
+    assert run(quota_command, ["me", "--jobs", "many"]).exit_code == 2
+
+
+def test_the_pool_is_enough(conninfo: str) -> None:
+    async def check() -> None:
+        async with open_pool(conninfo, max_size=2) as pool, pool.connection() as connection:
+            await check_bytes(connection, "me", Quota(max_bytes=0))
+
+    asyncio.run(check())

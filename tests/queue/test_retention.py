@@ -1,0 +1,286 @@
+"""What is old goes when it was told to go, and nothing else; the store loses what nothing names."""
+
+import asyncio
+import os
+import time
+import uuid
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from psycopg.types.json import Jsonb
+
+from workers.queue.attempts import Attempt, Result, claim
+from workers.queue.collecting import collect
+from workers.queue.database import Connection, Pool, open_pool
+from workers.queue.datasets import change_dataset, create_dataset, get_dataset, put_file
+from workers.queue.jobs import NewJob, artifacts_of, change_job, create_job, get_job, retry_job
+from workers.queue.procrastinate_slips import ProcrastinateSlips
+from workers.queue.retention import Forgotten, Retention, forget_expired, set_expiries
+from workers.queue.rows import Job
+from workers.storage.local import LocalStorage
+from workers.storage.trees import Manifest, TreeFile, publish_manifest
+
+DAY, LONG_AGO = 86_400.0, 10 * 86_400.0
+KEEP = Retention(jobs_hours=100, jobs_hours_by_kind={"render": 1, "export": 0}, datasets_hours=50)
+SLIPS = ProcrastinateSlips()
+
+
+@pytest.fixture
+def within(conninfo: str) -> Callable[[Callable[[Pool, Connection], Awaitable[None]]], None]:
+    def run(what: Callable[[Pool, Connection], Awaitable[None]]) -> None:
+        async def whole() -> None:
+            async with open_pool(conninfo) as pool, pool.connection() as connection:
+                await connection.set_autocommit(True)
+                await what(pool, connection)
+
+        asyncio.run(whole())
+
+    return run
+
+
+async def finished(connection: Connection, pool: Pool, kind: str = "x", **fields: Any) -> Job:
+    job = await create_job(connection, SLIPS, NewJob("me", kind, {}, "cpu", **fields))
+    assert job.slip is not None
+    attempt = await claim(pool, job.id, job.slip, "w")
+    assert attempt is not None
+    await attempt.fail({"type": "x", "message": "x"})
+    return await existing(connection, job.id)
+
+
+async def existing(connection: Connection, job_id: uuid.UUID) -> Job:
+    job = await get_job(connection, job_id)
+    assert job is not None
+    return job
+
+
+async def hours_left(connection: Connection, table: str, row_id: uuid.UUID) -> float | None:
+    cursor = await connection.execute(
+        f"SELECT extract(epoch FROM expires_at - now())::float8 / 3600 h FROM {table} WHERE id = %s".encode(),
+        [row_id],
+    )
+    row = await cursor.fetchone()
+    assert row is not None
+    left: float | None = row["h"]
+    return left
+
+
+def test_each_kind_has_its_own_time(within: Any) -> None:
+    async def story(pool: Pool, connection: Connection) -> None:
+        plain, render, export = [await finished(connection, pool, k) for k in ("x", "render", "export")]
+        pinned = await finished(connection, pool)
+        await change_job(connection, pinned.id, label=None, pinned=True)
+        queued = await create_job(connection, SLIPS, NewJob("me", "x", {}, "cpu"))
+        await set_expiries(connection, KEEP)
+        assert await hours_left(connection, "jobs", plain.id) == pytest.approx(100, abs=0.1)
+        assert await hours_left(connection, "jobs", render.id) == pytest.approx(1, abs=0.1)
+        for job in (export, pinned, queued):
+            assert await hours_left(connection, "jobs", job.id) is None
+        version = (await existing(connection, plain.id)).version
+        await set_expiries(connection, KEEP)
+        assert (await existing(connection, plain.id)).version == version
+        assert await forget_expired(connection) == Forgotten(0, 0)
+
+    within(story)
+
+
+def test_by_default_nothing_finished_expires(within: Any) -> None:
+    async def story(pool: Pool, connection: Connection) -> None:
+        job = await finished(connection, pool)
+        await connection.execute("UPDATE jobs SET finished_at = now() - interval '9 years'")
+        await set_expiries(connection, Retention())
+        assert await hours_left(connection, "jobs", job.id) is None
+
+    within(story)
+
+
+def test_what_was_old_already_is_told_first(within: Any) -> None:
+    async def story(pool: Pool, connection: Connection) -> None:
+        job = await finished(connection, pool)
+        await connection.execute("UPDATE jobs SET finished_at = now() - interval '9 years'")
+        await set_expiries(connection, KEEP)
+        assert await hours_left(connection, "jobs", job.id) == pytest.approx(24, abs=0.1)
+
+    within(story)
+
+
+def test_pin_and_retry_take_it_back(within: Any) -> None:
+    async def story(pool: Pool, connection: Connection) -> None:
+        pinned, retried, left = [await finished(connection, pool) for _ in range(3)]
+        await set_expiries(connection, KEEP)
+        await connection.execute("UPDATE jobs SET expires_at = now() - interval '1 second'")
+        assert (await change_job(connection, pinned.id, label=None, pinned=True)).expires_at is None
+        await retry_job(connection, SLIPS, retried.id, fresh=False)
+        assert await forget_expired(connection) == Forgotten(1, 0)
+        assert await get_job(connection, left.id) is None
+        for job in (pinned, retried):
+            assert await get_job(connection, job.id) is not None
+        await change_job(connection, pinned.id, label=None, pinned=False)
+        await set_expiries(connection, KEEP)
+        assert (await hours_left(connection, "jobs", pinned.id) or 0) > 1
+
+    within(story)
+
+
+def test_source_of_an_unfinished_job_waits(within: Any) -> None:
+    async def story(pool: Pool, connection: Connection) -> None:
+        source = await finished(connection, pool)
+        await create_job(connection, SLIPS, NewJob("me", "x", {}, "cpu", source_id=source.id))
+        await connection.execute(
+            "UPDATE jobs SET expires_at = now() - interval '1 s' WHERE id = %s", [source.id]
+        )
+        assert await forget_expired(connection) == Forgotten(0, 0)
+        assert await get_job(connection, source.id) is not None
+
+    within(story)
+
+
+def test_datasets_go_when_no_job_needs_them(within: Any) -> None:
+    async def story(pool: Pool, connection: Connection) -> None:
+        used, unused, pinned, fresh = [await create_dataset(connection, "me", "d") for _ in range(4)]
+        await connection.execute("UPDATE datasets SET state = 'committed' WHERE id <> %s", [fresh.id])
+        await change_dataset(connection, pinned.id, name="d", pinned=True)
+        job = await finished(connection, pool, dataset_id=used.id)
+        await set_expiries(connection, KEEP)
+        assert await hours_left(connection, "datasets", unused.id) == pytest.approx(50, abs=0.1)
+        for dataset in (used, pinned, fresh):
+            assert await hours_left(connection, "datasets", dataset.id) is None
+        await connection.execute("DELETE FROM jobs WHERE id = %s", [job.id])
+        await set_expiries(connection, KEEP)
+        assert await hours_left(connection, "datasets", used.id) is not None
+        await connection.execute(
+            "UPDATE datasets SET expires_at = now() - interval '1 s' WHERE expires_at IS NOT NULL"
+        )
+        await create_job(connection, SLIPS, NewJob("me", "x", {}, "cpu", dataset_id=used.id))
+        assert await forget_expired(connection) == Forgotten(0, 1)
+        assert await get_dataset(connection, unused.id) is None
+        for dataset in (used, pinned, fresh):
+            assert await get_dataset(connection, dataset.id) is not None
+
+    within(story)
+
+
+def test_upload_that_goes_on_keeps_an_open_dataset(within: Any) -> None:
+    async def story(_pool: Pool, connection: Connection) -> None:
+        keep = Retention(open_datasets_hours=10)
+        dataset = await create_dataset(connection, "me", "d")
+        await connection.execute("UPDATE datasets SET used_at = now() - interval '9 hours'")
+        await set_expiries(connection, keep)
+        await connection.execute("UPDATE datasets SET expires_at = now() + interval '1 hour'")
+        await put_file(connection, dataset.id, "images/a.jpg", "a" * 64, 1)
+        await set_expiries(connection, keep)
+        assert await hours_left(connection, "datasets", dataset.id) == pytest.approx(10, abs=0.1)
+
+    within(story)
+
+
+def put(storage: LocalStorage, content: str, age_seconds: float = LONG_AGO) -> str:
+    with storage.begin() as writer:
+        writer.write(content.encode())
+        sha256 = writer.commit().sha256
+    path = storage.local_path(sha256)
+    assert path is not None
+    os.utime(path, (time.time() - age_seconds,) * 2)
+    return sha256
+
+
+def held(storage: LocalStorage) -> set[str]:
+    return {entry.blob.sha256 for entry in storage.blobs()}
+
+
+async def running(connection: Connection, pool: Pool) -> Attempt:
+    job = await create_job(connection, SLIPS, NewJob("me", "x", {}, "cpu"))
+    assert job.slip is not None
+    attempt = await claim(pool, job.id, job.slip, "w")
+    assert attempt is not None
+    return attempt
+
+
+def checkpoint(*digests: str) -> dict[str, Any]:
+    files = [{"path": f"run/{n}", "sha256": d, "size_bytes": 1} for n, d in enumerate(digests)]
+    return {"attempt": 1, "stage": "train", "step": 1, "files": files}
+
+
+def test_only_what_nothing_names_is_collected(within: Any, tmp_path: Path) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+
+    async def story(pool: Pool, connection: Connection) -> None:
+        unused, young = put(storage, "unused"), put(storage, "young", age_seconds=DAY / 2)
+        photo, result, state, preview = [
+            put(storage, name) for name in ("photo", "result", "state", "preview")
+        ]
+        dataset = await create_dataset(connection, "me", "d")
+        await put_file(connection, dataset.id, "images/a.jpg", photo, 5)
+        done = await running(connection, pool)
+        await done.succeed([Result("scene.ply", result, 6, "x")])
+        going = await running(connection, pool)
+        await going.keep_checkpoint(checkpoint(state), advances=True)
+        await going.keep_preview({"sha256": preview, "step": 1, "view": "a"})
+        # Published by an attempt that was lost before it could say so.
+        unsaid = put(storage, "unsaid")
+        files = (TreeFile(path="scene.ply", sha256=unsaid, size_bytes=6),)
+        publish_manifest(storage, f"results/{going.job.id}/1", Manifest(files=files))
+        publish_manifest(storage, f"results/{uuid.uuid4()}/1", Manifest(files=files))
+        removed = await collect(pool, storage, unused_seconds=DAY)
+        assert removed is not None and (removed.blobs, removed.size_bytes) == (1, 6)
+        assert held(storage) == {young, photo, result, state, preview, unsaid} and unused not in held(storage)
+        assert list(storage.documents("results/")) == [f"results/{going.job.id}/1"]
+
+    within(story)
+
+
+def test_replaced_checkpoints_go_early_but_not_what_others_name(within: Any, tmp_path: Path) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+
+    async def story(pool: Pool, connection: Connection) -> None:
+        first, both, second, shared = [
+            put(storage, name, age_seconds=3600) for name in ("first", "both", "second", "shared")
+        ]
+        attempt = await running(connection, pool)
+        other = await running(connection, pool)
+        await other.succeed([Result("scene.ply", shared, 6, "x")])
+        await change_job(connection, other.job.id, label=None, pinned=True)
+        await attempt.keep_checkpoint(checkpoint(first, both, shared), advances=True)
+        await attempt.keep_checkpoint(checkpoint(both, second), advances=True)
+        assert (await collect(pool, storage, unused_seconds=DAY)) is not None
+        assert held(storage) == {first, both, second, shared}  # somebody may still read it
+        await connection.execute("UPDATE replaced_contents SET replaced_at = now() - interval '1 hour'")
+        await collect(pool, storage, unused_seconds=DAY)
+        assert held(storage) == {both, second, shared}
+        await attempt.succeed([])
+        await connection.execute("UPDATE replaced_contents SET replaced_at = now() - interval '1 hour'")
+        await collect(pool, storage, unused_seconds=DAY)
+        assert held(storage) == {shared}
+        assert [a.sha256 for a in await artifacts_of(connection, other.job.id)] == [shared]
+
+    within(story)
+
+
+def test_store_of_another_database_is_left_alone(within: Any, tmp_path: Path) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+
+    async def story(pool: Pool, connection: Connection) -> None:
+        unused = put(storage, "unused")
+        storage.publish("installation", b"another")
+        assert await collect(pool, storage, unused_seconds=DAY) is None
+        assert held(storage) == {unused}
+        storage.withdraw("installation")
+        assert await collect(pool, storage, unused_seconds=DAY, every_seconds=60) is not None
+        put(storage, "unused")
+        assert await collect(pool, storage, unused_seconds=DAY, every_seconds=60) is None
+        assert len(held(storage)) == 1
+
+    within(story)
+
+
+def test_json_null_checkpoints_do_no_harm(within: Any) -> None:
+    async def story(pool: Pool, connection: Connection) -> None:
+        attempt = await running(connection, pool)
+        for value in ({}, {"files": []}, {"stage": "poses"}):
+            await connection.execute("UPDATE jobs SET checkpoint = %s", [Jsonb(value)])
+        await attempt.cancel()
+        cursor = await connection.execute("SELECT count(*) AS n FROM replaced_contents")
+        assert (await cursor.fetchone()) == {"n": 0}
+
+    within(story)

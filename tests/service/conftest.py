@@ -1,0 +1,10 @@
+"""Fixtures of the database; the toy kind of the workers' tests is known here too."""
+
+import sys
+from pathlib import Path
+
+from postgres_for_tests import conninfo, postgres, short_root, template
+
+sys.path.append(str(Path(__file__).parents[1] / "worker"))
+
+__all__ = ["conninfo", "postgres", "short_root", "template"]

@@ -1,0 +1,109 @@
+"""Who gets in: tokens, scopes, owners, hosts, origins; test_access_matrix asks at every route."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from pydantic import SecretStr
+from service_bench import committed_dataset, running, with_token
+
+from engine.errors import ConfigError
+from service.state import Service
+
+Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
+
+
+@pytest.fixture
+def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
+    def run(conversation: Conversation, **settings: Any) -> None:
+        async def whole() -> None:
+            async with running(conninfo, tmp_path, **settings) as (http, service):
+                await conversation(http, service)
+
+        asyncio.run(whole())
+
+    return run
+
+
+def test_lists_hold_ones_own_and_inputs_must_be_ones_own(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        mine = await with_token(service, "me", "write")
+        stranger = await with_token(service, "stranger", "write")
+        taken = {"kind": "toy", "dataset_id": await committed_dataset(service, "me")}
+        assert (await http.post("/v1/jobs", json=taken, headers=mine)).status_code == 202
+        assert (await http.post("/v1/jobs", json=taken, headers=stranger)).status_code == 422
+        for path in ("/v1/jobs", "/v1/datasets"):
+            listed = (await http.get(path, headers=stranger)).json()
+            assert listed[path.removeprefix("/v1/")] == []
+        admin = await with_token(service, "boss", "admin")
+        assert len((await http.get("/v1/jobs", headers=admin)).json()["jobs"]) == 1
+
+    talk(conversation)
+
+
+def test_without_tokens_only_this_machine_and_no_page_of_others(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        assert (await http.get("/v1/jobs")).status_code == 200
+        for host in ("evil.example", "127.0.0.1.evil.example", "", "evil.example:8642"):
+            assert (await http.get("/v1/jobs", headers={"Host": host})).status_code == 421
+        for host in ("127.0.0.1:1", "[::1]:80", "LOCALHOST"):
+            assert (await http.get("/v1/jobs", headers={"Host": host})).status_code == 200
+        body = {"name": "x"}
+        for headers in (
+            {"Origin": "https://evil.example"},
+            {"Origin": "null"},
+            {"Origin": "http://localhost:9999"},
+            {"Sec-Fetch-Site": "cross-site"},
+        ):
+            assert (await http.post("/v1/datasets", json=body, headers=headers)).status_code == 403
+        own = {"Origin": "http://localhost:8642", "Sec-Fetch-Site": "same-origin"}
+        assert (await http.post("/v1/datasets", json=body, headers=own)).status_code == 201
+        answer = await http.get("/v1/info")
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+
+    talk(conversation)
+
+
+def test_first_token_shuts_the_door(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        new = {"name": "n", "owner": "me", "scopes": ["admin"]}
+        made = (await http.post("/v1/tokens", json=new)).json()
+        assert (await http.get("/v1/jobs")).status_code == 401
+        headers = {"Authorization": f"Bearer {made['token']}"}
+        assert (await http.get("/v1/jobs", headers=headers)).status_code == 200
+        listed = (await http.get("/v1/tokens", headers=headers)).json()["tokens"]
+        assert [t["id"] for t in listed] == [made["id"]] and "token" not in listed[0]
+        http.cookies.set("octasplat_token", made["token"])
+        assert (await http.get("/v1/jobs")).status_code == 200
+        http.cookies.clear()
+        async with service.pool.connection() as connection:
+            cursor = await connection.execute("SELECT * FROM tokens")
+            assert made["token"] not in str(await cursor.fetchall())
+        assert (await http.delete(f"/v1/tokens/{made['id']}", headers=headers)).status_code == 204
+        assert (await http.get("/v1/jobs", headers=headers)).status_code == 401
+
+    talk(conversation)
+
+
+def test_token_of_the_environment_is_let_in(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        assert (await http.get("/v1/jobs")).status_code == 401
+        headers = {"Authorization": "Bearer from-the-environment", "Host": "anything.example"}
+        assert (await http.get("/v1/tokens", headers=headers)).status_code == 200
+
+    talk(conversation, host="0.0.0.0", token=SecretStr("from-the-environment"))
+
+
+def test_public_address_without_a_token_is_refused(conninfo: str, tmp_path: Path) -> None:
+    async def start(host: str) -> None:
+        async with running(conninfo, tmp_path, host=host):
+            pass
+
+    for host in ("0.0.0.0", "::", "192.0.2.7", "example.org"):
+        with pytest.raises(ConfigError, match="token"):
+            asyncio.run(start(host))
+    for host in ("127.0.0.1", "127.8.8.8", "::1", "localhost"):
+        asyncio.run(start(host))

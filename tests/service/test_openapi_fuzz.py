@@ -1,0 +1,130 @@
+"""Schemathesis asks at every address of the OpenAPI document, in ways that fit it and in ways that do not."""
+
+import json
+import os
+import subprocess
+import sys
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from workers.storage.local import LocalStorage
+
+pytestmark = pytest.mark.heavy
+
+ROOT = Path(__file__).parents[2]
+TOKEN = "octa_for-the-fuzzing"
+EXAMPLES = os.environ.get("OCTASPLAT_TEST_EXAMPLES", "6")
+"""Requests of each kind for each operation; more for longer."""
+COPIES = 300
+CHECKS = (
+    "not_a_server_error", "status_code_conformance", "content_type_conformance",
+    "response_headers_conformance", "response_schema_conformance", "unsupported_method", "ignored_auth",
+)  # fmt: skip
+
+
+@dataclass
+class FrontEnd:
+    """A front end in a process of its own."""
+
+    process: "subprocess.Popen[str]"
+    address: str
+    log: Path
+
+
+@pytest.fixture
+def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
+    environment = {
+        **os.environ,
+        "DATABASE_URL": conninfo,
+        "OCTASPLAT_DATA": str(tmp_path),
+        "OCTASPLAT_FLOOR_BYTES": "0",
+        "OCTASPLAT_PORT": "0",
+        "OCTASPLAT_TOKEN": TOKEN,
+        "OCTASPLAT_KIND_MODULES": '["toy_kind"]',
+        "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'worker'}",
+    }
+    log = tmp_path / "service.log"
+    with log.open("wb") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "service"],
+            env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, text=True,
+        )  # fmt: skip
+    assert process.stdout is not None
+    address = process.stdout.readline().strip()
+    assert address.startswith("http"), log.read_text()
+    yield FrontEnd(process, address, log)
+    process.terminate()
+    process.wait(20)
+    process.stdout.close()
+
+
+def furnish(conninfo: str, tmp_path: Path) -> Path:
+    """Datasets and finished jobs with results to ask for; returns the file for the hooks."""
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    with storage.begin() as writer:
+        writer.write(b"ply\n")
+        sha256 = writer.commit().sha256
+    storage.close()
+    ids: dict[str, list[str]] = {"dataset_id": [], "job_id": []}
+    with psycopg.connect(conninfo) as connection:
+        for number in range(COPIES):
+            dataset, job = uuid.uuid4(), uuid.uuid4()
+            connection.execute(
+                "INSERT INTO datasets (id, owner, name, state) VALUES (%s, 'me', 'made', %s)",
+                [dataset, "committed" if number % 3 == 0 else "open"],
+            )
+            connection.execute(
+                "INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes) VALUES (%s, %s, %s, 4)",
+                [dataset, "images/a.png", sha256],
+            )
+            connection.execute(
+                """
+                INSERT INTO jobs (id, owner, kind, options, queue, state, dataset_id, finished_at)
+                VALUES (%s, 'me', 'toy', '{}', 'cpu', %s, %s, now())
+                """,
+                [job, ("succeeded", "failed", "canceled")[number % 3], dataset],
+            )
+            connection.execute(
+                "INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type) "
+                "VALUES (%s, 'scene.ply', %s, 4, 'application/octet-stream')",
+                [job, sha256],
+            )
+            ids["dataset_id"].append(str(dataset))
+            ids["job_id"].append(str(job))
+    kept = {name: some[:20] for name, some in ids.items()}
+    used = {name: some[20:] for name, some in ids.items()}
+    kept |= {"path": ["images/a.png"], "name": ["scene.ply"]}
+    used |= {"path": ["images/a.png", "images/b.png", "sparse/0/images.bin"]}
+    place = tmp_path / "ids.json"
+    place.write_text(json.dumps({"kept": kept, "used": used}))
+    return place
+
+
+def test_no_request_breaks_the_service(front_end: FrontEnd, conninfo: str, tmp_path: Path) -> None:
+    environment = {
+        **os.environ,
+        "OCTASPLAT_TEST_IDS": str(furnish(conninfo, tmp_path)),
+        "SCHEMATHESIS_HOOKS": "schemathesis_hooks",
+        "PYTHONPATH": str(Path(__file__).parent),
+    }
+    command = [
+        str(Path(sys.executable).with_name("schemathesis")), "run", f"{front_end.address}/openapi.json",
+        "--header", f"Authorization: Bearer {TOKEN}", "--phases", "examples,coverage,fuzzing",
+        "--max-examples", EXAMPLES, "--seed", "20261121", "--no-shrink", "--checks", ",".join(CHECKS),
+        "--request-timeout", "60", "--wait-for-schema", "60",
+        "--suppress-health-check", "all", "--warnings", "off", "--workers", "2",
+        "--continue-on-failure", "--no-color",
+    ]  # fmt: skip
+    done = subprocess.run(
+        command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stdout[-20_000:] + done.stderr[-2000:]
+    log = front_end.log.read_text()
+    assert "Traceback" not in log, log[-5000:]
+    assert front_end.process.poll() is None
+    print(done.stdout[-2500:])  # noqa: T201 - shown when the test fails or on request

@@ -1,0 +1,210 @@
+"""The whole way on one machine: ``octasplat serve``, a scene over HTTP, everything killed, the same bytes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from engine.pipeline import reconstruct
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from workers.client.api import Api, ServiceError
+from workers.client.download import download_results
+from workers.client.submission import Submission, submit
+from workers.client.upload import upload_scene
+from workers.client.watch import watch_job
+from workers.kinds.options import resolve_reconstruction
+
+pytestmark = pytest.mark.heavy
+
+ROOT = Path(__file__).parents[2]
+TRAIN = {
+    "iterations": 500, "rays": 512, "sh_degree": 1, "max_gaussians": 500, "initial_points": 400,
+    "fit_iterations": 20, "rebuild_every": 25, "checkpoint_every": 25, "probe_rays": 256,
+}  # fmt: skip
+OPTIONS: dict[str, Any] = {"preset": "fast", "train": TRAIN}
+
+
+@dataclass
+class Machine:
+    """A running ``octasplat serve``."""
+
+    data: Path
+    process: "subprocess.Popen[bytes]"
+
+    @property
+    def api(self) -> Api:
+        return Api(json.loads((self.data / "serve.json").read_text())["url"])
+
+    def children(self, word: str) -> list[psutil.Process]:
+        """Processes below whose command holds ``word``."""
+        found = []
+        for process in psutil.Process(self.process.pid).children(recursive=True):
+            try:
+                if word in " ".join(process.cmdline()):
+                    found.append(process)
+            except psutil.Error:
+                continue
+        return found
+
+    def stop(self) -> int:
+        if self.process.poll() is None:
+            self.process.terminate()
+        return self.process.wait(60)
+
+
+def start(data: Path) -> Machine:
+    environment = {
+        **os.environ,
+        "OCTASPLAT_FLOOR_BYTES": "0",
+        "OCTASPLAT_HEARTBEAT_SECONDS": "0.5",
+        "OCTASPLAT_STALE_SECONDS": "3",
+        "OCTASPLAT_RESCUE_SECONDS": "0.5",
+        "OCTASPLAT_POLL_SECONDS": "0.2",
+        "OMP_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "2",
+    }
+    (data / "serve.json").unlink(missing_ok=True)
+    log = data.parent / f"{data.name}.log"
+    command = [sys.executable, "-m", "workers", "serve", "--data", str(data), "--port", "0"]
+    with log.open("ab") as output:
+        process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=output)
+    machine = Machine(data, process)
+    deadline = time.monotonic() + 60
+    while not (data / "serve.json").exists():
+        assert process.poll() is None and time.monotonic() < deadline, log.read_text()
+        time.sleep(0.05)
+    return machine
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("served") / "scene"
+    write_generated_scene(
+        root, GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+    )
+    return root
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = resolve_reconstruction(OPTIONS).config()
+    return reconstruct(scene, tmp_path_factory.mktemp("undisturbed") / "run", config, threads=1)
+
+
+@pytest.fixture
+def machine(short_root: Path, request: pytest.FixtureRequest) -> Iterator[Machine]:
+    machine = start(short_root / f"m{abs(hash(request.node.name)) % 10**6}")
+    yield machine
+    machine.stop()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """The files that must not depend on what happened on the way."""
+    names = ("scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "held_out.json")
+    renders = [path.relative_to(folder).as_posix() for path in folder.glob("renders/**/*.png")]
+    assert renders
+    return {name: (folder / name).read_bytes() for name in (*names, *sorted(renders))}
+
+
+def test_everything_is_killed_and_the_result_is_the_same(
+    machine: Machine, scene: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    with machine.api as api:
+        job = submit(api, Submission(scene, OPTIONS, "killed"), quiet=True)
+        address = f"/v1/jobs/{job['id']}"
+
+        def until(ready: Any, seconds: float = 60.0) -> dict[str, Any]:
+            deadline = time.monotonic() + seconds
+            while not ready(now := api.get(address)):
+                assert time.monotonic() < deadline, now
+                time.sleep(0.05)
+            found: dict[str, Any] = now
+            return found
+
+        until(lambda job: job["checkpoint"] is not None and job["checkpoint"]["step"] >= 25)
+        for victim in machine.children("workers.worker.child"):
+            victim.kill()
+        until(lambda job: job["attempt"] >= 2 or job["state"] == "succeeded")
+        for victim in machine.children("--queues cpu"):
+            victim.kill()
+        for victim in machine.children("-m service"):
+            victim.kill()
+        done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
+        assert done["state"] == "succeeded", done
+        assert 2 <= done["attempt"] <= 4
+        events = api.get(f"/v1/jobs/{job['id']}/timeline", limit=5000)["events"]
+        resumed = [event["data"]["step"] for event in events if event["kind"] == "resumed"]
+        assert resumed and min(resumed) >= 25
+        download_results(api, job["id"], tmp_path / "result")
+        again = download_results(api, job["id"], tmp_path / "result")
+    assert contents(tmp_path / "result") == contents(undisturbed)
+    assert json.loads((tmp_path / "result" / "config.json").read_text())["scene"] == "scene"
+    assert (tmp_path / "result" / "report.html") in again
+
+
+def test_stop_and_start_go_on_and_other_kinds_use_the_result(
+    short_root: Path, scene: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    machine = start(short_root / "again")
+    try:
+        with machine.api as api:
+            dataset = upload_scene(api, scene)
+            assert dataset["state"] == "committed" and dataset["photographs"] == 8
+            assert upload_scene(api, scene)["id"] == dataset["id"]  # nothing is sent twice
+            job = submit(api, Submission(Path(dataset["id"]), OPTIONS), quiet=True)
+            while api.get(f"/v1/jobs/{job['id']}")["checkpoint"] is None:
+                time.sleep(0.05)
+        assert machine.stop() == 0
+        machine = start(short_root / "again")
+        with machine.api as api:
+            done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
+            assert done["state"] == "succeeded" and done["rescues"] == 0
+            download_results(api, job["id"], tmp_path / "result")
+            assert contents(tmp_path / "result") == contents(undisturbed)
+            assert done["preview"]["view"].endswith(".png")
+            picture = api.request("GET", f"/v1/jobs/{job['id']}/preview")
+            assert picture.content.startswith(b"\x89PNG")
+            for kind, options, expected in (
+                ("export", {"files": ["again.glb", "cloud.ply"]}, {"again.glb", "cloud.ply"}),
+                ("evaluate", {}, {"metrics.json", "report.html", "renders/view_000.png"}),
+                ("render", {"frames": 3, "width_px": 32, "height_px": 32}, {"turntable.mp4"}),
+                ("render", {"mode": "views", "format": "png"}, {"views/view_000.png"}),
+            ):
+                body = {"kind": kind, "source_id": job["id"], "options": options}
+                other = watch_job(
+                    api, api.post("/v1/jobs", body)["id"], lambda _event: None, lambda _state: None
+                )
+                assert other["state"] == "succeeded", other
+                artifacts = api.get(f"/v1/jobs/{other['id']}/artifacts")["artifacts"]
+                assert {artifact["name"] for artifact in artifacts} == expected
+            with pytest.raises(ServiceError, match="no result nothing"):
+                download_results(api, job["id"], tmp_path, names=("nothing",))
+    finally:
+        assert machine.stop() == 0
+
+
+def test_killed_database_comes_back(machine: Machine, scene: Path) -> None:
+    with machine.api as api:
+        job = submit(api, Submission(scene, OPTIONS), quiet=True)
+        while api.get(f"/v1/jobs/{job['id']}")["checkpoint"] is None:
+            time.sleep(0.05)
+        pid = int((machine.data / "postgres/cluster/postmaster.pid").read_text().split()[0])
+        os.kill(pid, signal.SIGKILL)
+        done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
+        assert done["state"] == "succeeded", done
+
+
+def test_second_service_on_the_same_data_is_refused(machine: Machine) -> None:
+    command = [sys.executable, "-m", "workers", "serve", "--data", str(machine.data), "--port", "0"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1 and "Another octasplat serve" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,131 @@
+"""What monitoring sees: true numbers, counters that never fall, and no ids."""
+
+import asyncio
+import re
+import uuid
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from service_bench import claimed, committed_dataset, running, with_token
+
+from service.state import Service
+from workers.queue.ids import new_id
+from workers.queue.rescue import rescue_lost_jobs
+from workers.queue.workers import see_worker
+
+Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
+PNG = bytes.fromhex(
+    "89504e470d0a1a0a0000000d4948445200000001000000010802000000907753de0000000c49444154789c63f8cfc000000301010018dd8d"
+    "b00000000049454e44ae426082"
+)
+
+
+@pytest.fixture
+def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
+    def run(conversation: Conversation, **settings: Any) -> None:
+        async def whole() -> None:
+            async with running(conninfo, tmp_path, **settings) as (http, service):
+                await conversation(http, service)
+
+        asyncio.run(whole())
+
+    return run
+
+
+async def read(http: httpx.AsyncClient, **headers: str) -> dict[str, float]:
+    """Values by name and labels, as Prometheus would read them."""
+    answer = await http.get("/metrics", headers=headers)
+    assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/plain; version=")
+    assert not re.search(r"[0-9a-f]{8}-[0-9a-f]{4}-|[0-9a-f]{32}", answer.text), "an id"
+    return {
+        sample.name + "".join(f"[{value}]" for value in sample.labels.values()): sample.value
+        for family in text_string_to_metric_families(answer.text)
+        for sample in family.samples
+    }
+
+
+async def new_job(http: httpx.AsyncClient, dataset: str, **more: Any) -> dict[str, Any]:
+    answer = await http.post("/v1/jobs", json={"kind": "toy", "dataset_id": dataset, **more})
+    job: dict[str, Any] = answer.json()
+    return job
+
+
+def test_numbers_are_those_of_the_tables(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        before = await read(http)
+        assert before["octasplat_queue_depth[cpu]"] == before["octasplat_job_attempts_total"] == 0
+        assert "octasplat_job_heartbeat_age_seconds" not in before and before["octasplat_workers"] == 0
+        assert before["octasplat_storage_free_bytes"] > 0 and before["process_resident_memory_bytes"] > 1e6
+        dataset = await committed_dataset(service)
+        jobs = [await new_job(http, dataset) for _ in range(4)] + [await new_job(http, dataset, queue="gpu")]
+        async with service.pool.connection() as connection:
+            await see_worker(connection, new_id(), name="w", queues=["cpu", "gpu"], slots=3, facts={})
+            await connection.execute("UPDATE workers SET seen_at = now() - interval '7 seconds'")
+            await connection.execute("UPDATE jobs SET queued_at = now() - interval '90 seconds'")
+        first = await claimed(service, jobs[0])
+        await claimed(service, jobs[1])
+        await (await claimed(service, jobs[2])).succeed([])
+        async with service.pool.connection() as connection:
+            await connection.execute(
+                "UPDATE jobs SET heartbeat_at = now() - interval '9 s' WHERE state = 'running'"
+            )
+        seen = await read(http)
+        assert (seen["octasplat_queue_depth[cpu]"], seen["octasplat_queue_depth[gpu]"]) == (1, 1)
+        assert 89 < seen["octasplat_queue_oldest_seconds[cpu]"] < 120
+        assert (seen["octasplat_jobs_running[cpu]"], seen["octasplat_jobs_running[gpu]"]) == (2, 0)
+        assert (seen["octasplat_worker_slots[cpu]"], seen["octasplat_workers"]) == (3, 1)
+        assert 6.9 < seen["octasplat_worker_heartbeat_age_seconds"] < 19
+        assert 8.9 < seen["octasplat_job_heartbeat_age_seconds"] < 30
+        assert seen["octasplat_job_attempts_total"] == 3
+        assert seen["octasplat_jobs_finished_total[succeeded]"] == 1
+        await first.cancel()
+        assert (await read(http))["octasplat_jobs_finished_total[canceled]"] == 1
+
+    talk(conversation)
+
+
+def test_rescues_and_poison_are_counted_and_outlive_the_job(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        job = await new_job(http, await committed_dataset(service))
+        for _ in range(4):
+            await claimed(service, job)
+            async with service.pool.connection() as connection:
+                await connection.execute("UPDATE jobs SET heartbeat_at = now() - interval '1 hour'")
+            assert await rescue_lost_jobs(service.pool, service.slips, 20) == 1
+        assert (await http.get(f"/v1/jobs/{job['id']}")).json()["state"] == "failed"
+        assert (await http.delete(f"/v1/jobs/{job['id']}")).status_code == 204
+        seen = await read(http)
+        assert (seen["octasplat_job_attempts_total"], seen["octasplat_job_rescues_total"]) == (4, 3)
+        assert seen["octasplat_job_poisoned_total"] == seen["octasplat_jobs_finished_total[failed]"] == 1
+
+    talk(conversation)
+
+
+def test_uploads_and_webhooks_are_counted(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = (await http.post("/v1/datasets", json={})).json()["id"]
+        answer = await http.put(f"/v1/datasets/{dataset}/files/images/a.png", content=PNG)
+        assert answer.status_code == 201, answer.text
+        hook = (await http.post("/v1/webhooks", json={"url": "https://example.org/"})).json()["id"]
+        await http.post(f"/v1/webhooks/{hook}/test")
+        seen = await read(http)
+        assert seen["octasplat_upload_bytes_total"] == len(PNG)
+        assert (seen["octasplat_webhook_messages[pending]"], seen["octasplat_webhook_messages[failed]"]) == (
+            1,
+            0,
+        )
+
+    talk(conversation)
+
+
+def test_metrics_need_a_token_where_there_are_any(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        reader = await with_token(service, f"u{uuid.uuid4().hex[:5]}", "read")
+        assert (await http.get("/metrics")).status_code == 401
+        assert await read(http, **reader)
+
+    talk(conversation)

@@ -1,0 +1,48 @@
+"""A front end that cannot start says why in one sentence."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def start(**environment: str) -> "subprocess.CompletedProcess[str]":
+    given = {name: value for name, value in os.environ.items() if not name.startswith("OCTASPLAT_")}
+    return subprocess.run(
+        [sys.executable, "-m", "service"],
+        env={**given, "OCTASPLAT_PORT": "0", **environment},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_database_that_is_down(tmp_path: Path) -> None:
+    done = start(DATABASE_URL="postgresql://user:hush@127.0.0.1:9/x", OCTASPLAT_DATA=str(tmp_path))
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("Error: The database cannot be reached") and "DATABASE_URL" in line
+    assert "hush" not in line
+
+
+def test_no_database_at_all(tmp_path: Path) -> None:
+    done = start(OCTASPLAT_DATA=str(tmp_path))
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1 and done.stderr.startswith("Error: ")
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [({"HOST": "0.0.0.0"}, "token"), ({"STORAGE": "/dev/null/store"}, "/dev/null/store")],
+)
+def test_settings_that_do_not_do(conninfo: str, tmp_path: Path, settings: dict[str, str], word: str) -> None:
+    given = {f"OCTASPLAT_{name}": value for name, value in settings.items()}
+    done = start(DATABASE_URL=conninfo, OCTASPLAT_DATA=str(tmp_path), **given)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("Error: ") and word in line

@@ -1,0 +1,402 @@
+"""Uploads through the API: every horror has its problem document, quotas and full disks too."""
+
+import asyncio
+import base64
+import hashlib
+import json
+import os
+import signal
+import socket as socket_module
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1] / "intake"))  # the builders of archives and models
+from model_builder import Model, photograph, photographs
+from zip_builder import Member, build
+
+from service.app import create_app
+from service.settings import ServiceSettings
+from workers.storage.local import LocalStorage
+
+ROOT = Path(__file__).parents[2]
+
+
+@asynccontextmanager
+async def client(
+    conninfo: str, folder: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any
+) -> AsyncIterator[httpx.AsyncClient]:
+    monkeypatch.setenv("DATABASE_URL", conninfo)
+    given = {"data": folder, "storage": str(folder / "store"), "floor_bytes": 0, **settings}
+    app = create_app(ServiceSettings(**given))
+    async with app.router.lifespan_context(app):
+        transport = httpx.ASGITransport(app=app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost:8642") as http:
+            yield http
+
+
+Talk = Callable[[Callable[[httpx.AsyncClient], Awaitable[None]]], None]
+
+
+@pytest.fixture
+def talk(conninfo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs a conversation with the service."""
+
+    def run(conversation: Callable[[httpx.AsyncClient], Awaitable[None]], **settings: Any) -> None:
+        async def whole() -> None:
+            async with client(conninfo, tmp_path, monkeypatch, **settings) as http:
+                await conversation(http)
+
+        asyncio.run(whole())
+
+    return run
+
+
+async def new_dataset(http: httpx.AsyncClient) -> str:
+    answer = await http.post("/v1/datasets", json={"name": "fox"})
+    assert answer.status_code == 201, answer.text
+    return answer.headers["Location"]
+
+
+def repr_digest(data: bytes) -> dict[str, str]:
+    return {"Repr-Digest": f"sha-256=:{base64.b64encode(hashlib.sha256(data).digest()).decode()}:"}
+
+
+def assert_problem(answer: httpx.Response, status: int, code: str) -> dict[str, Any]:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem: dict[str, Any] = answer.json()
+    assert problem["type"] == f"urn:octasplat:problem:{code}", problem
+    assert problem["detail"].endswith(".")
+    return problem
+
+
+def test_file_by_file(talk: Talk, tmp_path: Path) -> None:
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        files = {**photographs(), **Model().files()}
+        for name, data in files.items():
+            answer = await http.put(f"{dataset}/files/{name}", content=data, headers=repr_digest(data))
+            assert answer.status_code == 201, answer.text
+        again = await http.put(
+            f"{dataset}/files/images/v0.png", content=b"", headers=repr_digest(photograph())
+        )
+        assert again.status_code == 200
+        arrived = (await http.get(f"{dataset}/files")).json()["files"]
+        assert {file["path"]: file["sha256"] for file in arrived} == {
+            name: hashlib.sha256(data).hexdigest() for name, data in files.items()
+        }
+        committed = await http.post(f"{dataset}/commit")
+        assert committed.status_code == 200 and committed.json()["state"] == "committed", committed.text
+        late = await http.put(f"{dataset}/files/images/late.png", content=photograph())
+        assert_problem(late, 409, "conflict")
+
+    talk(conversation)
+    assert not list((tmp_path / "store" / "staging").iterdir())
+
+
+def test_an_archive(talk: Talk, tmp_path: Path) -> None:
+    files = {**photographs(), **Model().files()}
+    data = build(
+        *(Member(f"fox/{name}", content) for name, content in files.items()), Member("fox/x.md", b"x")
+    )
+
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        answer = await http.put(f"{dataset}/archive", content=data, headers=repr_digest(data))
+        assert answer.status_code == 200, answer.text
+        assert {file["path"] for file in answer.json()["files"]} == set(files)
+        assert answer.json()["left_out"] == ["fox/x.md"]
+        assert (await http.post(f"{dataset}/commit")).status_code == 200
+
+    talk(conversation)
+
+
+ARCHIVES = {
+    "name-traversal": lambda: build(Member("../evil.jpg", b"x")),
+    "name-absolute": lambda: build(Member("/etc/cron.d/evil", b"x")),
+    "name-drive": lambda: build(Member("C:/evil.jpg", b"x")),
+    "name-twin": lambda: build(Member("images/a.png", photograph()), Member("images/A.png", photograph())),
+    "archive-link": lambda: build(Member("images/a.png", b"/etc/passwd", mode=0o120777)),
+    "archive-ratio": lambda: build(Member("images/a.bmp", bytes(20_000_000))),
+    "archive-data-after-end": lambda: build(Member("images/a.png", photograph()), suffix=b"x"),
+    "archive-mismatch": lambda: build(Member("images/a.png", photograph(), local={"name": b"images/b.png"})),
+    "archive-nested": lambda: build(Member("images/a.zip", b"x")),
+    "archive-kind": lambda: b"\x1f\x8b\x08" + bytes(600),
+    "archive-damaged": lambda: b"hello",
+    "image-kind": lambda: build(Member("images/a.png", b"<svg>")),
+}
+
+
+@pytest.mark.parametrize("code", ARCHIVES)
+def test_hostile_archives(talk: Talk, tmp_path: Path, code: str) -> None:
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        problem = assert_problem(await http.put(f"{dataset}/archive", content=ARCHIVES[code]()), 422, code)
+        assert problem["errors"][0]["code"] == code
+        assert (await http.get(f"{dataset}/files")).json()["files"] == []
+
+    talk(conversation)
+    inside = {path.name for path in tmp_path.rglob("*") if path.is_file()}
+    assert not any("evil" in name for name in inside)
+    assert not list((tmp_path / "store" / "staging").iterdir())
+
+
+def test_hostile_names_and_contents_of_single_files(talk: Talk) -> None:
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        for path, content, status, code in (
+            ("images/..%2f..%2fevil.png", photograph(), 422, "name-traversal"),
+            ("%2fetc%2fpasswd", photograph(), 422, "name-absolute"),
+            ("images/a%00.png", photograph(), 422, "name-nul"),
+            ("images/CON.png", photograph(), 422, "name-reserved"),
+            ("images/a%5cb.png", photograph(), 422, "name-backslash"),
+            ("images/a.exe", photograph(), 422, "name-unexpected"),
+            ("state.pkl", b"x", 422, "name-unexpected"),
+            ("images/a.png", b"MZ" + bytes(99), 422, "image-kind"),
+            ("images/a.png", photograph()[:20], 422, "image-damaged"),
+        ):
+            answer = await http.put(f"{dataset}/files/{path}", content=content)
+            assert_problem(answer, status, code)
+            assert (await http.delete(f"{dataset}/files/{path}")).status_code == 404
+            assert (await http.get(f"{dataset}/files/{path}")).status_code == 404
+        wrong = await http.put(f"{dataset}/files/images/a.png", content=b"x", headers=repr_digest(b"y"))
+        assert_problem(wrong, 422, "digest-mismatch")
+        headers = {"Repr-Digest": "sha-256=:AAAA:"}
+        malformed = await http.put(f"{dataset}/files/images/a.png", content=b"x", headers=headers)
+        assert_problem(malformed, 422, "digest-malformed")
+        assert (await http.get(f"{dataset}/files")).json()["files"] == []
+        cursor = base64.urlsafe_b64encode(b"images/a\0b").decode().rstrip("=")
+        assert (await http.get(f"{dataset}/files", params={"cursor": cursor})).status_code == 422
+        for name in ("a\0b", "a" * 300, "", "\ud800"):
+            answer = await http.post("/v1/datasets", content=json.dumps({"name": name}))
+            assert answer.status_code == 422, answer.text
+
+    talk(conversation)
+
+
+MODELS = {
+    "name-traversal": lambda: Model().with_image(name="../../../../etc/passwd"),
+    "model-pose": lambda: Model().with_image(quat_wxyz=(0, 0, 0, 0)),
+    "model-camera": lambda: Model().with_camera(params=(-1, 31, 16, 12)),
+    "model-size": lambda: Model().with_camera(width=24, height=32),
+    "model-image-missing": lambda: Model().with_image(name="v9.png"),
+    "model-damaged": lambda: replace(Model(), counts={"points3D": 2**40}),
+}
+
+
+def test_hostile_models_are_listed_and_can_be_mended(talk: Talk) -> None:
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        for name, data in photographs().items():
+            await http.put(f"{dataset}/files/{name}", content=data)
+        for code, make in MODELS.items():
+            for name, data in make().files().items():
+                await http.put(f"{dataset}/files/{name}", content=data)
+            problem = assert_problem(await http.post(f"{dataset}/commit"), 422, code)
+            assert problem["errors"][0]["pointer"].startswith("#/files/sparse~10~1")
+            assert problem["errors"][0]["file"].startswith("sparse/0/")
+            assert (await http.get(dataset)).json()["state"] == "open"
+        for name, data in Model().files().items():
+            await http.put(f"{dataset}/files/{name}", content=data)
+        assert (await http.post(f"{dataset}/commit")).status_code == 200
+
+    talk(conversation)
+
+
+def test_limits_of_length(talk: Talk) -> None:
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        answer = await http.put(f"{dataset}/files/images/a.png", content=bytes(5000))
+        assert_problem(answer, 413, "too-large")
+
+        async def without_length() -> AsyncIterator[bytes]:
+            for _ in range(100):
+                yield bytes(1000)
+
+        answer = await http.put(f"{dataset}/files/images/a.png", content=without_length())
+        assert_problem(answer, 413, "too-large")
+        assert_problem(await http.put(f"{dataset}/archive", content=bytes(9000)), 413, "too-large")
+
+    talk(conversation, max_upload_bytes=4000, max_archive_bytes=8000)
+
+
+def test_quotas(talk: Talk) -> None:
+    size = len(photograph())
+
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        first = photograph(32, 24)
+        assert (await http.put(f"{dataset}/files/images/a.png", content=first)).status_code == 201
+        assert (await http.put(f"{dataset}/files/images/copy.png", content=b"")).status_code == 422
+        replaced = await http.put(f"{dataset}/files/images/a.png", content=photograph(24, 32))
+        assert replaced.status_code == 201, replaced.text
+        for number in range(8, 12):
+            answer = await http.put(
+                f"{dataset}/files/images/{number}.png", content=photograph(number, number)
+            )
+            if answer.status_code != 201:
+                break
+        assert "left of what you may store" in assert_problem(answer, 413, "quota-bytes")["detail"]
+        archive = build(
+            Member("images/z.png", photograph(40, 40)), Member("images/y.png", photograph(50, 40))
+        )
+        answer = await http.put(f"{dataset}/archive", content=archive)
+        assert answer.status_code == 413 or answer.json()["type"].endswith("archive-too-large"), answer.text
+        await new_dataset(http)
+        answer = await http.post("/v1/datasets", json={"name": "third"})
+        assert_problem(answer, 429, "quota-datasets")
+        assert "Retry-After" in answer.headers
+        used = sum(file["size_bytes"] for file in (await http.get(f"{dataset}/files")).json()["files"])
+        assert used <= 2 * size + 50
+
+    talk(conversation, quota_bytes=2 * size + 50, quota_datasets=2)
+
+
+def test_jobs_have_a_quota(talk: Talk) -> None:
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        for name, data in {**photographs(), **Model().files()}.items():
+            await http.put(f"{dataset}/files/{name}", content=data)
+        await http.post(f"{dataset}/commit")
+        body = {"kind": "reconstruct", "dataset_id": dataset.rpartition("/")[2]}
+        answers = [await http.post("/v1/jobs", json=body) for _ in range(3)]
+        assert [answer.status_code for answer in answers] == [202, 202, 429], answers[0].text
+        assert_problem(answers[2], 429, "quota-jobs")
+        await http.post(f"{answers[0].headers['Location']}/cancel")
+        assert (await http.post("/v1/jobs", json=body)).status_code == 202
+
+    talk(conversation, quota_jobs=2)
+
+
+def test_a_disk_below_its_floor(talk: Talk) -> None:
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        for path in ("files/images/a.png", "archive"):
+            answer = await http.put(f"{dataset}/{path}", content=photograph())
+            assert_problem(answer, 507, "storage-full")
+            assert "Retry-After" in answer.headers
+            assert str(Path.home()) not in answer.text and "/tmp" not in answer.text
+
+    talk(conversation, floor_bytes=1 << 60)
+
+
+SERVER = """
+import sys, uvicorn
+from service.app import create_app
+from service.settings import ServiceSettings
+uvicorn.run(create_app(ServiceSettings(port=0)), uds=sys.argv[1], log_level="warning")
+"""
+
+
+@pytest.fixture
+def start_server(conninfo: str, tmp_path: Path, short_root: Path) -> Iterator[Callable[[], tuple[int, Path]]]:
+    """Starts a service in a process of its own; gives its pid and its socket."""
+    environment = {
+        **os.environ,
+        "DATABASE_URL": conninfo,
+        "OCTASPLAT_DATA": str(tmp_path),
+        "OCTASPLAT_FLOOR_BYTES": "0",
+    }
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def start() -> tuple[int, Path]:
+        socket = short_root / f"{os.getpid()}-{len(processes)}.sock"
+        process = subprocess.Popen([sys.executable, "-c", SERVER, str(socket)], env=environment, cwd=ROOT)
+        processes.append(process)
+        deadline = time.monotonic() + 30
+        while not answers(socket):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        return process.pid, socket
+
+    yield start
+    for process in processes:
+        process.terminate()
+        process.wait(20)
+
+
+def answers(path: Path) -> bool:
+    """Whether somebody listens."""
+    with socket_module.socket(socket_module.AF_UNIX) as probe:
+        return probe.connect_ex(str(path)) == 0
+
+
+def peak_kib(pid: int) -> int:
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmHWM"):
+            return int(line.split()[1])
+    raise AssertionError(pid)
+
+
+def test_memory_does_not_grow_with_the_upload(
+    start_server: Callable[[], tuple[int, Path]], record_property: Callable[[str, object], None]
+) -> None:
+    pid, socket = start_server()
+    megabytes = int(os.environ.get("OCTASPLAT_UPLOAD_MB", "300"))
+
+    def body(count: int) -> Iterator[bytes]:
+        for number in range(count):
+            yield number.to_bytes(8, "big") * (1 << 17)
+
+    transport = httpx.HTTPTransport(uds=str(socket))
+    with httpx.Client(transport=transport, base_url="http://localhost:8642", timeout=600) as http:
+        dataset = http.post("/v1/datasets", json={"name": "large"}).headers["Location"]
+        name = "sparse/0/points3D.bin"
+        assert http.put(f"{dataset}/files/{name}", content=body(8)).status_code == 201
+        before = peak_kib(pid)
+        began = time.perf_counter()
+        answer = http.put(f"{dataset}/files/{name}", content=body(megabytes))
+        seconds = time.perf_counter() - began
+        assert answer.status_code == 201, answer.text
+        assert answer.json()["size_bytes"] == megabytes << 20
+    grown = peak_kib(pid) - before
+    record_property(
+        "upload", f"{megabytes} MiB in {seconds:.1f} s, peak {peak_kib(pid)} KiB, grown {grown} KiB"
+    )
+    assert grown < 16 << 10
+
+
+def test_a_killed_service_keeps_whole_files_only(
+    start_server: Callable[[], tuple[int, Path]], tmp_path: Path
+) -> None:
+    content = os.urandom(1 << 20) * 24
+    digest = repr_digest(content)
+    pid, socket = start_server()
+
+    def slow_body() -> Iterator[bytes]:
+        for number in range(24):
+            if number == 16:
+                os.kill(pid, signal.SIGKILL)
+            yield content[number << 20 : (number + 1) << 20]
+
+    def connect(path: Path) -> httpx.Client:
+        transport = httpx.HTTPTransport(uds=str(path))
+        return httpx.Client(transport=transport, base_url="http://localhost:8642", timeout=60)
+
+    name = "sparse/0/points3D.bin"
+    with connect(socket) as http:
+        dataset = http.post("/v1/datasets", json={"name": "killed"}).headers["Location"]
+        assert http.put(f"{dataset}/files/images/a.png", content=photograph()).status_code == 201
+        with pytest.raises(httpx.TransportError):
+            http.put(f"{dataset}/files/{name}", content=slow_body(), headers=digest)
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    assert len(list(storage.blobs())) == 1
+    _, socket = start_server()
+    with connect(socket) as http:
+        arrived = http.get(f"{dataset}/files").json()["files"]
+        assert [file["path"] for file in arrived] == ["images/a.png"]
+        answer = http.put(f"{dataset}/files/{name}", content=content, headers=digest)
+        assert answer.status_code == 201, answer.text
+        assert http.get(f"{dataset}/files/{name}").content == content
+    assert storage.sweep(-60) == 1  # what the killed upload left, for the next sweep
+    assert len(list(storage.blobs())) == 2
+    storage.close()

@@ -1,0 +1,343 @@
+"""Webhooks: told of jobs in time and signed, tried again for a day, never sent into inner networks."""
+
+import asyncio
+import base64
+import uuid
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from hook_receiver import Receiver, receiving
+from httpx_secure import SSRFProtectionError
+from service_bench import claimed, committed_dataset, running, with_token
+from standardwebhooks.webhooks import Webhook, WebhookVerificationError
+
+from service.state import Service
+from workers.queue.database import open_pool
+from workers.webhooks.addresses import AddressRefused, check_url
+from workers.webhooks.outbox import WAITS_SECONDS, take_due
+from workers.webhooks.sending import guarded_client, send_due
+
+Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
+HERE = ("127.0.0.1",)
+SECRET = "whsec_" + base64.b64encode(b"0123456789abcdef01234567").decode()
+
+
+@pytest.fixture
+def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
+    def run(conversation: Conversation, **settings: Any) -> None:
+        async def whole() -> None:
+            async with running(conninfo, tmp_path, webhook_hosts=HERE, **settings) as (http, service):
+                await conversation(http, service)
+
+        asyncio.run(whole())
+
+    return run
+
+
+async def make(http: httpx.AsyncClient, receiver: Receiver, **more: Any) -> dict[str, Any]:
+    answer = await http.post("/v1/webhooks", json={"url": receiver.url, **more})
+    assert answer.status_code == 201, answer.text
+    made: dict[str, Any] = answer.json()
+    assert answer.headers["Location"] == f"/v1/webhooks/{made['id']}"
+    return made
+
+
+async def new_job(http: httpx.AsyncClient, service: Service, **body: Any) -> dict[str, Any]:
+    given = {"kind": "toy", "dataset_id": await committed_dataset(service), **body}
+    answer = await http.post("/v1/jobs", json=given)
+    assert answer.status_code == 202, answer.text
+    job: dict[str, Any] = answer.json()
+    return job
+
+
+async def deliveries(http: httpx.AsyncClient, hook: dict[str, Any]) -> list[dict[str, Any]]:
+    answer = await http.get(f"/v1/webhooks/{hook['id']}/deliveries")
+    found: list[dict[str, Any]] = answer.json()["deliveries"]
+    return found
+
+
+async def make_due(service: Service) -> None:
+    """Let the wait for the next try be over."""
+    async with service.pool.connection() as connection:
+        await connection.execute("UPDATE webhook_deliveries SET due_at = now() WHERE state = 'pending'")
+
+
+def test_end_of_a_job_is_told_signed_and_thin(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving() as receiver:
+            hook = await make(http, receiver)
+            job = await new_job(http, service, label="fox")
+            assert await send_due(service.pool, HERE) == 0  # that it was queued is not asked for
+            await (await claimed(service, job)).fail({"type": "refused", "message": "a private path"})
+            assert await send_due(service.pool, HERE) == 1
+            assert await send_due(service.pool, HERE) == 0
+        ((path, headers, body),) = receiver.heard
+        heard = Webhook(hook["secret"]).verify(body, headers)
+        with pytest.raises(WebhookVerificationError):
+            Webhook(hook["secret"]).verify(body.replace(b"failed", b"queued"), headers)
+        with pytest.raises(WebhookVerificationError):
+            Webhook(SECRET).verify(body, headers)
+        assert (path, headers["content-type"]) == ("/hook", "application/json")
+        assert heard["type"] == "job.failed"
+        assert heard["data"] == {
+            "job_id": job["id"], "kind": "toy", "label": "fox", "state": "failed", "attempt": 1
+        }  # fmt: skip
+        assert heard["timestamp"].endswith("Z") and b"private" not in body
+        (told,) = await deliveries(http, hook)
+        assert (told["state"], told["status"], told["tries"], told["due_at"]) == ("delivered", 204, 1, None)
+        assert told["message_id"] == headers["webhook-id"] and told["payload"] == heard
+
+    talk(conversation)
+
+
+def test_what_is_rolled_back_is_not_told(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving() as receiver:
+            hook = await make(http, receiver, events=["job.canceling"])
+            attempt = await claimed(service, await new_job(http, service))
+            async with service.pool.connection() as connection:
+                with pytest.raises(RuntimeError):
+                    async with connection.transaction():
+                        await connection.execute(
+                            "INSERT INTO job_events (job_id, attempt, kind, data) "
+                            "VALUES (%s, 1, 'state', '{\"state\": \"canceling\"}')",
+                            [attempt.job.id],
+                        )
+                        raise RuntimeError
+            assert await deliveries(http, hook) == []
+            assert (await http.post(f"/v1/jobs/{attempt.job.id}/cancel")).status_code == 202
+            assert [told["kind"] for told in await deliveries(http, hook)] == ["job.canceling"]
+
+    talk(conversation)
+
+
+def test_webhook_of_one_job(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving() as receiver:
+            hook = {"url": receiver.url, "secret": SECRET}
+            job = await new_job(http, service, webhook=hook)
+            await new_job(http, service)
+            for listed in (await http.get("/v1/jobs")).json()["jobs"]:
+                assert (await http.post(f"/v1/jobs/{listed['id']}/cancel")).status_code == 202
+            await send_due(service.pool, HERE)
+            ((_, headers, body),) = receiver.heard
+            assert Webhook(SECRET).verify(body, headers)["data"]["job_id"] == job["id"]
+            (made,) = (await http.get("/v1/webhooks")).json()["webhooks"]
+            assert made["job_id"] == job["id"] and "secret" not in made
+            inner = {**hook, "url": "https://10.0.0.1/"}
+            body_ = {"kind": "toy", "dataset_id": job["dataset_id"], "webhook": inner}
+            answer = await http.post("/v1/jobs", json=body_)
+            assert answer.status_code == 422 and answer.json()["errors"][0]["pointer"] == "#/webhook/url"
+            assert (await http.delete(f"/v1/jobs/{job['id']}")).status_code == 204
+            assert (await http.get("/v1/webhooks")).json()["webhooks"] == []
+
+    talk(conversation)
+
+
+def test_is_tried_again_for_a_day_with_the_same_message(talk: Callable[..., None]) -> None:
+    assert 23 * 3600 < sum(WAITS_SECONDS) <= 86_400 and list(WAITS_SECONDS) == sorted(WAITS_SECONDS)
+
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving(500) as receiver:
+            hook = await make(http, receiver)
+            assert (await http.post(f"/v1/webhooks/{hook['id']}/test")).status_code == 202
+            for tries, wait in enumerate(WAITS_SECONDS, start=1):
+                assert await send_due(service.pool, HERE) == 1
+                (told,) = await deliveries(http, hook)
+                assert (told["state"], told["tries"], told["status"]) == ("pending", tries, 500)
+                async with service.pool.connection() as connection:
+                    cursor = await connection.execute(
+                        "SELECT extract(epoch FROM due_at - now())::float8 AS wait FROM webhook_deliveries"
+                    )
+                    row = await cursor.fetchone()
+                assert row is not None and 0.95 * wait - 2 < row["wait"] <= 1.1 * wait
+                await make_due(service)
+            assert await send_due(service.pool, HERE) == 1
+            (told,) = await deliveries(http, hook)
+            assert (told["state"], told["due_at"]) == ("failed", None) and "500" in told["error"]
+            receiver.statuses = [200]
+            again = await http.post(f"/v1/webhooks/{hook['id']}/deliveries/{told['id']}/redeliver")
+            assert again.status_code == 202 and again.json()["state"] == "pending"
+            assert await send_due(service.pool, HERE) == 1
+            assert (await deliveries(http, hook))[0]["state"] == "delivered"
+            assert len(receiver.heard) == len(WAITS_SECONDS) + 2
+            assert len({(headers["webhook-id"], body) for _, headers, body in receiver.heard}) == 1
+            for _, headers, body in receiver.heard:
+                assert Webhook(hook["secret"]).verify(body, headers)["type"] == "webhook.test"
+
+    talk(conversation)
+
+
+def test_gone_disables_it_until_its_owner_says_otherwise(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving(500, 410, 204) as receiver:
+            hook = await make(http, receiver)
+            address = f"/v1/webhooks/{hook['id']}"
+            await http.post(f"{address}/test")
+            await send_due(service.pool, HERE)
+            await http.post(f"{address}/test")
+            assert await send_due(service.pool, HERE) == 1
+            seen = (await http.get(address)).json()
+            assert not seen["enabled"] and "410" in seen["disabled_reason"]
+            assert {told["state"] for told in await deliveries(http, hook)} == {"failed"}
+            await (await claimed(service, await new_job(http, service))).cancel()
+            await make_due(service)
+            assert await send_due(service.pool, HERE) == 0
+            answer = await http.post(f"{address}/test")
+            assert answer.status_code == 409 and answer.json()["type"].endswith("webhook-disabled")
+            seen = (await http.patch(address, json={"enabled": True})).json()
+            assert seen["enabled"] and seen["disabled_reason"] is None
+            await http.post(f"{address}/test")
+            assert await send_due(service.pool, HERE) == 1 and len(receiver.heard) == 3
+
+    talk(conversation)
+
+
+def test_redirects_are_not_followed(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving(307) as receiver:
+            hook = await make(http, receiver)
+            await http.post(f"/v1/webhooks/{hook['id']}/test")
+            await send_due(service.pool, HERE)
+            assert [path for path, _, _ in receiver.heard] == ["/hook"]
+            assert (await deliveries(http, hook))[0]["status"] == 307
+
+    talk(conversation)
+
+
+def test_two_senders_share_and_a_lost_one_is_replaced(talk: Callable[..., None], conninfo: str) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving() as receiver:
+            hook = await make(http, receiver)
+            for _ in range(30):
+                await http.post(f"/v1/webhooks/{hook['id']}/test")
+            async with service.pool.connection() as connection:
+                lost = await take_due(connection, 5)  # and its sender dies
+            assert len(lost) == 5
+            async with open_pool(conninfo, max_size=4) as other:
+                sent = await asyncio.gather(send_due(service.pool, HERE), send_due(other, HERE))
+            assert sum(sent) == 25 == len({headers["webhook-id"] for _, headers, _ in receiver.heard})
+            await make_due(service)
+            assert await send_due(service.pool, HERE) == 5
+            assert len({headers["webhook-id"] for _, headers, _ in receiver.heard}) == 30
+
+    talk(conversation)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://example.org/", "ftp://example.org/", "https://example.org:22/", "https://u:p@example.org/",
+        "https://example.org/#x", "https://", "https://[::1", "https://exa mple.org/", "javascript:alert(1)",
+        "https://localhost/", "https://printer.local/", "https://intranet/", "https://127.0.0.1/",
+        "https://10.1.2.3/", "https://169.254.169.254/latest", "https://[::ffff:10.0.0.1]/",
+        "https://[fd00::1]/", "https://100.64.0.1/", "https://example.org:99999/", "https://127.0.0.1./",
+    ],
+)  # fmt: skip
+def test_addresses_that_are_refused(url: str) -> None:
+    with pytest.raises(AddressRefused):
+        check_url(url)
+
+
+def test_addresses_that_are_taken() -> None:
+    for url in ("https://example.org/hook?x=1", "https://example.org:8443/", "https://93.184.216.34/"):
+        assert check_url(url) == url
+    assert check_url("http://hooks.internal:9000/x", ("hooks.internal",))
+    with pytest.raises(AddressRefused):
+        check_url("http://other.internal:9000/x", ("hooks.internal",))
+
+
+@pytest.mark.parametrize("allowed", [(), ("elsewhere.internal",)])
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1", "[::1]", "[::ffff:127.0.0.1]", "2130706433", "0x7f000001", "localhost", "[64:ff9b::7f00:1]",
+     "100.64.0.1", "169.254.169.254", "[fd00::1]", "224.0.0.1", "0.0.0.0"],
+)  # fmt: skip
+def test_connections_into_inner_networks_are_not_made(host: str, allowed: tuple[str, ...]) -> None:
+    with receiving() as receiver:
+
+        async def try_it() -> None:
+            async with guarded_client(allowed) as client:
+                with pytest.raises(SSRFProtectionError):
+                    await client.post(f"http://{host}:{receiver.port}/hook", content=b"x")
+
+        asyncio.run(try_it())
+        assert receiver.heard == []
+
+
+def test_name_that_leads_inside_is_found_out_when_sending(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving() as receiver:
+            hook = await make(http, receiver)
+            await http.post(f"/v1/webhooks/{hook['id']}/test")
+            await send_due(service.pool, ())  # this worker's settings allow no inner hosts
+            assert receiver.heard == []
+            (told,) = await deliveries(http, hook)
+            assert told["state"] == "pending" and "network" in told["error"] and told["status"] is None
+
+    talk(conversation)
+
+
+def test_only_their_owner_sees_webhooks(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        mine = await with_token(service, "me", "write")
+        other = await with_token(service, "stranger", "write")
+        with receiving() as receiver:
+            made = (await http.post("/v1/webhooks", json={"url": receiver.url}, headers=mine)).json()
+            address = f"/v1/webhooks/{made['id']}"
+            told = (await http.post(f"{address}/test", headers=mine)).json()
+            again = f"{address}/deliveries/{told['id']}/redeliver"
+            for method, path in [
+                ("GET", address), ("PATCH", address), ("DELETE", address), ("POST", f"{address}/test"),
+                ("GET", f"{address}/deliveries"), ("POST", again),
+            ]:  # fmt: skip
+                body = {"json": {}} if method == "PATCH" else {}
+                assert (await http.request(method, path, headers=other, **body)).status_code == 404, path
+            assert (await http.get("/v1/webhooks", headers=other)).json()["webhooks"] == []
+            given = {"kind": "toy", "dataset_id": await committed_dataset(service, "me")}
+            job = (await http.post("/v1/jobs", json=given, headers=mine)).json()
+            spy = {"url": receiver.url, "job_id": job["id"]}
+            assert (await http.post("/v1/webhooks", json=spy, headers=other)).status_code == 404
+            await http.post("/v1/webhooks", json={"url": receiver.url}, headers=other)
+            await http.post(f"/v1/jobs/{job['id']}/cancel", headers=mine)
+            assert await send_due(service.pool, HERE) == 2  # the test and the owner's message
+            assert (
+                await http.post(f"{address}/deliveries/{uuid.uuid4()}/redeliver", headers=mine)
+            ).status_code == 404
+            assert (await http.delete(address, headers=mine)).status_code == 204
+            assert (await http.get(address, headers=mine)).status_code == 404
+
+    talk(conversation)
+
+
+@pytest.mark.parametrize(
+    ("body", "pointer"),
+    [
+        ({"url": "http://example.org"}, "#/url"),
+        ({"url": "https://example.org", "secret": "short"}, "#/secret"),
+        ({"url": "https://example.org", "secret": "whsec_AAAA"}, "#/secret"),
+        ({"url": "https://example.org", "events": []}, "#/events"),
+        ({"url": "https://example.org", "events": ["job.exploded"]}, "#/events/0"),
+    ],
+)
+def test_what_makes_no_sense_as_webhook(
+    talk: Callable[..., None], body: dict[str, Any], pointer: str
+) -> None:
+    async def conversation(http: httpx.AsyncClient, _service: Service) -> None:
+        answer = await http.post("/v1/webhooks", json=body)
+        assert answer.status_code == 422
+        assert answer.json()["errors"][0]["pointer"] == pointer
+
+    talk(conversation)
+
+
+def test_there_is_an_end_of_webhooks(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, _service: Service) -> None:
+        body = {"url": "https://example.org/hook"}
+        statuses = [(await http.post("/v1/webhooks", json=body)).status_code for _ in range(51)]
+        assert statuses == [201] * 50 + [422]
+
+    talk(conversation)

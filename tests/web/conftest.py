@@ -1,0 +1,146 @@
+"""A service on a database and a store of its own, and headless Chromium to use it with."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+from psycopg.conninfo import make_conninfo
+
+sys.path.append(str(Path(__file__).parents[1]))
+sys.path.append(str(Path(__file__).parents[1] / "tools"))
+from browser import PLAYWRIGHT, chromium
+from npm_packages import npm_folder
+from postgres_for_tests import postgres, short_root, template
+from replay import Replay
+
+from workers.queue.embedded_postgres import EmbeddedPostgres
+
+__all__ = ["postgres", "short_root", "template"]
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Service:
+    """A service that runs.
+
+    Attributes:
+        url: where.
+        store: its folder of contents.
+        worker: plays a worker's part.
+    """
+
+    url: str
+    store: Path
+    worker: Replay
+
+    def ask(self, method: str, path: str, body: object = None, **headers: str) -> Any:
+        """The JSON that the API answers."""
+        data = body if isinstance(body, bytes) else None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.url + path, data=data, method=method, headers=headers)
+        if body is not None and not isinstance(body, bytes):
+            request.add_header("Content-Type", "application/json")
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            text = answer.read()
+        return json.loads(text) if text else None
+
+
+StartService = Callable[..., Service]
+
+
+@pytest.fixture(scope="module")
+def database(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
+    """A database for the tests of one module."""
+    name = f"web_{uuid.uuid4().hex[:12]}"
+    admin = make_conninfo(postgres.conninfo(), dbname="postgres")
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f'CREATE DATABASE "{name}" TEMPLATE "{template}"'.encode())
+    yield make_conninfo(postgres.conninfo(), dbname=name)
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
+
+
+@pytest.fixture(scope="module")
+def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[StartService]:
+    """Starts a front end; settings as in its environment, without their prefix."""
+    root = tmp_path_factory.mktemp("service")
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def start(**settings: str) -> Service:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        given = {"DATA": str(root), "PORT": str(port), "FLOOR_BYTES": "0", **settings}
+        environment = {
+            **os.environ,
+            "DATABASE_URL": database,
+            **{f"OCTASPLAT_{key}": value for key, value in given.items()},
+        }
+        process = subprocess.Popen([sys.executable, "-m", "service"], env=environment, cwd=ROOT)
+        processes.append(process)
+        url = f"http://127.0.0.1:{port}"
+        deadline = time.monotonic() + 240
+        while True:
+            assert process.poll() is None and time.monotonic() < deadline
+            try:
+                urllib.request.urlopen(f"{url}/healthz", timeout=5).close()
+                break
+            except (urllib.error.URLError, OSError):
+                time.sleep(0.1)
+        store = root / "store"
+        return Service(url, store, Replay(database, store))
+
+    yield start
+    for process in processes:
+        process.terminate()
+        process.wait(20)
+
+
+@pytest.fixture(scope="module")
+def service(start_service: StartService) -> Service:
+    """A front end without tokens."""
+    return start_service()
+
+
+Browse = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def browse(tmp_path_factory: pytest.TempPathFactory) -> Browse:
+    """Runs the steps of a script in ``steps.mjs`` against a service; skips without Chromium or node."""
+    browser, playwright = chromium(), npm_folder(*PLAYWRIGHT)
+    node = shutil.which("node")
+    assert node is not None
+
+    def run(name: str, url: str, *, seconds: float = 240, **job: Any) -> dict[str, Any]:
+        shots = Path(os.environ.get("OCTASPLAT_SCREENSHOTS", tmp_path_factory.getbasetemp() / "shots"))
+        shots.mkdir(parents=True, exist_ok=True)
+        given = {
+            "name": name, "url": url, "chromium": str(browser), "playwright": str(playwright),
+            "shots": str(shots), "seconds": seconds, **job,
+        }  # fmt: skip
+        done = subprocess.run(
+            [node, str(Path(__file__).with_name("steps.mjs"))],
+            input=json.dumps(given),
+            capture_output=True,
+            text=True,
+            timeout=seconds + 60,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
+        found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+        return found
+
+    return run

@@ -1,0 +1,318 @@
+// Steps through the pages in headless Chromium. The job comes on stdin as JSON: {name, url, chromium, playwright,
+// shots, seconds, ...}; what the steps found goes to stdout as JSON, with everything that a browser complains of.
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+import { join } from "node:path";
+
+const job = JSON.parse(readFileSync(0, "utf8"));
+const { chromium } = createRequire(join(job.playwright, "package.json"))("playwright-core");
+const complaints = [];
+
+const browser = await chromium.launch({
+    executablePath: job.chromium,
+    args: ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--force-color-profile=srgb"],
+});
+
+async function open({ width = 1200, height = 860, ...options } = {}) {
+    const context = await browser.newContext({ viewport: { width, height }, ...options });
+    context.setDefaultTimeout(job.seconds * 1000);
+    const page = await context.newPage();
+    page.on("pageerror", (error) => complaints.push(`error: ${error.message}`));
+    page.on("console", (message) => {
+        // What the steps break on purpose is no complaint.
+        if (message.type() === "error" && !/ERR_(FAILED|ABORTED|CONNECTION)/.test(message.text())) complaints.push(`console: ${message.text()} ${message.location().url}`);
+    });
+    return page;
+}
+
+const shot = (page, name, fullPage = true) => page.screenshot({ path: join(job.shots, `${name}.png`), fullPage });
+const overflow = (page) => page.evaluate(() => document.documentElement.scrollWidth - document.documentElement.clientWidth);
+
+/** Names of all controls that a screen reader would find nameless. */
+const nameless = (page) => page.evaluate(() => [...document.querySelectorAll("a, button, input:not([type=hidden]), select, canvas, progress, img")]
+    .filter((part) => part.checkVisibility() && !part.parentElement.closest("[role=img]"))
+    .filter((part) => {
+        const labelled = part.getAttribute("aria-label") || part.getAttribute("aria-labelledby") || part.labels?.length || part.textContent.trim() || part.title;
+        return part.tagName === "IMG" ? part.getAttribute("alt") === null : !labelled && part.getAttribute("aria-hidden") !== "true";
+    })
+    .map((part) => part.outerHTML.slice(0, 200)));
+
+/** Mean and spread of the brightness of what the viewer shows. */
+async function brightness(page) {
+    const clip = await page.locator("#viewer canvas").boundingBox();
+    const png = (await page.screenshot({ clip })).toString("base64");
+    return page.evaluate(async (data) => {
+        const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+        const image = await createImageBitmap(new Blob([bytes], { type: "image/png" }));
+        const canvas = new OffscreenCanvas(image.width, image.height), context = canvas.getContext("2d");
+        context.drawImage(image, 0, 0);
+        const { data: pixels } = context.getImageData(0, 0, image.width, image.height);
+        let sum = 0, squares = 0, count = 0;
+        for (let k = 0; k < pixels.length; k += 4) { const v = (pixels[k] + pixels[k + 1] + pixels[k + 2]) / 3; sum += v; squares += v * v; count += 1; }
+        return { mean: sum / count, deviation: Math.sqrt(squares / count - (sum / count) ** 2) };
+    }, png);
+}
+
+const steps = {
+    /** A folder is chosen; half of it arrives and the page is left; the second time only the rest is sent. */
+    async flow() {
+        const found = {};
+        let page = await open();
+        await page.goto(`${job.url}/`);
+        found.empty = await page.locator(".empty h2").textContent();
+        await shot(page, "empty");
+        const puts = [];
+        const listenTo = (page) => page.on("request", (request) => { if (request.method() === "PUT") puts.push(decodeURIComponent(new URL(request.url()).pathname.split("/files/")[1])); });
+
+        listenTo(page);
+        let let_through = job.first;
+        await page.route("**/files/**", (route) => {
+            if (route.request().method() !== "PUT" || let_through-- > 0) route.continue();
+            else route.abort("connectionfailed");
+        });
+        await page.goto(`${job.url}/new`);
+        await page.setInputFiles("#pick-folder", job.folder);
+        found.chosen = await page.locator("#chosen-text").textContent();
+        await page.click("#start");
+        await page.waitForFunction(() => /connection is lost/.test(document.getElementById("going-text").textContent));
+        await shot(page, "interrupted");
+        await page.context().close();
+        found.firstPuts = puts.splice(0);
+
+        page = await open();
+        listenTo(page);
+        await page.goto(`${job.url}/new`);
+        await shot(page, "new");
+        await page.setInputFiles("#pick-folder", job.folder);
+        await page.selectOption("[data-path=preset]", "fast");
+        found.iterationsHint = await page.getAttribute("[data-path='train.iterations']", "placeholder");
+        await page.fill("#label", "a still life");
+        await page.click("details.all summary");
+        for (const [path, value] of Object.entries(job.options)) await page.fill(`[data-path='${path}']`, String(value));
+        await shot(page, "new_settings");
+        found.namelessOnNew = await nameless(page);
+        await page.click("#start");
+        await page.waitForURL("**/jobs/*-*");
+        found.secondPuts = puts.splice(0);
+        found.job = page.url().split("/").pop();
+        return found;
+    },
+
+    /** A job that waits, runs and ends while its page and the list are open; nothing is reloaded by hand. */
+    async watch() {
+        const found = { states: [], list: [] };
+        const page = await open(), list = await open();
+        await list.goto(`${job.url}/`);
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        const seen = async () => {
+            const state = await page.getAttribute("#status", "data-state").catch(() => null);
+            if (state && found.states.at(-1) !== state) { found.states.push(state); await shot(page, `job_${state}`); }
+            const chip = await list.locator(".job .chip").first().textContent().catch(() => null);
+            if (chip && found.list.at(-1) !== chip) found.list.push(chip);
+            return state;
+        };
+        const began = Date.now();
+        while (await seen() !== "succeeded") {
+            if (Date.now() - began > job.seconds * 1000) throw new Error(`the job is ${found.states}`);
+            found.curves = Math.max(found.curves ?? 0, await page.locator(".chart canvas").count());
+            found.preview ||= await page.locator("#preview .below").count() > 0;
+            await page.waitForTimeout(300);
+        }
+        await list.waitForFunction(() => document.querySelector(".job .chip")?.textContent === "Done");
+        await shot(list, "jobs");
+        await page.waitForSelector("#viewer[data-ready=yes]");
+        await page.waitForTimeout(700);
+        await shot(page, "result");
+        found.view = await brightness(page);
+        found.nameless = [...await nameless(page), ...await nameless(list)];
+        found.overflow = await overflow(page);
+        return found;
+    },
+
+    /** The result by pointer: sorting, another view, the difference, the report, a download. */
+    async result() {
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        const column = (k) => page.locator(".sortable tbody tr").evaluateAll((rows, k) => rows.map((row) => row.cells[k].dataset.sort), k);
+        const found = { worstFirst: (await column(1)).map(Number) };
+        await page.click(".sortable thead th:nth-child(2) button");
+        found.bestFirst = (await column(1)).map(Number);
+        await page.click(".sortable thead th:first-child button");
+        found.byName = await column(0);
+        await page.locator(".sortable tbody tr").nth(1).click();
+        found.shown = await page.locator(".view-name").textContent();
+        await page.waitForFunction(() => [...document.querySelectorAll("#view-shown img")].every((image) => image.complete && image.naturalWidth > 0));
+        found.boxes = await page.evaluate(() => [".below", ".above"].map((name) => { const box = document.querySelector(`#view-shown ${name}`).getBoundingClientRect(); return [box.x, box.y, box.width, box.height].map(Math.round); }));
+        await page.click("[data-mode=difference]");
+        await shot(page, "difference");
+        const download = page.waitForEvent("download");
+        await page.click(".files-list a[href$='metrics.json']");
+        found.download = (await download).suggestedFilename();
+        const [report] = await Promise.all([page.context().waitForEvent("page"), page.click("text=Open the report")]);
+        await report.waitForLoadState();
+        found.report = await report.title();
+        found.reportRuns = await report.evaluate(() => document.documentElement.classList.contains("js") || document.querySelectorAll(".strip button").length > 0);
+        found.reportOrigin = await report.evaluate(() => self.origin);
+        await shot(report, "report", false);
+        const before = await page.locator("#viewer").getAttribute("data-ready");
+        await page.waitForSelector("#viewer[data-ready=yes]");
+        found.viewerReady = before !== "failed";
+        return found;
+    },
+
+    /** From the list to the viewer and back with keys alone; nothing is clicked. */
+    async keyboard() {
+        const found = {};
+        const page = await open();
+        await page.goto(`${job.url}/`);
+        await page.keyboard.press("Tab");
+        found.first = await page.evaluate(() => document.activeElement.textContent);
+        const tabTo = async (matches, most = 120) => {
+            for (let k = 0; k < most; k++) {
+                if (await page.evaluate(matches, job.job)) return k;
+                await page.keyboard.press("Tab");
+            }
+            throw new Error(`${matches} was not reached`);
+        };
+        await tabTo((id) => document.activeElement.id === `name-${id}`);
+        // The list renews itself under the focus.
+        await page.waitForTimeout(2600);
+        found.keepsFocus = await page.evaluate((id) => document.activeElement.id === `name-${id}`, job.job);
+        await page.keyboard.press("Enter");
+        await page.waitForURL("**/jobs/*-*");
+        await page.waitForSelector("#viewer[data-ready=yes]");
+        await tabTo(() => document.activeElement.tagName === "CANVAS");
+        await page.waitForTimeout(500);
+        const picture = () => page.locator("#viewer canvas").screenshot().then((png) => png.toString("base64"));
+        const start = await picture();
+        const changes = {};
+        for (const key of ["ArrowLeft", "ArrowUp", "KeyW", "KeyD", "KeyE", "Minus"]) {
+            const before = await picture();
+            await page.keyboard.down(key);
+            await page.waitForTimeout(350);
+            await page.keyboard.up(key);
+            await page.waitForTimeout(500);
+            changes[key] = (await picture()) !== before;
+        }
+        found.changes = changes;
+        await page.keyboard.press("KeyN");
+        found.place = await page.locator(".place").textContent();
+        await page.keyboard.press("KeyF");
+        found.flies = await page.getAttribute("[data-do=fly]", "aria-pressed");
+        await page.keyboard.press("KeyR");
+        for (let k = 0; k < 20 && !found.back; k++) {
+            await page.waitForTimeout(300);
+            found.back = (await picture()) === start;
+        }
+        await tabTo(() => document.activeElement.closest("thead") !== null);
+        await page.keyboard.press("Tab");
+        await page.keyboard.press("Enter");
+        found.sorted = await page.getAttribute(".sortable th:nth-child(2)", "aria-sort");
+        await tabTo(() => document.activeElement.matches(".sortable tbody button"));
+        await page.keyboard.press("Enter");
+        await page.keyboard.press("Shift+Tab");
+        for (let k = 0; k < 30 && !(await page.evaluate(() => document.activeElement.matches("#view-shown input"))); k++) await page.keyboard.press("Shift+Tab");
+        await page.keyboard.press("Home");
+        found.cut = await page.evaluate(() => document.activeElement.parentElement.style.getPropertyValue("--cut"));
+        await page.goto(`${job.url}/new`);
+        await tabTo(() => document.activeElement.matches("label.button"));
+        const chooser = page.waitForEvent("filechooser");
+        await page.keyboard.press("Enter");
+        found.chooser = (await chooser).isMultiple();
+        await tabTo(() => document.activeElement.id === "start", 200);
+        await page.keyboard.press("Enter");
+        found.complaint = await page.locator("#faults").textContent();
+        return found;
+    },
+
+    /** All pages as narrow as a phone, in dark and light, and by touch. */
+    async phone() {
+        const found = { overflow: {}, background: {} };
+        for (const colorScheme of ["light", "dark"]) {
+            const page = await open({ width: 360, height: 760, colorScheme, hasTouch: true, isMobile: true, deviceScaleFactor: 2 });
+            for (const [name, path] of Object.entries({ jobs: "/", job: `/jobs/${job.job}`, new: "/new", sign_in: "/sign-in", missing: "/jobs/00000000-0000-7000-8000-000000000000" })) {
+                await page.goto(job.url + path);
+                if (name === "job") await page.waitForSelector("#viewer[data-ready=yes]");
+                await page.evaluate(() => document.querySelectorAll("details").forEach((fold) => { fold.open = true; }));
+                await page.waitForTimeout(400);
+                found.overflow[`${name} ${colorScheme}`] = await overflow(page);
+                found.background[`${name} ${colorScheme}`] = await page.evaluate(() => getComputedStyle(document.body).backgroundColor);
+                await shot(page, `phone_${name}_${colorScheme}`);
+                if (name !== "job" || colorScheme !== "light") continue;
+                const canvas = page.locator("#viewer canvas"), box = await canvas.boundingBox();
+                const before = (await canvas.screenshot()).toString("base64");
+                const touch = await page.context().newCDPSession(page);
+                await canvas.scrollIntoViewIfNeeded();
+                const at = await canvas.boundingBox();
+                const point = (dx) => [{ x: at.x + at.width / 2 + dx, y: at.y + at.height / 2 }];
+                await touch.send("Input.dispatchTouchEvent", { type: "touchStart", touchPoints: point(0) });
+                for (let dx = 10; dx <= 90; dx += 10) await touch.send("Input.dispatchTouchEvent", { type: "touchMove", touchPoints: point(dx) });
+                await touch.send("Input.dispatchTouchEvent", { type: "touchEnd", touchPoints: [] });
+                await page.waitForTimeout(900);
+                found.touchTurns = box !== null && (await canvas.screenshot()).toString("base64") !== before;
+            }
+            await page.context().close();
+        }
+        return found;
+    },
+
+    /** Where a token is needed: asked for, refused, taken, forgotten. */
+    async signIn() {
+        const page = await open();
+        await page.goto(`${job.url}/new`);
+        const found = { sentTo: new URL(page.url()).pathname + new URL(page.url()).search };
+        await page.fill("#token", "octa_wrong");
+        await page.keyboard.press("Enter");
+        await page.waitForSelector("#refused");
+        found.refused = await page.locator("#refused").textContent();
+        await shot(page, "sign_in");
+        await page.fill("#token", job.token);
+        await page.keyboard.press("Enter");
+        await page.waitForURL("**/new");
+        const [cookie] = await page.context().cookies();
+        found.cookie = { httpOnly: cookie.httpOnly, sameSite: cookie.sameSite };
+        found.readable = await page.evaluate(() => document.cookie);
+        found.api = await page.evaluate(() => fetch("/v1/info").then((answer) => answer.json()).then((info) => info.owner));
+        await page.click("text=Sign out");
+        await page.waitForURL("**/sign-in");
+        found.after = await page.evaluate(() => fetch("/v1/info").then((answer) => answer.status));
+        return found;
+    },
+
+    /** Buttons of the list and of a job's page: cancel, retry, keep, delete; events do not come through. */
+    async actions() {
+        const found = {};
+        const page = await open();
+        await page.route("**/events**", (route) => route.abort("connectionfailed"));
+        await page.goto(`${job.url}/`);
+        await page.click(`#cancel-${job.jobs[0]}`);
+        await page.waitForSelector(`#job-${job.jobs[0]} .chip.canceled`);
+        await page.click(`#retry-${job.jobs[0]}`);
+        await page.waitForSelector(`#job-${job.jobs[0]} .chip.queued`);
+        await page.goto(`${job.url}/jobs/${job.jobs[1]}`);
+        await page.click("#do-cancel");
+        await page.waitForSelector("#do-retry");
+        await page.click("#do-pin");
+        await page.waitForSelector("#do-pin[aria-pressed=true]");
+        page.once("dialog", (dialog) => { found.asked = dialog.message(); dialog.accept(); });
+        await page.click("#do-delete");
+        await page.waitForURL(`${job.url}/`);
+        found.gone = await page.locator(`#job-${job.jobs[1]}`).count() === 0;
+        await page.goto(`${job.url}/jobs/${job.jobs[0]}`);
+        await page.waitForTimeout(200);
+        await page.evaluate((address) => fetch(address, { method: "POST" }), `/v1/jobs/${job.jobs[0]}/cancel`);
+        await page.waitForSelector("#status[data-state=canceled]");
+        found.polled = true;
+        return found;
+    },
+};
+
+try {
+    const found = await steps[job.name]();
+    console.log(JSON.stringify({ ...found, complaints }));
+} catch (error) {
+    console.error(String(error.stack), complaints);
+    process.exitCode = 1;
+} finally {
+    await browser.close();
+}

@@ -1,0 +1,66 @@
+"""Forms from the schemas of the options."""
+
+import json
+from itertools import chain
+
+from service.web.forms import Field, OptionsForm, options_form
+from workers.kinds import job_kinds, kind_named
+
+
+def fields_of(form: OptionsForm) -> dict[str, Field]:
+    return {f.path: f for f in chain(form.first, *(section.fields for section in form.more))}
+
+
+def leaves(values: dict, prefix: str = "") -> set[str]:
+    found = set()
+    for name, value in values.items():
+        found |= leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}"}
+    return found
+
+
+def test_every_setting_has_its_field() -> None:
+    kind = kind_named("reconstruct")
+    form = options_form(kind)
+    for preset in ("fast", "standard", "paper"):
+        assert leaves(kind.resolve({"preset": preset}).model_dump(mode="json")) <= set(fields_of(form))
+    assert [f.path for f in form.first][:3] == ["preset", "poses", "max_side"]
+
+
+def test_defaults_follow_the_preset() -> None:
+    fields = fields_of(options_form(kind_named("reconstruct")))
+    kind = kind_named("reconstruct")
+    shown = json.loads(fields["train.iterations"].defaults)
+    assert shown == {
+        name: str(kind.resolve({"preset": name}).model_dump()["train"]["iterations"])
+        for name in ("fast", "standard", "paper")
+    }
+    assert json.loads(fields["train.densify.kind"].defaults)["paper"] == "paper"
+    assert fields["test_every"].defaults == "" and fields["test_every"].default == "8"
+
+
+def test_limits_choices_and_words() -> None:
+    fields = fields_of(options_form(kind_named("reconstruct")))
+    assert fields["test_every"].low == 0 and fields["test_every"].control == "whole"
+    assert fields["train.patch_fraction"].high == 1 and fields["train.patch_fraction"].control == "number"
+    assert [choice.value for choice in fields["poses"].choices] == ["given", "auto", "missing"]
+    assert fields["held_out"].control == "list"
+    assert "hold out" in fields["held_out"].help.lower()  # from the docstring
+    assert fields["train.rays"].help == "Rays of one iteration"  # from the field
+    assert fields["train.densify.growth"].help.startswith("Only for mcmc")
+    assert not fields["train.densify.start"].help.startswith("Only for")
+
+
+def test_files_are_chosen_from_the_formats() -> None:
+    export = fields_of(options_form(kind_named("export")))
+    names = [choice.value for choice in export["files"].choices]
+    assert {"mesh.glb", "scene.spz", "scene.splat"} <= set(names)
+    assert export["files"].required
+    for name in names:  # the kind takes all that is offered
+        kind_named("export").resolve({"files": [name]})
+
+
+def test_every_kind_has_a_form() -> None:
+    for kind in job_kinds():
+        form = options_form(kind)
+        names = list(fields_of(form))
+        assert len(names) == len(set(names))

@@ -1,0 +1,184 @@
+"""The pages in headless Chromium, on a real service with a real worker and a scene that it makes itself."""
+
+import os
+import subprocess
+import sys
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import ROOT, Browse, Service, StartService
+
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.train.config import preset
+
+pytestmark = [pytest.mark.tools, pytest.mark.heavy]
+
+VIEWS = 8
+OPTIONS = {
+    "train.iterations": 600,
+    "train.max_gaussians": 1500,
+    "train.rays": 1024,
+    "train.initial_points": 600,
+    "train.probe_rays": 256,
+    "train.patch_side": 16,
+    "train.checkpoint_every": 50,
+    "test_every": 4,
+}
+"""Settings of a run of some seconds."""
+
+
+@dataclass(frozen=True)
+class Flow:
+    """A scene that went through the browser, and the job that came of it."""
+
+    service: Service
+    folder: Path
+    facts: dict[str, Any]
+    job: str
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("generated") / "still life"
+    config = GeneratedSceneConfig(views=VIEWS, width_px=96, height_px=72, samples_per_side=2, points=800)
+    write_generated_scene(root, config)
+    return root
+
+
+@pytest.fixture(scope="module")
+def flow(start_service: StartService, browse: Browse, folder: Path) -> Flow:
+    service = start_service()
+    facts = browse("flow", service.url, folder=str(folder), first=5, options=OPTIONS)
+    return Flow(service, folder, facts, facts["job"])
+
+
+@pytest.fixture(scope="module")
+def watched(flow: Flow, browse: Browse, work: None) -> dict[str, Any]:
+    """The job's page and the list while a worker does the job."""
+    return browse("watch", flow.service.url, job=flow.job, seconds=400)
+
+
+@pytest.fixture(scope="module")
+def work(flow: Flow, database: str) -> Iterator[None]:
+    """A worker that starts some seconds from now, so that waiting is seen too."""
+    given = {"STORAGE": str(flow.service.store), "WORK": str(flow.service.store.parent / "work")}
+    environment = {
+        **os.environ,
+        "DATABASE_URL": database,
+        "OMP_NUM_THREADS": "1",
+        "OCTASPLAT_THREADS": "1",
+        "OCTASPLAT_FLOOR_BYTES": "0",
+        **{f"OCTASPLAT_{key}": value for key, value in given.items()},
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-m", "workers", "worker", "--queues", "cpu", "--name", "w"],
+        cwd=ROOT,
+        env=environment,
+    )
+    yield
+    process.terminate()
+    process.wait(40)
+
+
+def test_a_folder_is_sent_and_goes_on_after_a_break(flow: Flow) -> None:
+    facts = flow.facts
+    assert facts["empty"] == "Nothing here yet"
+    assert facts["chosen"].startswith(f"still life: {VIEWS} photographs and a COLMAP model")
+    parts = [path for name in ("images", "sparse") for path in (flow.folder / name).rglob("*")]
+    wanted = {path.relative_to(flow.folder).as_posix() for path in parts if path.is_file()}
+    first, second = facts["firstPuts"], facts["secondPuts"]
+    assert len(first) >= 5 and len(second) == len(wanted) - 5  # just what had not arrived
+    job = flow.service.ask("GET", f"/v1/jobs/{flow.job}")
+    dataset = flow.service.ask("GET", f"/v1/datasets/{job['dataset_id']}")
+    files = flow.service.ask("GET", f"/v1/datasets/{dataset['id']}/files")["files"]
+    assert {file["path"] for file in files} == wanted
+    assert dataset["name"] == "still life" and dataset["photographs"] == VIEWS and dataset["has_poses"]
+    assert len(flow.service.ask("GET", "/v1/datasets")["datasets"]) == 1  # the second time found the first
+    assert facts["complaints"] == []
+
+
+def test_the_form_asks_for_what_was_filled_in(flow: Flow) -> None:
+    job = flow.service.ask("GET", f"/v1/jobs/{flow.job}")
+    options = job["options"]
+    assert job["label"] == "a still life"
+    assert options["preset"] == "fast" and options["poses"] == "missing" and options["test_every"] == 4
+    assert options["train"]["iterations"] == 600 and options["train"]["rays"] == 1024
+    # Of the preset, as the field was left empty.
+    assert options["train"]["sh_every"] == preset("fast").sh_every
+    assert flow.facts["iterationsHint"] == str(preset("fast").iterations)  # the hint follows the preset
+    assert flow.facts["namelessOnNew"] == []
+
+
+def test_a_job_is_followed_to_its_end(watched: dict[str, Any]) -> None:
+    assert watched["states"][-1] == "succeeded" and "running" in watched["states"]
+    assert watched["list"][-1] == "Done"
+    assert watched["curves"] == 3
+    assert watched["view"]["deviation"] > 15  # there is a picture in the viewer
+    assert watched["nameless"] == []
+    assert watched["overflow"] <= 0
+    assert watched["complaints"] == []
+
+
+def test_the_result(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
+    found = browse("result", flow.service.url, job=flow.job)
+    assert found["worstFirst"] == sorted(found["worstFirst"]) and len(found["worstFirst"]) == 2
+    assert found["bestFirst"] == found["worstFirst"][::-1]
+    assert found["byName"] == sorted(found["byName"])
+    assert found["shown"] == found["byName"][1]
+    assert found["boxes"][0] == found["boxes"][1]  # photograph and render lie on each other
+    assert found["download"] == "metrics.json"
+    assert "report" in found["report"]
+    assert found["reportRuns"] and found["reportOrigin"] == "null"  # its script runs, as nobody
+    assert found["viewerReady"] and found["complaints"] == []
+
+
+def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
+    found = browse("keyboard", flow.service.url, job=flow.job)
+    assert found["first"] == "Skip to the content"
+    assert found["keepsFocus"]
+    assert all(found["changes"].values()), found["changes"]
+    assert found["place"].startswith("view_")
+    assert found["flies"] == "true" and found["back"]
+    assert found["sorted"] == "descending"
+    assert found["cut"] == "0%"
+    assert found["chooser"] is True
+    assert found["complaint"] == "Choose photographs first."
+    assert found["complaints"] == []
+
+
+def test_on_a_phone_in_dark_and_light(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
+    found = browse("phone", flow.service.url, job=flow.job)
+    assert {name: width for name, width in found["overflow"].items() if width > 0} == {}
+    for name, colour in found["background"].items():
+        channels = [int(part) for part in colour[4:-1].split(",")]
+        assert (max(channels) < 60) if name.endswith("dark") else (min(channels) > 200), name
+    assert found["touchTurns"]
+    assert [
+        text for text in found["complaints"] if "404" not in text
+    ] == []  # one page is meant to be missing
+
+
+def test_buttons_and_polling_without_events(flow: Flow, browse: Browse) -> None:
+    dataset = flow.service.ask("GET", f"/v1/jobs/{flow.job}")["dataset_id"]
+    # A queue that nobody works on.
+    body = {"dataset_id": dataset, "queue": "nobody", "options": {"preset": "fast"}}
+    jobs = [flow.service.ask("POST", "/v1/jobs", body)["id"] for _ in range(2)]
+    found = browse("actions", flow.service.url, jobs=jobs)
+    assert found["asked"] == "Delete this job and its results?"
+    assert found["gone"] and found["polled"]
+    assert flow.service.ask("GET", f"/v1/jobs/{uuid.UUID(jobs[0])}")["state"] == "canceled"
+    assert found["complaints"] == []
+
+
+def test_a_token_is_asked_for(start_service: StartService, browse: Browse) -> None:
+    service = start_service(TOKEN="octa_of_this_test")
+    found = browse("signIn", service.url, token="octa_of_this_test")
+    assert found["sentTo"] == "/sign-in?next=/new"
+    assert found["refused"] == "This token is not valid (any more)."
+    assert found["cookie"] == {"httpOnly": True, "sameSite": "Strict"} and found["readable"] == ""
+    assert found["api"] == "admin" and found["after"] == 401
+    assert [text for text in found["complaints"] if "401" not in text and "403" not in text] == []

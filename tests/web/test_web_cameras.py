@@ -1,0 +1,127 @@
+"""The viewer's cameras, from COLMAP models in both forms."""
+
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engine.gaussians.frames import quaternions
+from engine.render.paths import look_at
+from service.web.cameras import MAX_VIEWS, CamerasUnreadable, PhotographPose, read_poses, viewer_cameras
+
+UP = np.array([0.0, 0.0, 1.0])
+CENTRES = [(3.0, 0.0, 1.0), (0.0, 3.0, 2.0), (-3.0, 0.5, 1.5), (0.5, -3.0, 0.7)]
+TARGET = np.array([0.2, -0.1, 0.4])
+OBSERVATIONS = 3
+
+
+def rotations() -> np.ndarray:
+    """World to camera, all of them looking at one point with a level horizon."""
+    return np.stack([look_at(np.array(centre), TARGET, UP)[:3, :3].T for centre in CENTRES])
+
+
+def model(binary: bool) -> tuple[io.BytesIO, io.BytesIO]:
+    """Two cameras, one of them with one focal length and one with two, and four photographs."""
+    quats = quaternions(rotations())
+    if not binary:
+        cameras = "# a comment\n1 SIMPLE_RADIAL 400 300 500 200 150 0.1\n2 PINHOLE 300 400 310 320 150 200\n"
+        lines = ["# a comment"]
+        for k, (quat, centre) in enumerate(zip(quats, CENTRES, strict=True)):
+            translation = -rotations()[k] @ np.array(centre)
+            pose = " ".join(repr(float(v)) for v in [*quat, *translation])
+            lines += [f"{k + 1} {pose} {1 + k % 2} a folder/view {9 - k}.jpg", "1.5 2.5 -1 3 4 17"]
+        return io.BytesIO(cameras.encode()), io.BytesIO(("\n".join(lines) + "\n").encode())
+    cameras_bin = struct.pack("<Q", 2)
+    cameras_bin += struct.pack("<iiQQ4d", 1, 2, 400, 300, 500, 200, 150, 0.1)
+    cameras_bin += struct.pack("<iiQQ4d", 2, 1, 300, 400, 310, 320, 150, 200)
+    images = struct.pack("<Q", len(CENTRES))
+    for k, (quat, centre) in enumerate(zip(quats, CENTRES, strict=True)):
+        translation = -rotations()[k] @ np.array(centre)
+        images += struct.pack("<i7di", k + 1, *quat, *translation, 1 + k % 2)
+        images += f"a folder/view {9 - k}.jpg".encode() + b"\0" + struct.pack("<Q", OBSERVATIONS)
+        images += bytes(24 * OBSERVATIONS)
+    return io.BytesIO(cameras_bin), io.BytesIO(images)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_poses_are_read(binary: bool) -> None:
+    poses = read_poses(*model(binary), binary=binary)
+    assert [pose.name for pose in poses] == [f"a folder/view {k}.jpg" for k in (6, 7, 8, 9)]
+    for pose, k in zip(poses, (3, 2, 1, 0), strict=True):
+        np.testing.assert_allclose(pose.centre_world, CENTRES[k], atol=1e-6)
+        np.testing.assert_allclose(pose.rotation_cam_from_world, rotations()[k], atol=1e-6)
+        height, focal, aspect = ((300, 500, 4 / 3), (400, 320, 3 / 4))[k % 2]
+        assert pose.fov_y_degrees == pytest.approx(np.degrees(2 * np.arctan(height / 2 / focal)))
+        assert pose.aspect == pytest.approx(aspect)
+
+
+def test_the_viewer_turns_about_what_the_cameras_look_at() -> None:
+    poses = read_poses(*model(True), binary=True)
+    found = viewer_cameras(poses, ["a folder/view 7.jpg"])
+    # Level cameras that look up and down by different angles: their mean up is not up, but what is square to
+    # their right sides is.
+    np.testing.assert_allclose(found["up"], UP, atol=1e-2)
+    np.testing.assert_allclose(found["target"], TARGET, atol=2e-2)
+    distances = [np.linalg.norm(np.array(centre) - TARGET) for centre in CENTRES]
+    assert found["radius"] == pytest.approx(np.median(distances), rel=0.02)
+    assert [view["held_out"] for view in found["views"]] == [False, True, False, False]
+
+
+def test_parallel_cameras_have_something_ahead_to_turn_about() -> None:
+    rotation = look_at(np.zeros(3), np.array([1.0, 0, 0]), UP)[:3, :3].T
+    poses = [PhotographPose(f"{k}", rotation, np.array([0.0, float(k), 0.0]), 50.0, 1.5) for k in range(5)]
+    found = viewer_cameras(poses)
+    assert found["target"][0] > 0.5  # ahead
+    np.testing.assert_allclose(found["up"], UP, atol=1e-6)
+
+
+def test_of_many_views_some_are_offered_and_all_held_out_ones_first_of_all() -> None:
+    rotation = np.eye(3)
+    poses = [PhotographPose(f"{k:05}", rotation, np.zeros(3), 50.0, 1.5) for k in range(3000)]
+    views = viewer_cameras(poses, ["00001"])["views"]
+    assert len(views) <= MAX_VIEWS
+    assert [view["name"] for view in views if view["held_out"]] == ["00001"]
+
+
+@pytest.mark.parametrize("cut", [0, 7, 20, 60, 300])
+def test_files_cut_short_are_refused(cut: int) -> None:
+    cameras, images = model(True)
+    with pytest.raises(CamerasUnreadable):
+        read_poses(cameras, io.BytesIO(images.getvalue()[:cut]), binary=True)
+
+
+def test_hostile_counts_and_names_are_refused() -> None:
+    cameras, images = model(True)
+    for data in (
+        struct.pack("<Q", 1 << 60),
+        struct.pack("<Q", 2) + struct.pack("<i7di", 1, *range(7), 1) + b"x" * 9000,
+    ):
+        cameras.seek(0)
+        with pytest.raises(CamerasUnreadable):
+            read_poses(cameras, io.BytesIO(data), binary=True)
+    with pytest.raises(CamerasUnreadable):
+        read_poses(io.BytesIO(struct.pack("<QiiQQ", 1, 1, 99, 4, 3)), images, binary=True)
+
+
+def test_poses_that_make_no_sense_are_left_out() -> None:
+    lines = ["1 0 0 0 0 0 0 0 1 zero.jpg", "2 1 0 0 0 nan 0 0 1 nan.jpg", "3 1 0 0 0 0 0 0 9 lost.jpg"]
+    text = "\n\n".join([*lines, "4 1 0 0 0 0 0 0 1 good.jpg", ""]).encode()
+    poses = read_poses(io.BytesIO(b"1 PINHOLE 4 3 2 2 2 2\n"), io.BytesIO(text), binary=False)
+    assert [pose.name for pose in poses] == ["good.jpg"]
+
+
+@pytest.mark.real
+def test_a_real_model(scenes_root: Path) -> None:
+    import pycolmap
+
+    folder = scenes_root / "fox" / "sparse" / "0"
+    if not (folder / "images.bin").exists():
+        pytest.skip("there is no fox")
+    with (folder / "cameras.bin").open("rb") as cameras, (folder / "images.bin").open("rb") as images:
+        poses = {pose.name: pose for pose in read_poses(cameras, images, binary=True)}
+    reconstruction = pycolmap.Reconstruction(str(folder))
+    assert len(poses) == reconstruction.num_images()
+    for image in reconstruction.images.values():
+        np.testing.assert_allclose(poses[image.name].centre_world, image.projection_center(), atol=1e-6)

@@ -1,0 +1,279 @@
+"""Jobs survive whatever happens to those who do them."""
+
+import os
+import signal
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+from worker_bench import Bench, alive, child_pids
+
+from workers.queue.rows import Job
+
+SLOW = {"steps": 200, "seconds": 0.02, "checkpoint_every": 10}
+"""Some four seconds with a checkpoint every 0.2 s."""
+
+
+@pytest.fixture
+def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(conninfo, tmp_path)
+    yield bench
+    bench.close()
+
+
+def has_checkpoint(job: Job) -> bool:
+    return job.checkpoint is not None and job.state == "running"
+
+
+def starts(bench: Bench, job_id: uuid.UUID) -> list[int]:
+    """The steps at which the attempts of a finished job began."""
+    return [int(line) for line in bench.results(job_id)["history.txt"].split()]
+
+
+def test_job_is_done_and_its_journal_tells_of_it(bench: Bench) -> None:
+    bench.worker()
+    job_id = bench.submit(options={"steps": 12, "seconds": 0.01})
+    job = bench.over(job_id)
+    assert (job.state, job.attempt, job.rescues, job.step, job.error) == ("succeeded", 1, 0, 12, None)
+    assert bench.results(job_id) == {"sum.txt": b"78", "history.txt": b"0\n"}
+    states = [event.data["state"] for event in bench.events(job_id) if event.kind == "state"]
+    assert states == ["queued", "running", "succeeded"]
+    assert "the toy begins at 0" in bench.log(job_id)
+    assert not any((bench.folder / "work-w" / "attempts").iterdir())
+
+
+def test_killed_worker_takes_its_child_along_and_another_goes_on(bench: Bench) -> None:
+    first = bench.worker(name="first")
+    job_id = bench.submit(options=SLOW)
+    bench.wait(job_id, has_checkpoint)
+    (child,) = child_pids(first)
+    bench.worker(name="second")
+    first.kill()
+    killed = time.monotonic()
+    job = bench.wait(job_id, lambda job: job.worker == "second")
+    assert time.monotonic() - killed < 2.4 + 2.0
+    assert not alive(child)
+    assert (job.attempt, job.rescues) == (2, 1)
+    assert bench.over(job_id).state == "succeeded"
+    began = starts(bench, job_id)
+    assert len(began) == 2 and began[0] == 0 and began[1] >= 10
+    assert bench.results(job_id)["sum.txt"] == str(sum(range(201))).encode()
+
+
+def test_killed_child_is_started_again_from_the_checkpoint(bench: Bench) -> None:
+    worker = bench.worker()
+    job_id = bench.submit(options=SLOW)
+    bench.wait(job_id, has_checkpoint)
+    os.kill(child_pids(worker)[0], signal.SIGKILL)
+    job = bench.over(job_id)
+    assert (job.state, job.attempt) == ("succeeded", 2)
+    assert starts(bench, job_id)[1] >= 10
+    rescued = [event.data for event in bench.events(job_id) if event.kind == "rescued"]
+    assert len(rescued) == 1 and "signal 9" in rescued[0]["reason"]
+
+
+def test_frozen_worker_is_fenced_when_it_comes_back(bench: Bench) -> None:
+    first = bench.worker(name="first")
+    job_id = bench.submit(options={**SLOW, "steps": 400})
+    bench.wait(job_id, has_checkpoint)
+    (child,) = child_pids(first)
+    first.send_signal(signal.SIGSTOP)
+    bench.worker(name="second")
+    bench.wait(job_id, lambda job: job.worker == "second" and job.attempt == 2)
+    assert alive(child)  # the ghost's child goes on working
+    first.send_signal(signal.SIGCONT)
+    deadline = time.monotonic() + 5
+    while alive(child) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(child)
+    job = bench.over(job_id)
+    assert (job.state, job.attempt, job.worker) == ("succeeded", 2, "second")
+    events = bench.events(job_id)
+    taken = next(event.id for event in events if event.data.get("worker") == "second")
+    assert all(event.attempt == 2 for event in events if event.id > taken)
+    assert sum(event.data.get("state") == "succeeded" for event in events) == 1
+    assert first.poll() is None  # the worker itself is fit for other jobs
+
+
+def test_job_that_kills_its_program_fails_with_the_reason(bench: Bench) -> None:
+    bench.worker()
+    job_id = bench.submit(options={"steps": 10, "seconds": 0.01, "crash_at": 7})
+    job = bench.over(job_id)
+    assert (job.state, job.attempt, job.rescues) == ("failed", 4, 3)
+    assert job.error is not None and job.error["type"] == "crashed"
+    assert "signal 11" in job.error["message"] and "4 times" in job.error["message"]
+
+
+def test_job_that_kills_its_worker_fails_too(bench: Bench) -> None:
+    """The rescue counts, as no worker lives to do so."""
+    bench.worker(queues="", name="care")
+    job_id = bench.submit(options={"steps": 1000, "seconds": 0.02, "checkpoint_every": 10_000})
+    for _ in range(4):
+        worker = bench.worker(name="victim")
+        bench.wait(job_id, lambda job: job.state == "running")
+        worker.kill()
+        worker.wait()
+        bench.wait(job_id, lambda job: job.state != "running")
+    job = bench.job(job_id)
+    assert (job.state, job.attempt) == ("failed", 4)
+    assert job.error is not None and job.error["type"] == "worker_lost"
+
+
+def test_terminated_worker_hands_back_at_once(bench: Bench) -> None:
+    first = bench.worker(name="first")
+    job_id = bench.submit(options=SLOW)
+    bench.wait(job_id, has_checkpoint)
+    step = bench.job(job_id).checkpoint
+    bench.worker(name="second")
+    time.sleep(1.0)
+    first.terminate()
+    asked = time.monotonic()
+    bench.wait(job_id, lambda job: job.worker == "second")
+    assert time.monotonic() - asked < 2.0
+    assert first.wait(10) == 0
+    job = bench.over(job_id)
+    assert (job.state, job.attempt, job.rescues) == ("succeeded", 2, 0)
+    assert step is not None and starts(bench, job_id)[1] > step["step"]
+    assert [event.kind for event in bench.events(job_id)].count("handed_back") == 1
+
+
+def test_cancelled_job_stops_and_goes_on_when_retried(bench: Bench) -> None:
+    worker = bench.worker()
+    job_id = bench.submit(options=SLOW)
+    bench.wait(job_id, has_checkpoint)
+    assert bench.cancel(job_id).state == "canceling"
+    assert bench.cancel(job_id).state == "canceling"
+    job = bench.over(job_id, seconds=5)
+    assert (job.state, job.error) == ("canceled", None) and child_pids(worker) == []
+    assert bench.cancel(job_id).state == "canceled"
+    assert bench.retry(job_id).state == "queued"
+    assert bench.over(job_id).state == "succeeded"
+    assert starts(bench, job_id)[1] >= 10
+
+
+def test_retry_from_the_start_forgets_the_checkpoint(bench: Bench) -> None:
+    bench.worker()
+    job_id = bench.submit(options=SLOW)
+    bench.wait(job_id, has_checkpoint)
+    bench.cancel(job_id)
+    bench.over(job_id)
+    bench.retry(job_id, fresh=True)
+    assert bench.over(job_id).state == "succeeded"
+    assert starts(bench, job_id) == [0]
+
+
+def test_deaf_program_is_killed_after_the_grace(bench: Bench) -> None:
+    worker = bench.worker(GRACE_SECONDS="0.5")
+    job_id = bench.submit(options={"steps": 10_000, "deaf": True})
+    bench.wait(job_id, lambda job: job.step is not None and job.step > 0)
+    bench.cancel(job_id)
+    assert bench.over(job_id, seconds=5).state == "canceled"
+    assert child_pids(worker) == []
+
+
+def test_queued_job_is_cancelled_without_a_worker(bench: Bench) -> None:
+    job_id = bench.submit()
+    assert bench.cancel(job_id).state == "canceled"
+    other = bench.submit(options={"steps": 1})
+    bench.worker()
+    assert bench.over(other).state == "succeeded"
+    assert bench.job(job_id).attempt == 0
+
+
+def test_lost_database_stops_the_child_before_others_take_over(bench: Bench) -> None:
+    """The worker is cut off by refusing its connections, as a partition would."""
+    worker = bench.worker(name="cut-off")
+    job_id = bench.submit(options={**SLOW, "steps": 2000})
+    bench.wait(job_id, has_checkpoint)
+    (child,) = child_pids(worker)
+    name = psycopg.conninfo.conninfo_to_dict(bench.conninfo)["dbname"]
+    admin = psycopg.conninfo.make_conninfo(bench.conninfo, dbname="postgres")
+    with psycopg.connect(admin, autocommit=True) as connection:
+        connection.execute(f'ALTER DATABASE "{name}" ALLOW_CONNECTIONS false')
+        connection.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = %s", [name]
+        )
+        cut = time.monotonic()
+        while alive(child):
+            assert time.monotonic() - cut < 2.4, "the child outlived the stale limit"
+            time.sleep(0.02)
+        assert worker.wait(10) == 69  # to be started again
+        connection.execute(f'ALTER DATABASE "{name}" ALLOW_CONNECTIONS true')
+    bench.worker(name="after", queues="cpu")
+    bench.wait(job_id, lambda job: job.worker == "after" and job.attempt == 2)
+    bench.wait(job_id, lambda _job: any(event.kind == "resumed" for event in bench.events(job_id)))
+    assert next(e.data["step"] for e in bench.events(job_id) if e.kind == "resumed") >= 10
+
+
+def test_silent_program_is_tried_again(bench: Bench) -> None:
+    bench.worker(SILENT_SECONDS="0.8")
+    job_id = bench.submit(options={"steps": 20, "silent_at": 15, "checkpoint_every": 5})
+    job = bench.over(job_id)
+    assert (job.state, job.attempt) == ("failed", 4)
+    assert job.error is not None and job.error["type"] == "silent"
+
+
+def test_program_that_needs_too_much_memory_is_stopped(bench: Bench) -> None:
+    bench.worker(MEMORY_LIMIT_BYTES=str(400 << 20))
+    job_id = bench.submit(options={"steps": 1000, "hog_bytes": 600 << 20})
+    job = bench.over(job_id)
+    assert (job.state, job.attempt) == ("failed", 1)
+    assert job.error is not None and job.error["type"] == "memory_limit"
+
+
+@pytest.mark.parametrize(
+    ("options", "type_", "message"),
+    [
+        ({"refuse": True}, "dataset_error", "The toy refuses this scene; send another."),
+        ({"fault": True}, "unexpected", "RuntimeError: a fault of the program"),
+    ],
+)
+def test_what_would_fail_again_fails_at_once(
+    bench: Bench, options: dict[str, bool], type_: str, message: str
+) -> None:
+    bench.worker()
+    job_id = bench.submit(options=options)
+    job = bench.over(job_id)
+    assert (job.state, job.attempt, job.error) == ("failed", 1, {"type": type_, "message": message})
+    assert ("Traceback" in bench.log(job_id)) == (type_ == "unexpected")
+
+
+def test_results_published_before_a_crash_are_adopted(bench: Bench) -> None:
+    """A worker that died between publishing and saying so; the work is not done again."""
+    bench.worker()
+    job_id = bench.submit(options={"steps": 5, "seconds": 0.01})
+    bench.over(job_id)
+    with psycopg.connect(bench.conninfo) as connection:
+        connection.execute("DELETE FROM artifacts")
+        connection.execute(
+            "UPDATE jobs SET state = 'running', heartbeat_at = now() - interval '1 hour', finished_at = NULL"
+        )
+    job = bench.wait(job_id, lambda job: job.is_over)
+    assert (job.state, job.attempt) == ("succeeded", 2)
+    assert bench.results(job_id) == {"sum.txt": b"15", "history.txt": b"0\n"}
+
+
+def test_priority_and_queues(bench: Bench) -> None:
+    low = bench.submit(options={"steps": 2}, priority=-5)
+    high = bench.submit(options={"steps": 2}, priority=5)
+    elsewhere = bench.submit(options={"steps": 2}, queue="gpu")
+    bench.worker()
+    bench.over(low)
+    assert bench.job(high).started_at < bench.job(low).started_at  # type: ignore[operator]
+    assert bench.job(elsewhere).state == "queued"
+    bench.worker(queues="gpu", name="gpu")
+    assert bench.over(elsewhere).worker == "gpu"
+
+
+def test_child_knows_no_secrets(bench: Bench) -> None:
+    worker = bench.worker()
+    job_id = bench.submit(options={"steps": 1000})
+    bench.wait(job_id, lambda job: job.step is not None)
+    environment = Path(f"/proc/{child_pids(worker)[0]}/environ").read_bytes()
+    assert b"DATABASE_URL" not in environment and b"SECRET" not in environment
+    assert b"PATH=" in environment
+    bench.cancel(job_id)
+    bench.over(job_id)

@@ -1,0 +1,77 @@
+"""A kind of job that counts, with everything that can go wrong on request; workers under test import it."""
+
+import os
+import signal
+import time
+
+from pydantic import BaseModel, ConfigDict
+
+from engine.errors import Cancelled, DatasetError
+from engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
+from workers.kinds import JobKind, register
+from workers.kinds.table import validated
+from workers.worker.task import Task
+
+
+class ToyOptions(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    steps: int = 10
+    seconds: float = 0.02
+    checkpoint_every: int = 5
+    crash_at: int | None = None
+    refuse: bool = False
+    fault: bool = False
+    silent_at: int | None = None
+    hog_bytes: int = 0
+    deaf: bool = False
+
+
+def run(task: Task) -> None:
+    options = ToyOptions.model_validate(task.options)
+    if options.refuse:
+        raise DatasetError("The toy refuses this scene; send another.")
+    if options.fault:
+        raise RuntimeError("a fault of the program")
+    checkpoints = task.run / "checkpoints"
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    newest = max(checkpoints.glob("iteration_*.npz"), default=None)
+    step = int(newest.read_text()) if newest else 0
+    with (task.run / "events.jsonl").open("a") as history:
+        history.write(f"{step}\n")
+    hog = bytearray(options.hog_bytes)
+    hog[::4096] = b"x" * len(hog[::4096])
+    print(f"the toy begins at {step}", flush=True)  # noqa: T201 - as a library might
+    task.listener(StageStarted("train", options.steps))
+    while step < options.steps:
+        time.sleep(options.seconds)
+        step += 1
+        if options.crash_at == step:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if options.silent_at == step:
+            time.sleep(3600)
+        task.listener(StageProgress("train", step, options.steps))
+        stop = task.should_stop() and not options.deaf
+        if stop or step % options.checkpoint_every == 0:
+            path = checkpoints / f"iteration_{step:07d}.npz"
+            path.with_suffix(".tmp").write_text(str(step))
+            path.with_suffix(".tmp").rename(path)
+            task.listener(CheckpointWritten(step, str(path)))
+        if stop and step < options.steps:
+            raise Cancelled("stopped")
+    task.listener(StageFinished("train", 1.0))
+    (task.results / "sum.txt").write_text(str(sum(range(options.steps + 1))))
+    (task.results / "history.txt").write_text((task.run / "events.jsonl").read_text())
+
+
+register(
+    JobKind(
+        name="toy",
+        title="Counts",
+        needs="dataset",
+        options=ToyOptions,
+        program="toy_kind:run",
+        stages=lambda _options: ("train",),
+        resolve=validated(ToyOptions),
+    )
+)

@@ -1,0 +1,149 @@
+"""Starts real workers and asks the database about their jobs."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psycopg
+from psycopg.rows import class_row
+
+from workers.queue.database import Connection, open_pool
+from workers.queue.jobs import NewJob, artifacts_of, cancel_job, create_job, retry_job
+from workers.queue.procrastinate_slips import ProcrastinateSlips
+from workers.queue.rows import Artifact, Job, JobEvent
+from workers.storage.opening import open_storage
+
+ROOT = Path(__file__).parents[2]
+FAST = {
+    "HEARTBEAT_SECONDS": "0.4",
+    "STALE_SECONDS": "2.4",
+    "RESCUE_SECONDS": "0.3",
+    "POLL_SECONDS": "0.15",
+    "GRACE_SECONDS": "8",
+    "FLOOR_BYTES": "0",
+    "THREADS": "1",
+    "KIND_MODULES": '["toy_kind"]',
+}
+
+
+@dataclass
+class Bench:
+    """Workers on one database and one store."""
+
+    conninfo: str
+    folder: Path
+    processes: list["subprocess.Popen[bytes]"] = field(default_factory=list)
+
+    def worker(self, *, queues: str = "cpu", name: str = "w", **settings: str) -> "subprocess.Popen[bytes]":
+        """Start a worker in a process."""
+        given = {**FAST, "STORAGE": str(self.folder / "store"), "WORK": str(self.folder / f"work-{name}")}
+        given.update(settings)
+        environment = {
+            **os.environ,
+            **{f"OCTASPLAT_{key}": value for key, value in given.items()},
+            "DATABASE_URL": self.conninfo,
+            "PYTHONPATH": f"{ROOT}{os.pathsep}{Path(__file__).parent}",
+            "OMP_NUM_THREADS": "1",
+            "NUMBA_NUM_THREADS": "2",
+            "A_SECRET_TOKEN": "must not reach the child",
+        }
+        command = [sys.executable, "-m", "workers", "worker", "--queues", queues, "--name", name]
+        with (self.folder / f"{name}.log").open("ab") as log:
+            process = subprocess.Popen(command, env=environment, cwd=ROOT, stderr=log)
+        self.processes.append(process)
+        return process
+
+    def close(self) -> None:
+        """End what still runs."""
+        for process in self.processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+            process.wait(10)
+
+    def submit(self, kind: str = "toy", **values: Any) -> uuid.UUID:
+        """Queue a job."""
+        fields = {"owner": "me", "queue": "cpu", "options": {}, **values}
+        return self.do(lambda c: create_job(c, ProcrastinateSlips(), NewJob(kind=kind, **fields))).id
+
+    def cancel(self, job_id: uuid.UUID) -> Job:
+        """Cancel a job."""
+        return self.do(lambda c: cancel_job(c, ProcrastinateSlips(), job_id))
+
+    def retry(self, job_id: uuid.UUID, *, fresh: bool = False) -> Job:
+        """Queue a job again."""
+        return self.do(lambda c: retry_job(c, ProcrastinateSlips(), job_id, fresh=fresh))
+
+    def do(self, what: Callable[[Connection], Any]) -> Any:
+        """Run a function of the queue on a connection."""
+
+        async def run() -> Any:
+            async with open_pool(self.conninfo, max_size=2) as pool, pool.connection() as connection:
+                return await what(connection)
+
+        return asyncio.run(run())
+
+    def job(self, job_id: uuid.UUID) -> Job:
+        """The job as it is."""
+        with psycopg.connect(self.conninfo) as connection:
+            cursor = connection.cursor(row_factory=class_row(Job))
+            job = cursor.execute("SELECT * FROM jobs WHERE id = %s", [job_id]).fetchone()
+        assert job is not None
+        return job
+
+    def events(self, job_id: uuid.UUID) -> list[JobEvent]:
+        """What happened to the job."""
+        with psycopg.connect(self.conninfo) as connection:
+            cursor = connection.cursor(row_factory=class_row(JobEvent))
+            cursor.execute("SELECT * FROM job_events WHERE job_id = %s ORDER BY id", [job_id])
+            return cursor.fetchall()
+
+    def log(self, job_id: uuid.UUID) -> str:
+        """The job's log."""
+        with psycopg.connect(self.conninfo) as connection:
+            rows = connection.execute("SELECT text FROM job_logs WHERE job_id = %s ORDER BY id", [job_id])
+            return "\n".join(text for (text,) in rows)
+
+    def results(self, job_id: uuid.UUID) -> dict[str, bytes]:
+        """Contents of the job's results by name."""
+        storage = open_storage(self.folder / "store")
+        artifacts: list[Artifact] = self.do(lambda c: artifacts_of(c, job_id))
+        return {a.name: b"".join(storage.read(a.sha256)) for a in artifacts}
+
+    def wait(self, job_id: uuid.UUID, ready: Callable[[Job], bool], seconds: float = 30) -> Job:
+        """Wait until the job is as asked for."""
+        deadline = time.monotonic() + seconds
+        while not ready(job := self.job(job_id)):
+            assert time.monotonic() < deadline, f"{job}\n{self.worker_logs()}"
+            time.sleep(0.03)
+        return job
+
+    def over(self, job_id: uuid.UUID, seconds: float = 30) -> Job:
+        """Wait until the job is over."""
+        return self.wait(job_id, lambda job: job.is_over, seconds)
+
+    def worker_logs(self) -> str:
+        """What the workers said."""
+        return "\n".join(path.read_text(errors="replace")[-3000:] for path in self.folder.glob("*.log"))
+
+
+def child_pids(worker: "subprocess.Popen[bytes]") -> list[int]:
+    """Processes that a worker has started."""
+    found = Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text().split()
+    return [int(pid) for pid in found]
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; a zombie does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,102 @@
+"""``octasplat import``, and other commands on files of any splat format."""
+
+import numpy as np
+import pytest
+
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
+from engine.gaussians.ply_format import PlyWriteElement, write_ply
+from engine.importers import read_scene
+
+
+@pytest.fixture
+def flat() -> FlatGaussians:
+    random = np.random.default_rng(0)
+
+    def normal(*shape: int) -> np.ndarray:
+        return random.standard_normal(shape, dtype=np.float32)
+
+    return FlatGaussians(normal(60, 3), normal(60, 4), normal(60, 2) * 0.3 - 2, normal(60), normal(60, 9, 3))
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.splat", "a.spz", "a.splats.glb"])
+def test_there_and_back(octasplat, flat, tmp_path, name):
+    write_gaussian_ply(flat, tmp_path / "own.ply")
+    assert octasplat("export", tmp_path / "own.ply", tmp_path / name).exit_code == 0
+    result = octasplat("import", tmp_path / name, tmp_path / "back.ply")
+    assert result.exit_code == 0, result.output
+    assert "60 Gaussians with spherical harmonics of degree" in result.stdout
+    assert f"Wrote {tmp_path / 'back.ply'}" in result.stdout
+    back, _ = read_gaussian_ply(tmp_path / "back.ply")
+    np.testing.assert_allclose(back.means_world, flat.means_world, atol=2e-4)
+    np.testing.assert_allclose(back.opacities, flat.opacities, atol=0.003)
+
+
+def test_what_flattening_costs_is_told(octasplat, tmp_path):
+    write_thick(tmp_path / "thick.ply", [0.1, 0.2, 0.2, 0.9])
+    result = octasplat("import", tmp_path / "thick.ply", tmp_path / "flat.ply")
+    assert result.exit_code == 0, result.output
+    assert "4 of 4 Gaussians were not flat" in result.stderr and "Warning" not in result.stderr
+    assert "0.200 in the median, 0.900 at most, above one half in 1 (25.0%)" in result.stdout
+    again = octasplat("import", tmp_path / "flat.ply", tmp_path / "again.ply")
+    assert "All of them were flat already." in again.stdout and again.stderr == ""
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "flat.ply").read_bytes()
+    write_thick(tmp_path / "thick.ply", [0.1, 0.8, 0.9])
+    quiet = octasplat("import", tmp_path / "thick.ply", tmp_path / "flat.ply", "--quiet")
+    assert quiet.stdout == "" and quiet.stderr.startswith("Warning: ")
+
+
+def test_bad_gaussians_can_be_left_out(octasplat, flat, tmp_path):
+    write_gaussian_ply(flat, tmp_path / "a.ply")
+    data = bytearray((tmp_path / "a.ply").read_bytes())
+    rows = np.frombuffer(data, "<f4", offset=data.index(b"end_header\n") + 11).reshape(60, -1)
+    rows[5, 0] = np.inf
+    (tmp_path / "a.ply").write_bytes(data)
+    result = octasplat("import", tmp_path / "a.ply", tmp_path / "b.ply")
+    assert result.exit_code == 1 and result.stderr.count("\n") == 1
+    assert "a.ply" in result.stderr and "--drop-invalid" in result.stderr
+    assert not (tmp_path / "b.ply").exists()
+    result = octasplat("import", tmp_path / "a.ply", tmp_path / "b.ply", "--drop-invalid")
+    assert result.exit_code == 0 and "Left out: 1." in result.stdout
+    assert len(read_scene(tmp_path / "b.ply")[0]) == 59
+
+
+def test_harmonics_can_be_cut(octasplat, flat, tmp_path):
+    write_gaussian_ply(flat, tmp_path / "a.ply")
+    assert octasplat("import", tmp_path / "a.ply", tmp_path / "b.ply", "--sh-degree", 1).exit_code == 0
+    back, _ = read_gaussian_ply(tmp_path / "b.ply")
+    np.testing.assert_array_equal(back.sh, flat.sh[:, :4])
+
+
+def test_wrong_names(octasplat, flat, tmp_path):
+    write_gaussian_ply(flat, tmp_path / "a.ply")
+    result = octasplat("import", tmp_path / "a.ply", tmp_path / "b.glb")
+    assert result.exit_code == 2 and "octasplat export writes the other formats" in result.stderr
+    result = octasplat("import", tmp_path / "a.ply", tmp_path / "b.ply", "--format", "spz")
+    assert result.exit_code == 1 and "a.ply: is no SPZ file" in result.stderr
+    (tmp_path / "a.xyz").write_text("hello")
+    result = octasplat("import", tmp_path / "a.xyz", tmp_path / "b.ply")
+    assert result.exit_code == 1 and "the formats are" in result.stderr
+
+
+def test_a_splat_is_rendered_and_a_run_exported(octasplat, flat, run, tmp_path):
+    write_gaussian_ply(flat, tmp_path / "own.ply")
+    assert octasplat("export", tmp_path / "own.ply", tmp_path / "a.spz", "--spz-version", 4).exit_code == 0
+    assert (tmp_path / "a.spz").read_bytes()[:4] == b"NGSP"
+    size = ("--frames", 1, "--width", 32, "--height", 24, "--threads", 1)
+    result = octasplat("render", tmp_path / "a.spz", "-o", tmp_path / "frames", "--turntable", *size)
+    assert result.exit_code == 0, result.output
+    assert len(list((tmp_path / "frames").iterdir())) == 1
+    result = octasplat("export", run.output, tmp_path / "run.splat")
+    assert result.exit_code == 0, result.output
+    assert len(read_scene(tmp_path / "run.splat")[0]) == len(read_scene(run.output)[0])
+
+
+def write_thick(path, thicknesses):
+    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{k}" for k in range(3))]
+    names += [f"rot_{k}" for k in range(4)]
+    rows = np.zeros(len(thicknesses), dtype=[(name, "<f4") for name in names])
+    rows["x"] = np.arange(len(rows))
+    rows["scale_0"] = np.log(thicknesses)
+    rows["rot_0"] = 1
+    write_ply(path, [PlyWriteElement("vertex", len(rows), rows.dtype, iter([rows]))])

@@ -1,0 +1,92 @@
+"""``octasplat surface``."""
+
+import signal
+import time
+
+import numpy as np
+import pytest
+import trimesh
+
+SMALL = ("--resolution", 48, "--depth-side", 48, "--min-component", 0)
+
+
+def test_run_to_each_format(run, octasplat, tmp_path):
+    for name in ("a.glb", "a.ply", "a.obj"):
+        result = octasplat("surface", run.output, "-o", tmp_path / name, *SMALL)
+        assert result.exit_code == 0, result.output
+        assert "triangles" in result.output
+        mesh = trimesh.load(tmp_path / name, force="mesh", process=False)
+        assert len(mesh.faces) > 100
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.glb", "a.obj", "a.ply"]
+
+
+def test_everything_at_once(run, octasplat, tmp_path):
+    result = octasplat(
+        "surface", run.output / "scene.ply", "--scene", run.scene, "-o", tmp_path / "new" / "a.obj", *SMALL,
+        "--bounds", "-1,-1,-0.5,1,1,1", "--components", 1, "--fill-holes", "all", "--max-triangles", 500,
+        "--texture", 128, "--threads", 1,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    mesh = trimesh.load(tmp_path / "new" / "a.obj", force="mesh", process=False)
+    assert 100 < len(mesh.faces) <= 500
+    assert mesh.visual.material.image.size == (128, 128)
+    assert (np.abs(mesh.vertices) < 1.1).all()
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.mtl", "a.obj", "a.png"]
+
+
+def test_unbounded_and_quiet(run, octasplat, tmp_path):
+    result = octasplat("surface", run.output, "-o", tmp_path / "a.ply", *SMALL, "--unbounded", "--quiet")
+    assert result.exit_code == 0, result.output
+    assert result.output == ""
+    assert (tmp_path / "a.ply").exists()
+
+
+def test_file_alone_is_seen_from_all_around(run, octasplat, tmp_path):
+    result = octasplat(
+        "surface", run.output / "scene.ply", "-o", tmp_path / "a.ply", "--resolution", 32, "--depth-side", 24
+    )
+    assert result.exit_code == 0, result.output
+    assert "Rendered 96 images" in result.output
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("-o", "a.stl"), "written as .glb, .ply or .obj"),
+        (("-o", "a.ply", "--texture", 128), "holds no texture"),
+        (("-o", "a.glb", "--unbounded", "--bounds", "0,0,0,1,1,1"), "contradict"),
+        (("-o", "a.glb", "--bounds", "0,0,0,1,1,0"), "x0 < x1"),
+        (("-o", "a.glb", "--bounds", "90,90,90,91,91,91"), "--bounds"),
+        (("-o", "a.glb", "--max-memory", "0.0001"), "allowed"),
+        (("-o", "a.glb", "--scene", "nowhere"), "nowhere"),
+    ],
+)
+def test_refusals_are_one_sentence(run, octasplat, tmp_path, monkeypatch, options, complaint):
+    monkeypatch.chdir(tmp_path)
+    result = octasplat("surface", run.output, *SMALL, *options, "--quiet")
+    assert result.exit_code == 1
+    assert complaint in result.output
+    assert result.output.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("bad", [("--bounds", "1,2,3"), ("--fill-holes", "some"), ("--fill-holes", "-1")])
+def test_options_that_make_no_sense(run, octasplat, tmp_path, bad):
+    result = octasplat("surface", run.output, "-o", tmp_path / "a.glb", *bad)
+    assert result.exit_code == 2
+    assert bad[1] in result.output
+
+
+def test_ctrl_c_leaves_nothing(run, start_octasplat, tmp_path):
+    process = start_octasplat(
+        "surface", run.output, "-o", tmp_path / "a.ply", "--depth-side", 64, "--resolution", 2000,
+        "--threads", 1,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert "Rendering" in process.stdout.readline()
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    _, complaint = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "Stopped" in complaint
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,1 @@
+"""The service from the outside: uploads, jobs, progress, downloads, over HTTP only."""

@@ -1,0 +1,165 @@
+"""Requests to a service, tried again where that is safe, with its errors as ours."""
+
+import json
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from engine.errors import OctasplatError
+from workers.settings import default_data_folder
+
+DEFAULT_ADDRESS = "http://127.0.0.1:8642"
+SERVER, TOKEN, DATA = "OCTASPLAT_SERVER", "OCTASPLAT_TOKEN", "OCTASPLAT_DATA"
+ADDRESS_FILE = "serve.json"
+TRIES = 6
+_AGAIN = frozenset({408, 429, 502, 503, 504})
+_TIMEOUT = httpx.Timeout(60.0, connect=10.0)
+
+
+class ServiceError(OctasplatError):
+    """The service refused something; ``status`` is that of the answer, ``errors`` single faults."""
+
+    def __init__(self, message: str, status: int = 0, errors: tuple[Mapping[str, Any], ...] = ()) -> None:
+        super().__init__(message)
+        self.status = status
+        self.errors = errors
+
+
+class Unreachable(OctasplatError):
+    """The service does not answer."""
+
+
+def find_address(environment: Mapping[str, str], data: Path | None = None) -> str:
+    """Where the service is: as the environment says, or where ``octasplat serve`` of this machine is."""
+    if environment.get(SERVER):
+        return environment[SERVER].rstrip("/")
+    folder = data or Path(environment.get(DATA) or default_data_folder())
+    try:
+        content = json.loads((folder / ADDRESS_FILE).read_text(encoding="utf-8"))
+        return str(content["url"]).rstrip("/")
+    except (OSError, ValueError, KeyError, TypeError):
+        return DEFAULT_ADDRESS
+
+
+class Api:
+    """A service.
+
+    Args:
+        address: e.g. ``http://127.0.0.1:8642``.
+        token: a bearer token, if it needs one.
+    """
+
+    def __init__(self, address: str, token: str | None = None) -> None:
+        headers = {"User-Agent": "octasplat"}
+        if token:
+            headers["Authorization"] = f"Bearer {token}"
+        self.address = address
+        # Proxies of the environment are not for the own machine.
+        local = httpx.URL(address).host in ("127.0.0.1", "localhost", "::1")
+        self._http = httpx.Client(
+            base_url=address,
+            headers=headers,
+            timeout=_TIMEOUT,
+            trust_env=not local,
+            limits=httpx.Limits(max_connections=20),
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, _type: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self._http.close()
+
+    def get(self, path: str, **query: Any) -> Any:
+        """The JSON of a GET."""
+        return self.request("GET", path, params=query or None).json()
+
+    def post(self, path: str, body: Any = None, *, key: str | None = None) -> Any:
+        """The JSON of a POST; with a key, which is made if not given, it is safe to try again."""
+        return self.request(
+            "POST", path, json=body, headers={"Idempotency-Key": key or uuid.uuid4().hex}
+        ).json()
+
+    def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+        """A request, tried again while the service is away or busy; bodies must be given as content or JSON.
+
+        Raises:
+            ServiceError: it was refused.
+            Unreachable: nobody answers.
+        """
+        wait = 0.3
+        for left in reversed(range(TRIES)):
+            try:
+                response = self._http.request(method, path, **arguments)
+            except (httpx.TransportError, httpx.RemoteProtocolError) as error:
+                if left == 0:
+                    raise self.unreachable(error) from None
+            else:
+                if response.status_code not in _AGAIN or left == 0:
+                    return _checked(response)
+                wait = max(wait, _retry_after(response))
+            time.sleep(min(wait, 10.0))
+            wait *= 2
+        raise AssertionError
+
+    def stream(self, method: str, path: str, **arguments: Any) -> Any:
+        """A streamed answer, as a context; the caller checks it with :func:`check_stream`."""
+        return self._http.stream(method, path, **arguments)
+
+    def pages(self, path: str, name: str, **query: Any) -> Iterator[dict[str, Any]]:
+        """All entries of a list that comes in parts."""
+        cursor: str | None = None
+        while True:
+            page = self.get(path, **query, **({} if cursor is None else {"cursor": cursor}))
+            yield from page[name]
+            cursor = page["next"]
+            if cursor is None:
+                return
+
+    def unreachable(self, error: Exception) -> Unreachable:
+        """What to tell when nobody answers."""
+        reason = str(error) or type(error).__name__
+        return Unreachable(
+            f"No service answers at {self.address} ({reason}); start one with octasplat serve, or "
+            f"set {SERVER}."
+        )
+
+
+def check_stream(response: httpx.Response) -> None:
+    """Raise unless a streamed answer is good.
+
+    Raises:
+        ServiceError: it is not.
+    """
+    if response.is_error:
+        response.read()
+        _checked(response)
+
+
+def _checked(response: httpx.Response) -> httpx.Response:
+    if not response.is_error:
+        return response
+    try:
+        problem = response.json()
+        detail, errors = str(problem["detail"]), tuple(problem.get("errors") or ())
+    except (ValueError, KeyError, TypeError):
+        detail, errors = f"The service answered {response.status_code} to {response.request.url}.", ()
+    further = [str(e.get("detail")) for e in errors if e.get("detail") and str(e["detail"]) != detail]
+    if further:
+        more = f" and {len(further) - 5} more" if len(further) > 5 else ""
+        detail = f"{detail} {' '.join(further[:5])}{more}"
+    if response.status_code == 401:
+        detail = f"{detail.split(':')[0]}: set {TOKEN}."
+    raise ServiceError(detail, response.status_code, errors)
+
+
+def _retry_after(response: httpx.Response) -> float:
+    text = response.headers.get("retry-after", "")
+    return float(text) if text.isdigit() else 0.0

@@ -1,0 +1,110 @@
+"""Results to a folder; a download that broke off goes on, and every digest is verified."""
+
+import hashlib
+import urllib.parse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from engine.errors import OutputError
+from workers.client.api import TRIES, Api, ServiceError, check_stream
+from workers.storage.names import NameSet
+
+
+def download_results(
+    api: Api,
+    job_id: str,
+    folder: Path,
+    *,
+    names: tuple[str, ...] = (),
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> list[Path]:
+    """Save the results of a job.
+
+    Args:
+        api: the service.
+        job_id: which.
+        folder: where to; files that are there with the right content are left alone.
+        names: only these results.
+        progress: told (bytes done, bytes in all).
+
+    Returns:
+        The files.
+
+    Raises:
+        ServiceError: there is no such job or result.
+        OutputError: a file cannot be written.
+    """
+    found = api.get(f"/v1/jobs/{job_id}/artifacts")["artifacts"]
+    chosen = [artifact for artifact in found if not names or artifact["name"] in names]
+    missing = set(names) - {artifact["name"] for artifact in chosen}
+    if missing or not found:
+        what = f"no result {', '.join(sorted(missing))}" if missing else "no results"
+        raise ServiceError(f"The job {job_id} has {what}; see octasplat status {job_id}.")
+    safe = NameSet()
+    total = sum(artifact["size_bytes"] for artifact in chosen)
+    done = 0
+    progress(0, total)
+    paths = []
+    for artifact in chosen:
+        safe.add(artifact["name"])  # a service is not trusted with the paths of this machine
+        path = folder / artifact["name"]
+        before = done
+
+        def tell(count: int, before: int = before) -> None:
+            progress(before + count, total)
+
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _save(api, job_id, artifact, path, tell)
+        except OSError as error:
+            raise OutputError(f"{path} cannot be written ({error.strerror or error}).") from None
+        done += artifact["size_bytes"]
+        progress(done, total)
+        paths.append(path)
+    return paths
+
+
+def _save(api: Api, job_id: str, artifact: dict[str, Any], path: Path, tell: Callable[[int], None]) -> None:
+    if path.is_file() and _sha256(path) == artifact["sha256"]:
+        return
+    partial = path.with_name(f".{path.name}.{artifact['sha256'][:12]}.partial")
+    address = f"/v1/jobs/{job_id}/artifacts/{urllib.parse.quote(artifact['name'])}"
+    for left in reversed(range(TRIES)):
+        try:
+            _go_on(api, address, artifact, partial, tell)
+        except httpx.TransportError as error:
+            if left == 0:
+                raise api.unreachable(error) from None
+            continue
+        if _sha256(partial) == artifact["sha256"]:
+            partial.replace(path)
+            return
+        partial.unlink()
+    raise OutputError(f"{path} came damaged {TRIES} times; the store of the service needs to be looked at.")
+
+
+def _go_on(
+    api: Api, address: str, artifact: dict[str, Any], partial: Path, tell: Callable[[int], None]
+) -> None:
+    begin = partial.stat().st_size if partial.exists() else 0
+    if begin >= artifact["size_bytes"]:
+        partial.touch()
+        return
+    headers = {"Accept-Encoding": "identity"}
+    if begin:
+        headers |= {"Range": f"bytes={begin}-", "If-Range": f'"{artifact["sha256"]}"'}
+    with api.stream("GET", address, headers=headers) as response:
+        check_stream(response)
+        goes_on = response.status_code == 206
+        with partial.open("ab" if goes_on else "wb") as handle:
+            for piece in response.iter_bytes(1 << 20):
+                handle.write(piece)
+                tell(handle.tell())
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -1,0 +1,178 @@
+"""A folder of photographs to a dataset; what has arrived before is not sent again."""
+
+import base64
+import hashlib
+import threading
+import urllib.parse
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from engine.errors import DatasetError
+from workers.client.api import Api, ServiceError
+
+PARALLEL = 4
+_PIECE_BYTES = 1 << 20
+_PARTS = ("images", "masks", "sparse", "colmap/sparse")
+_CLUTTER = frozenset({"thumbs.db", "desktop.ini"})
+
+
+@dataclass(frozen=True)
+class LocalFile:
+    """A file to send: its name in the dataset and where it is."""
+
+    name: str
+    path: Path
+    size_bytes: int
+
+
+def scene_files(scene: Path) -> list[LocalFile]:
+    """The files of a scene folder that belong to a dataset, by name; a bare folder of pictures will do.
+
+    Raises:
+        DatasetError: it is no folder, or holds no photographs.
+    """
+    if not scene.is_dir():
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds images/ and sparse/.")
+    if (scene / "images").is_dir():
+        found = {path.relative_to(scene).as_posix(): path for part in _PARTS for path in _below(scene / part)}
+    else:
+        found = {f"images/{path.name}": path for path in sorted(scene.iterdir()) if _is_wanted(path)}
+    if not any(name.startswith("images/") for name in found):
+        raise DatasetError(f"{scene} holds no photographs; put them into {scene / 'images'}.")
+    return [LocalFile(name, path, path.stat().st_size) for name, path in sorted(found.items())]
+
+
+def upload_scene(
+    api: Api,
+    scene: Path,
+    *,
+    name: str | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> dict[str, Any]:
+    """Send a scene and commit it; the same command again goes on with the same dataset.
+
+    Args:
+        api: the service.
+        scene: a folder with ``images/``, a bare folder of photographs, or a ZIP file.
+        name: what to call it; by default as the folder.
+        progress: told (bytes done, bytes in all).
+
+    Returns:
+        The dataset.
+
+    Raises:
+        DatasetError: the folder holds nothing to send.
+        ServiceError: the service refuses it; the text names the files.
+    """
+    is_archive = scene.is_file()
+    files = [LocalFile(scene.name, scene, scene.stat().st_size)] if is_archive else scene_files(scene)
+    dataset = _dataset_for(api, name or scene.resolve().stem, files)
+    if dataset["state"] == "open":
+        if is_archive:
+            _send_archive(api, dataset["id"], files[0], progress)
+        else:
+            _send_missing(api, dataset["id"], files, progress)
+        dataset = api.post(f"/v1/datasets/{dataset['id']}/commit")
+    return dataset
+
+
+def _dataset_for(api: Api, name: str, files: Iterable[LocalFile]) -> dict[str, Any]:
+    """The dataset that was made for just these files, or a new one."""
+    digest = hashlib.sha256(name.encode())
+    for file in files:
+        facts = file.path.stat()
+        digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
+    try:
+        found: dict[str, Any] = api.post("/v1/datasets", {"name": name}, key=f"scene-{digest.hexdigest()}")
+    except ServiceError as error:
+        if error.status != 404:  # it was deleted since
+            raise
+        found = api.post("/v1/datasets", {"name": name}, key=uuid.uuid4().hex)
+    return found
+
+
+def _send_missing(
+    api: Api, dataset_id: str, files: list[LocalFile], progress: Callable[[int, int], None]
+) -> None:
+    there = {f["path"]: f for f in api.pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)}
+    wanted = {file.name for file in files}
+    for path in there.keys() - wanted:
+        api.request("DELETE", _address(dataset_id, path))
+    counter = _Counter(sum(file.size_bytes for file in files), progress)
+
+    def send(file: LocalFile) -> None:
+        sha256 = _sha256(file.path)
+        known = there.get(file.name)
+        if known is None or known["sha256"] != sha256:
+            _put(api, _address(dataset_id, file.name), file.path, sha256)
+        counter.add(file.size_bytes)
+
+    with ThreadPoolExecutor(PARALLEL) as pool:
+        jobs = [pool.submit(send, file) for file in files]
+        try:
+            done, _ = wait(jobs, return_when=FIRST_EXCEPTION)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    for job in done:
+        job.result()
+
+
+def _send_archive(api: Api, dataset_id: str, file: LocalFile, progress: Callable[[int, int], None]) -> None:
+    progress(0, file.size_bytes)
+    _put(api, f"/v1/datasets/{dataset_id}/archive", file.path, _sha256(file.path))
+    progress(file.size_bytes, file.size_bytes)
+
+
+def _put(api: Api, address: str, path: Path, sha256: str) -> None:
+    encoded = base64.b64encode(bytes.fromhex(sha256)).decode()
+    headers = {
+        "Repr-Digest": f"sha-256=:{encoded}:",
+        "Content-Type": "application/octet-stream",
+        "Content-Length": str(path.stat().st_size),
+    }
+    api.request("PUT", address, content=_Rereadable(path), headers=headers)
+
+
+class _Rereadable:
+    """A file's content that can be sent again when the first try breaks off."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __iter__(self) -> Iterator[bytes]:
+        with self._path.open("rb") as handle:
+            while piece := handle.read(_PIECE_BYTES):
+                yield piece
+
+
+class _Counter:
+    def __init__(self, total: int, progress: Callable[[int, int], None]) -> None:
+        self._done, self._total, self._progress = 0, total, progress
+        self._lock = threading.Lock()
+        progress(0, total)
+
+    def add(self, count: int) -> None:
+        with self._lock:
+            self._done += count
+            self._progress(self._done, self._total)
+
+
+def _address(dataset_id: str, name: str) -> str:
+    return f"/v1/datasets/{dataset_id}/files/{urllib.parse.quote(name)}"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    return (path for path in sorted(folder.rglob("*")) if _is_wanted(path))
+
+
+def _is_wanted(path: Path) -> bool:
+    return path.is_file() and not path.name.startswith(".") and path.name.lower() not in _CLUTTER

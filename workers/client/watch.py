@@ -1,0 +1,105 @@
+"""A job's progress as the engine's events, from its stream of events."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from typing import Any
+
+import httpx
+
+from engine.events import (
+    Event,
+    HeldOutMeasured,
+    Listener,
+    StageFinished,
+    StageProgress,
+    StageStarted,
+    TrainingProgress,
+    Warned,
+)
+from workers.client.api import Api, check_stream
+
+TERMINAL = frozenset({"succeeded", "failed", "canceled"})
+_PATIENCE_SECONDS = 120.0
+_KINDS: dict[str, type[Event]] = {
+    "stage_started": StageStarted,
+    "stage_finished": StageFinished,
+    "held_out_measured": HeldOutMeasured,
+    "warning": Warned,
+}
+
+
+def watch_job(
+    api: Api, job_id: str, listener: Listener, on_state: Callable[[dict[str, Any]], None]
+) -> dict[str, Any]:
+    """Follow a job to its end, over any break of the connection.
+
+    Args:
+        api: the service.
+        job_id: which.
+        listener: hears what the engine tells.
+        on_state: hears of changes of state, rescues and the like.
+
+    Returns:
+        The job.
+
+    Raises:
+        ServiceError: there is no such job.
+        Unreachable: the service was away for two minutes.
+    """
+    last = "0"
+    heard = time.monotonic()
+    while True:
+        try:
+            for kind, data, number in _events(api, job_id, last):
+                last = number
+                heard = time.monotonic()
+                _tell(kind, data, listener, on_state)
+        except httpx.TransportError as error:
+            if time.monotonic() - heard > _PATIENCE_SECONDS:
+                raise api.unreachable(error) from None
+        job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
+        heard = time.monotonic()
+        if job["state"] in TERMINAL:
+            return job
+        time.sleep(0.5)
+
+
+def _events(api: Api, job_id: str, last: str) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Kind, data and id of events after ``last``, until the stream ends."""
+    timeout = httpx.Timeout(10.0, read=60.0)
+    headers = {"Last-Event-ID": last, "Accept": "text/event-stream"}
+    with api.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
+        if response.status_code == 503:
+            response.read()
+            time.sleep(2)
+            return
+        check_stream(response)
+        kind, data, number = "message", "", last
+        for line in response.iter_lines():
+            name, _, value = line.partition(":")
+            value = value.removeprefix(" ")
+            if name == "event":
+                kind = value
+            elif name == "data":
+                data += value
+            elif name == "id":
+                number = value
+            elif not line and data:
+                yield kind, json.loads(data), number
+                kind, data = "message", ""
+
+
+def _tell(
+    kind: str, data: dict[str, Any], listener: Listener, on_state: Callable[[dict[str, Any]], None]
+) -> None:
+    model: type[Event] | None = _KINDS.get(kind)
+    if kind == "progress":
+        model = TrainingProgress if "iteration" in data else StageProgress
+    if model is None:
+        on_state({"kind": kind, **data})
+        return
+    names = {field.name for field in fields(model)}
+    if names <= data.keys():
+        listener(model(**{name: data[name] for name in names}))

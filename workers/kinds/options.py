@@ -1,0 +1,136 @@
+"""Options of the job kinds, as users give them and as they are kept. Imports neither torch nor numba."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from engine.config import ReconstructionConfig
+from engine.errors import SceneFileError
+from engine.export.registry import exporter_for
+from engine.train.config import preset
+
+_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_TAKEN = frozenset(
+    {"scene.ply", "config.json", "held_out.json", "events.jsonl", "metrics.json", "report.html"}
+    | {"training.json", "renders", "checkpoints", "cache", "poses"}
+)  # fmt: skip
+
+
+def _export_name(name: str) -> str:
+    if not _FILE_NAME.fullmatch(name) or ".." in name:
+        raise ValueError("name a file such as mesh.glb: letters, digits, '.', '_' and '-'")
+    if name.lower() in _TAKEN:
+        raise ValueError(f"{name} is the name of another result")
+    try:
+        exporter_for(Path(name))
+    except SceneFileError as error:
+        raise ValueError(str(error)) from None
+    return name
+
+
+ExportName = Annotated[str, AfterValidator(_export_name)]
+
+
+class ReconstructOptions(ReconstructionConfig):
+    """Options of ``reconstruct``: those of the engine, and where poses come from.
+
+    Attributes:
+        poses: ``given`` takes the COLMAP model of the dataset; ``auto`` finds the poses first, by COLMAP's
+            features, matching and mapping; ``missing`` does so only where the dataset holds no model.
+    """
+
+    exports: tuple[ExportName, ...] = Field(("mesh.ply", "mesh.obj", "mesh.glb"), max_length=20)
+    poses: Literal["given", "auto", "missing"] = "given"
+
+    def config(self) -> ReconstructionConfig:
+        """The engine's part."""
+        return ReconstructionConfig.model_validate(self.model_dump(mode="json", exclude={"poses"}))
+
+
+class EvaluateOptions(BaseModel):
+    """Options of ``evaluate``: the held-out views of a finished reconstruction are measured again."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ExportJobOptions(BaseModel):
+    """Options of ``export``.
+
+    Attributes:
+        files: files to write; their names say the formats.
+        min_opacity: Gaussians fainter than this are left out.
+        q: squared radius of the octagons in standard deviations; None takes that of the reconstruction.
+        sh_pad_degree: Gaussian PLY: pad the harmonics with zeros up to this degree.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    files: tuple[ExportName, ...] = Field(min_length=1, max_length=20)
+    min_opacity: float = Field(0.0, ge=0, lt=1)
+    q: float | None = Field(None, gt=0, le=100)
+    sh_pad_degree: int | None = Field(None, ge=0, le=3)
+
+
+class RenderJobOptions(BaseModel):
+    """Options of ``render``.
+
+    Attributes:
+        mode: a turntable, or the views of the photographs.
+        views: with ``mode`` views: which.
+        format: ``mp4`` is a video of a turntable, ``png`` and ``exr`` are images.
+        frames: images of one turn.
+        fps: images per second of a video.
+        width_px: width of a turntable's images.
+        height_px: height of a turntable's images.
+        fov_y_degrees: angle of a turntable's images from top to bottom; None takes that of the photographs.
+        background: behind the scene; None takes that of the reconstruction's evaluation.
+        max_side: longer side of the images of views, px.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mode: Literal["turntable", "views"] = "turntable"
+    views: Literal["held-out", "train", "all"] = "held-out"
+    format: Literal["mp4", "png", "exr"] = "mp4"
+    frames: int = Field(120, ge=1, le=3600)
+    fps: float = Field(30.0, gt=0, le=240)
+    width_px: int = Field(640, ge=16, le=4096)
+    height_px: int = Field(480, ge=16, le=4096)
+    fov_y_degrees: float | None = Field(None, ge=1, le=170)
+    background: Literal["black", "white"] | None = None
+    max_side: int | None = Field(None, ge=16)
+
+    @model_validator(mode="after")
+    def _fits(self) -> "RenderJobOptions":
+        if self.mode == "views" and self.format == "mp4":
+            raise ValueError("views are images; choose the format png or exr")
+        return self
+
+
+def resolve_reconstruction(asked: Mapping[str, Any]) -> ReconstructOptions:
+    """Complete options: the preset's training settings with what was asked for on top.
+
+    Raises:
+        ValidationError: an unknown name or a value out of range.
+    """
+    name = asked.get("preset", "standard")
+    known = name in ("fast", "standard", "paper")
+    base = preset(str(name)).model_dump(mode="json") if known else {}
+    train = asked.get("train")
+    merged = _merged(base, train) if isinstance(train, Mapping) else base if train is None else train
+    return ReconstructOptions.model_validate({**asked, "train": merged})
+
+
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with the values of ``over``, section by section; a section of another kind begins anew."""
+    merged = dict(base)
+    for key, value in over.items():
+        old = merged.get(key)
+        merged[key] = value
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            same_kind = value.get("kind", old.get("kind")) == old.get("kind")
+            merged[key] = _merged(old, value) if same_kind else value
+    return merged

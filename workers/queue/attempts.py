@@ -1,0 +1,225 @@
+"""Changes of jobs by the worker that has them, every one of them fenced by the number of the attempt.
+
+A worker that was taken for dead may come back. By then its job has a higher attempt number or is over, and
+whatever it still wants to write is refused with :class:`Fenced`.
+"""
+
+import uuid
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from psycopg.types.json import Jsonb
+
+from workers.queue.database import Connection, Pool
+from workers.queue.jobs import get_job, queue_again
+from workers.queue.journal import add_event, add_log_lines
+from workers.queue.port import Slips
+from workers.queue.rows import Job
+
+MAX_RESCUES = 3
+"""Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
+
+
+class Fenced(Exception):
+    """The attempt is over: the job has gone on without this worker."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A result to publish: its name, content and media type."""
+
+    name: str
+    sha256: str
+    size_bytes: int
+    media_type: str
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One start of a job.
+
+    Args:
+        pool: connections.
+        job: the row as it was when the attempt began; ``job.attempt`` is the number that fences.
+    """
+
+    pool: Pool
+    job: Job
+
+    async def beat(self) -> str:
+        """Say that the worker lives; returns the state, ``running`` or ``canceling``."""
+        async with self._fenced() as (connection, job):
+            await connection.execute("UPDATE jobs SET heartbeat_at = now() WHERE id = %s", [job.id])
+            return job.state
+
+    async def look(self) -> str:
+        """The state, without saying anything."""
+        async with self.pool.connection() as connection:
+            job = await get_job(connection, self.job.id)
+        self._check(job)
+        assert job is not None
+        return job.state
+
+    async def tell(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Add an event to the journal."""
+        async with self._fenced() as (connection, job):
+            await add_event(connection, job.id, job.attempt, kind, data)
+
+    async def log(self, lines: Sequence[str]) -> None:
+        """Add lines to the log."""
+        async with self._fenced() as (connection, job):
+            await add_log_lines(connection, job.id, job.attempt, lines)
+
+    async def progress(
+        self,
+        *,
+        stage: str,
+        step: int | None,
+        total_steps: int | None,
+        seconds_left: float | None = None,
+        psnr: float | None = None,
+        event: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Say how far the job is; ``event`` goes to the journal besides."""
+        async with self._fenced() as (connection, job):
+            await connection.execute(
+                """
+                UPDATE jobs SET stage = %s, step = %s, total_steps = %s, seconds_left = %s,
+                    psnr = coalesce(%s, psnr)
+                WHERE id = %s
+                """,
+                [stage, step, total_steps, seconds_left, psnr, job.id],
+            )
+            if event is not None:
+                await add_event(connection, job.id, job.attempt, "progress", event)
+
+    async def keep_checkpoint(self, manifest: Mapping[str, Any], *, advances: bool) -> None:
+        """Record a stored checkpoint; one that advances forgives the job the workers it has lost."""
+        async with self._fenced() as (connection, job):
+            await connection.execute(
+                """
+                UPDATE jobs SET checkpoint = %s, rescues = CASE WHEN %s THEN 0 ELSE rescues END WHERE id = %s
+                """,
+                [Jsonb(dict(manifest)), advances, job.id],
+            )
+            event = {key: manifest[key] for key in ("stage", "step") if key in manifest}
+            await add_event(connection, job.id, job.attempt, "checkpoint", event)
+
+    async def keep_preview(self, preview: Mapping[str, Any]) -> None:
+        """Record the newest preview picture: ``sha256``, ``step`` and ``view``."""
+        async with self._fenced() as (connection, job):
+            await connection.execute(
+                "UPDATE jobs SET preview = %s WHERE id = %s", [Jsonb(dict(preview)), job.id]
+            )
+            await add_event(connection, job.id, job.attempt, "preview", preview)
+
+    async def succeed(self, results: Sequence[Result]) -> None:
+        """Publish the results and end the job; the one place where results become visible."""
+        async with self._fenced() as (connection, job):
+            async with connection.cursor() as cursor:
+                await cursor.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
+                await cursor.executemany(
+                    """
+                    INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type)
+                    VALUES (%s, %s, %s, %s, %s)
+                    """,
+                    [(job.id, r.name, r.sha256, r.size_bytes, r.media_type) for r in results],
+                )
+            await end_job(connection, job, "succeeded", None)
+
+    async def fail(self, error: Mapping[str, Any]) -> None:
+        """End the job for a reason that another try would meet again."""
+        async with self._fenced() as (connection, job):
+            await end_job(connection, job, "failed", error)
+
+    async def cancel(self) -> None:
+        """End the job as its owner asked."""
+        async with self._fenced() as (connection, job):
+            await end_job(connection, job, "canceled", None)
+
+    async def hand_back(self, slips: Slips, reason: str) -> None:
+        """Put the job back into the queue, as its worker has to go; a cancelled one ends instead."""
+        async with self._fenced() as (connection, job):
+            if job.state == "canceling":
+                await end_job(connection, job, "canceled", None)
+                return
+            await add_event(connection, job.id, job.attempt, "handed_back", {"reason": reason})
+            await queue_again(connection, slips, job, keep_slip=True)
+
+    async def lose(self, slips: Slips, error: Mapping[str, Any]) -> None:
+        """The attempt was lost without its worker's intent: another try, or the end if there were enough."""
+        async with self._fenced() as (connection, job):
+            await rescue(connection, slips, job, error, keep_slip=True)
+
+    @asynccontextmanager
+    async def _fenced(self) -> AsyncIterator[tuple[Connection, Job]]:
+        """A transaction that holds the job's lock, if the attempt is still the job's."""
+        async with self.pool.connection() as connection, connection.transaction():
+            job = await get_job(connection, self.job.id, lock=True)
+            self._check(job)
+            assert job is not None
+            yield connection, job
+
+    def _check(self, job: Job | None) -> None:
+        if job is None or job.attempt != self.job.attempt or job.state not in ("running", "canceling"):
+            raise Fenced(f"attempt {self.job.attempt} of job {self.job.id} is over")
+
+
+async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attempt | None:
+    """Begin an attempt at a queued job, or None if the slip is stale: the job has gone on without it."""
+    async with pool.connection() as connection, connection.transaction():
+        job = await get_job(connection, job_id, lock=True)
+        if job is None or job.state != "queued" or job.slip != slip:
+            return None
+        await connection.execute(
+            """
+            UPDATE jobs SET state = 'running', attempt = attempt + 1, worker = %s, started_at = now(),
+                heartbeat_at = now(), stage = NULL, step = NULL, total_steps = NULL, seconds_left = NULL
+            WHERE id = %s
+            """,
+            [worker, job_id],
+        )
+        await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
+        claimed = await get_job(connection, job_id)
+    assert claimed is not None
+    return Attempt(pool, claimed)
+
+
+async def rescue(
+    connection: Connection, slips: Slips, job: Job, error: Mapping[str, Any], *, keep_slip: bool = False
+) -> None:
+    """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
+
+    A job that was to be cancelled is cancelled. One that was lost too often without getting any further is
+    failed with ``error``. With ``keep_slip`` the slip is still being delivered and goes by itself.
+    """
+    if job.slip is not None and not keep_slip:
+        await slips.remove(connection, job.slip)
+    if job.state == "canceling":
+        await end_job(connection, job, "canceled", None)
+    elif job.rescues >= MAX_RESCUES:
+        message = f"{error['message']} This happened {job.rescues + 1} times without getting any further."
+        await end_job(connection, job, "failed", {**error, "message": message, "rescues": job.rescues})
+    else:
+        await connection.execute("UPDATE jobs SET rescues = rescues + 1 WHERE id = %s", [job.id])
+        data = {"reason": error["message"], "rescues": job.rescues + 1}
+        await add_event(connection, job.id, job.attempt, "rescued", data)
+        await queue_again(connection, slips, job, keep_slip=keep_slip)
+
+
+async def end_job(connection: Connection, job: Job, state: str, error: Mapping[str, Any] | None) -> None:
+    """Bring a job to a terminal state; the caller holds the job's lock."""
+    await connection.execute(
+        """
+        UPDATE jobs SET state = %s, error = %s, finished_at = now(), slip = NULL, seconds_left = NULL,
+            checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END
+        WHERE id = %s
+        """,
+        [state, Jsonb(dict(error)) if error is not None else None, state == "succeeded", job.id],
+    )
+    data: dict[str, Any] = {"state": state}
+    if error is not None:
+        data["error"] = dict(error)
+    await add_event(connection, job.id, job.attempt, "state", data)

@@ -1,0 +1,14 @@
+"""Ids that sort by the time they were made: UUID version 7 (RFC 9562)."""
+
+import secrets
+import time
+import uuid
+
+
+def new_id() -> uuid.UUID:
+    """A fresh UUIDv7: 48 bits of Unix time in ms, 12 bits of the fraction of it, 62 random bits."""
+    nanoseconds = time.time_ns()
+    milliseconds, rest = divmod(nanoseconds, 1_000_000)
+    fraction = rest * 4096 // 1_000_000
+    value = (milliseconds << 80) | (7 << 76) | (fraction << 64) | (2 << 62) | secrets.randbits(62)
+    return uuid.UUID(int=value)

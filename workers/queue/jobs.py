@@ -1,0 +1,295 @@
+"""Changes of jobs from the outside: accepted, listed, cancelled, retried, deleted.
+
+Every function takes a connection and does its work in one transaction of its own or of the caller's.
+"""
+
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from psycopg.rows import class_row
+from psycopg.types.json import Jsonb
+
+from engine.errors import OctasplatError
+from workers.queue.database import Connection
+from workers.queue.ids import new_id
+from workers.queue.journal import add_event
+from workers.queue.port import QueueDepth, Slips
+from workers.queue.rows import Artifact, Job
+
+LOCK_SECONDS = 10
+"""A transaction that has locked a job and falls silent for so long is undone; its process is gone."""
+
+
+class Conflict(OctasplatError):
+    """The job is in a state that does not allow what was asked."""
+
+
+@dataclass(frozen=True)
+class NewJob:
+    """What a job is made from; see :class:`workers.queue.rows.Job`."""
+
+    owner: str
+    kind: str
+    options: Mapping[str, Any]
+    queue: str
+    priority: int = 0
+    dataset_id: uuid.UUID | None = None
+    source_id: uuid.UUID | None = None
+    label: str | None = None
+    traceparent: str | None = None
+
+
+async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
+    """Write the job and its slip in one transaction."""
+    async with connection.transaction():
+        job_id = new_id()
+        slip = await slips.put(connection, job_id, new.queue, new.priority)
+        await connection.execute(
+            """
+            INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
+                              traceparent)
+            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
+            """,
+            [
+                job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
+                Jsonb(dict(new.options)), new.queue, new.priority, slip, new.traceparent,
+            ],
+        )  # fmt: skip
+        if new.dataset_id is not None:
+            await connection.execute(
+                "UPDATE datasets SET used_at = now(), expires_at = NULL WHERE id = %s", [new.dataset_id]
+            )
+        await add_event(connection, job_id, 0, "state", {"state": "queued"})
+        return await _existing(connection, job_id)
+
+
+async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job | None:
+    """The job of that id, or None; with ``lock`` nobody else changes it until the transaction ends."""
+    query = "SELECT * FROM jobs WHERE id = %s FOR UPDATE" if lock else "SELECT * FROM jobs WHERE id = %s"
+    if lock:  # for all it knows the database would wait hours for a host that vanished
+        limit = "SELECT set_config('idle_in_transaction_session_timeout', %s, true)"
+        await connection.execute(limit, [f"{LOCK_SECONDS}s"])
+    async with connection.cursor(row_factory=class_row(Job)) as cursor:
+        await cursor.execute(query, [job_id])
+        return await cursor.fetchone()
+
+
+async def list_jobs(
+    connection: Connection,
+    *,
+    owner: str | None = None,
+    states: Sequence[str] = (),
+    kind: str | None = None,
+    label: str | None = None,
+    dataset_id: uuid.UUID | None = None,
+    before: uuid.UUID | None = None,
+    limit: int = 50,
+) -> list[Job]:
+    """Jobs that fit, the newest first.
+
+    Args:
+        connection: to the database.
+        owner: whose; None takes everybody's.
+        states: in one of these states; none given takes all.
+        kind: of this kind.
+        label: with this label.
+        dataset_id: on this dataset.
+        before: made before this job.
+        limit: at most so many.
+    """
+    async with connection.cursor(row_factory=class_row(Job)) as cursor:
+        await cursor.execute(
+            """
+            SELECT * FROM jobs
+            WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
+              AND (cardinality(%(states)s::text[]) = 0 OR state = ANY(%(states)s))
+              AND (%(kind)s::text IS NULL OR kind = %(kind)s)
+              AND (%(label)s::text IS NULL OR label = %(label)s)
+              AND (%(dataset)s::uuid IS NULL OR dataset_id = %(dataset)s)
+              AND (%(before)s::uuid IS NULL OR id < %(before)s)
+            ORDER BY id DESC LIMIT %(limit)s
+            """,
+            {
+                "owner": owner,
+                "states": list(states),
+                "kind": kind,
+                "label": label,
+                "dataset": dataset_id,
+                "before": before,
+                "limit": limit,
+            },
+        )
+        return await cursor.fetchall()
+
+
+async def queue_position(connection: Connection, job: Job) -> int | None:
+    """How many jobs go before a queued job in its queue; None for any other."""
+    if job.state != "queued":
+        return None
+    cursor = await connection.execute(
+        """
+        SELECT count(*) AS ahead FROM jobs
+        WHERE state = 'queued' AND queue = %s AND (priority > %s OR priority = %s AND slip < %s)
+        """,
+        [job.queue, job.priority, job.priority, job.slip],
+    )
+    row = await cursor.fetchone()
+    return int(row["ahead"]) if row else 0
+
+
+async def cancel_job(connection: Connection, slips: Slips, job_id: uuid.UUID) -> Job:
+    """Cancel a job: at once while it is queued, by its worker when it runs; may be repeated.
+
+    Raises:
+        Conflict: it succeeded or failed already.
+        KeyError: there is no such job.
+    """
+    async with connection.transaction():
+        job = await _existing(connection, job_id, lock=True)
+        if job.state in ("succeeded", "failed"):
+            raise Conflict(f"The job is over ({job.state}), so it cannot be cancelled.")
+        if job.state == "queued":
+            if job.slip is not None:
+                await slips.remove(connection, job.slip)
+            await connection.execute(
+                "UPDATE jobs SET state = 'canceled', finished_at = now(), slip = NULL WHERE id = %s", [job_id]
+            )
+            await add_event(connection, job_id, job.attempt, "state", {"state": "canceled"})
+        elif job.state == "running":
+            await connection.execute("UPDATE jobs SET state = 'canceling' WHERE id = %s", [job_id])
+            await add_event(connection, job_id, job.attempt, "state", {"state": "canceling"})
+        return await _existing(connection, job_id)
+
+
+async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, fresh: bool) -> Job:
+    """Queue a failed or cancelled job again.
+
+    Args:
+        connection: to the database.
+        slips: the queue.
+        job_id: which.
+        fresh: begin from the start, not from the newest checkpoint.
+
+    Raises:
+        Conflict: it is neither failed nor cancelled.
+        KeyError: there is no such job.
+    """
+    async with connection.transaction():
+        job = await _existing(connection, job_id, lock=True)
+        if job.state not in ("failed", "canceled"):
+            raise Conflict(f"Only failed and canceled jobs are retried; this one is {job.state}.")
+        await connection.execute(
+            """
+            UPDATE jobs SET rescues = 0, error = NULL, stage = NULL, step = NULL, total_steps = NULL,
+                seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL,
+                checkpoint = CASE WHEN %(fresh)s THEN NULL ELSE checkpoint END,
+                fresh_after = CASE WHEN %(fresh)s THEN attempt ELSE fresh_after END
+            WHERE id = %(id)s
+            """,
+            {"fresh": fresh, "id": job_id},
+        )
+        await queue_again(connection, slips, job)
+        return await _existing(connection, job_id)
+
+
+async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_slip: bool = False) -> None:
+    """Put a job back into its queue with a new slip; the caller holds the job's lock.
+
+    Args:
+        connection: of the transaction.
+        slips: the queue.
+        job: which.
+        keep_slip: the old slip is being delivered and goes by itself when that ends.
+    """
+    if job.slip is not None and not keep_slip:
+        await slips.remove(connection, job.slip)
+    slip = await slips.put(connection, job.id, job.queue, job.priority)
+    await connection.execute(
+        """
+        UPDATE jobs SET state = 'queued', slip = %s, queued_at = now(), worker = NULL, seconds_left = NULL
+        WHERE id = %s
+        """,
+        [slip, job.id],
+    )
+    await add_event(connection, job.id, job.attempt, "state", {"state": "queued"})
+
+
+async def change_job(connection: Connection, job_id: uuid.UUID, *, label: str | None, pinned: bool) -> Job:
+    """Rename a job, or keep it whatever its age."""
+    await connection.execute(
+        """
+        UPDATE jobs SET label = %(label)s, pinned = %(pinned)s,
+            expires_at = CASE WHEN %(pinned)s THEN NULL ELSE expires_at END
+        WHERE id = %(id)s
+        """,
+        {"label": label, "pinned": pinned, "id": job_id},
+    )
+    return await _existing(connection, job_id)
+
+
+async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
+    """Forget a finished job; its blobs stay until they are swept.
+
+    Raises:
+        Conflict: it is not over, or other jobs work on its results.
+        KeyError: there is no such job.
+    """
+    async with connection.transaction():
+        job = await _existing(connection, job_id, lock=True)
+        if not job.is_over:
+            raise Conflict(f"The job is {job.state}; cancel it first.")
+        cursor = await connection.execute(
+            """
+            SELECT count(*) AS n FROM jobs
+            WHERE source_id = %s AND state IN ('queued', 'running', 'canceling')
+            """,
+            [job_id],
+        )
+        row = await cursor.fetchone()
+        if row and row["n"]:
+            raise Conflict(f"{row['n']} unfinished jobs work on this job's results; cancel them first.")
+        await connection.execute("UPDATE jobs SET source_id = NULL WHERE source_id = %s", [job_id])
+        await connection.execute("DELETE FROM jobs WHERE id = %s", [job_id])
+
+
+async def artifacts_of(connection: Connection, job_id: uuid.UUID) -> list[Artifact]:
+    """The results of a job, by name."""
+    async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
+        await cursor.execute("SELECT * FROM artifacts WHERE job_id = %s ORDER BY name", [job_id])
+        return await cursor.fetchall()
+
+
+async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> Artifact | None:
+    """One result of a job, or None."""
+    async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
+        await cursor.execute("SELECT * FROM artifacts WHERE job_id = %s AND name = %s", [job_id, name])
+        return await cursor.fetchone()
+
+
+async def queue_depths(connection: Connection) -> list[QueueDepth]:
+    """How much waits in each queue that has something waiting."""
+    cursor = await connection.execute(
+        """
+        SELECT queue, count(*) AS waiting,
+            extract(epoch FROM now() - min(queued_at))::float8 AS oldest_seconds
+        FROM jobs WHERE state = 'queued' GROUP BY queue ORDER BY queue
+        """
+    )
+    return [QueueDepth(**row) for row in await cursor.fetchall()]
+
+
+async def running_by_queue(connection: Connection) -> dict[str, int]:
+    """Number of jobs that run, by queue."""
+    cursor = await connection.execute(
+        "SELECT queue, count(*) AS n FROM jobs WHERE state IN ('running', 'canceling') GROUP BY queue"
+    )
+    return {row["queue"]: row["n"] for row in await cursor.fetchall()}
+
+
+async def _existing(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job:
+    job = await get_job(connection, job_id, lock=lock)
+    if job is None:
+        raise KeyError(job_id)
+    return job

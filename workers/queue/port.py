@@ -1,0 +1,49 @@
+"""What a queue has to do for us: deliver slips, each naming a job. The truth about jobs is in our own table.
+
+A slip is delivered at least once. One whose worker is lost stays behind; the rescue asks for such slips and
+replaces them. Everything that belongs to a change of a job takes the connection of its transaction.
+"""
+
+import uuid
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from workers.queue.database import Connection
+
+Deliver = Callable[[uuid.UUID, int], Awaitable[None]]
+"""Called with the job's id and the slip's number; when it returns the slip is done with."""
+
+
+@dataclass(frozen=True)
+class QueueDepth:
+    """Slips of one queue that wait, and the seconds for which the oldest of them has."""
+
+    queue: str
+    waiting: int
+    oldest_seconds: float
+
+
+@runtime_checkable
+class Slips(Protocol):
+    """A queue of slips."""
+
+    async def put(self, connection: Connection, job_id: uuid.UUID, queue: str, priority: int) -> int:
+        """Queue a slip for a job within the transaction of ``connection``; returns its number."""
+        ...
+
+    async def remove(self, connection: Connection, slip: int) -> None:
+        """Take a slip away, whether it waits or its worker was lost; harmless if it is gone."""
+        ...
+
+    async def lost(self, connection: Connection) -> Sequence[uuid.UUID]:
+        """Jobs that say they are queued although no slip of theirs waits or is with a live worker."""
+        ...
+
+    async def work(self, queue: str, concurrency: int, deliver: Deliver) -> None:
+        """Deliver slips until :meth:`stop` is called or the database is lost; returns when all are done."""
+        ...
+
+    def stop(self) -> None:
+        """Deliver no more slips."""
+        ...

@@ -1,0 +1,116 @@
+"""The port on Procrastinate."""
+
+import uuid
+from collections.abc import Sequence
+from typing import Any, cast
+
+import procrastinate
+from procrastinate.manager import JobManager
+from procrastinate.worker import Worker
+
+from workers.queue.database import Connection, Pool
+from workers.queue.port import Deliver
+
+TASK = "octasplat.run_job"
+
+
+class ProcrastinateSlips:
+    """A queue of slips in the tables of Procrastinate.
+
+    Args:
+        pool: connections; only :meth:`work` needs it.
+        heartbeat_seconds: how often a worker says that it lives.
+        stale_seconds: after how long without it is taken for dead.
+        poll_seconds: how often to look for slips that no notification told of.
+        listen: whether notifications reach this process; a pooler in transaction mode swallows them.
+    """
+
+    def __init__(
+        self,
+        pool: Pool | None = None,
+        *,
+        heartbeat_seconds: float = 5.0,
+        stale_seconds: float = 20.0,
+        poll_seconds: float = 1.0,
+        listen: bool = True,
+    ) -> None:
+        self._pool = pool
+        self._heartbeat_seconds = heartbeat_seconds
+        self._stale_seconds = stale_seconds
+        self._poll_seconds = poll_seconds
+        self._listen = listen
+        self._manager = JobManager(procrastinate.PsycopgConnector())
+        self._workers: set[Worker] = set()
+        self._stopped = False
+
+    async def put(self, connection: Connection, job_id: uuid.UUID, queue: str, priority: int) -> int:
+        """Queue a slip; see the port."""
+        job = procrastinate.jobs.Job(
+            queue=queue,
+            priority=priority,
+            lock=None,
+            queueing_lock=None,
+            task_name=TASK,
+            task_kwargs={"job_id": str(job_id)},
+        )
+        slip = (await self._manager.defer_job_async(job, connection=connection)).id
+        assert slip is not None
+        return slip
+
+    async def remove(self, connection: Connection, slip: int) -> None:
+        """Take a slip away; see the port."""
+        await connection.execute("DELETE FROM procrastinate_jobs WHERE id = %s", [slip])
+
+    async def lost(self, connection: Connection) -> Sequence[uuid.UUID]:
+        """Queued jobs without a living slip; see the port."""
+        cursor = await connection.execute(
+            """
+            SELECT jobs.id FROM jobs
+            LEFT JOIN procrastinate_jobs slips ON slips.id = jobs.slip AND slips.status IN ('todo', 'doing')
+            LEFT JOIN procrastinate_workers holders ON holders.id = slips.worker_id
+            WHERE jobs.state = 'queued'
+              AND jobs.queued_at < now() - make_interval(secs => %(stale)s)
+              AND (slips.id IS NULL OR slips.status = 'doing' AND
+                   (holders.id IS NULL OR holders.last_heartbeat < now() - make_interval(secs => %(stale)s)))
+            """,
+            {"stale": self._stale_seconds},
+        )
+        return [row["id"] for row in await cursor.fetchall()]
+
+    async def work(self, queue: str, concurrency: int, deliver: Deliver) -> None:
+        """Deliver slips; see the port."""
+        assert self._pool is not None
+        connector = procrastinate.PsycopgConnector()
+        await connector.open_async(cast(Any, self._pool))  # its cursors name their own kind of rows
+        app = procrastinate.App(connector=connector)
+
+        async def run_job(context: procrastinate.JobContext, job_id: str) -> None:
+            assert context.job.id is not None
+            await deliver(uuid.UUID(job_id), context.job.id)
+
+        app.task(name=TASK, pass_context=True)(run_job)
+        worker = Worker(
+            app,
+            queues=[queue],
+            name=queue,
+            concurrency=concurrency,
+            fetch_job_polling_interval=self._poll_seconds,
+            abort_job_polling_interval=60.0,  # jobs are cancelled by their own table
+            listen_notify=self._listen,
+            delete_jobs="always",
+            install_signal_handlers=False,
+            update_heartbeat_interval=self._heartbeat_seconds,
+            stalled_worker_timeout=self._stale_seconds,
+        )
+        self._workers.add(worker)
+        try:
+            if not self._stopped:
+                await worker.run()  # type: ignore[no-untyped-call]
+        finally:
+            self._workers.discard(worker)
+
+    def stop(self) -> None:
+        """Deliver no more; see the port."""
+        self._stopped = True
+        for worker in self._workers:
+            worker.stop()  # type: ignore[no-untyped-call]

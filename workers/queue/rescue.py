@@ -1,0 +1,49 @@
+"""Jobs whose worker was lost go to another one."""
+
+import logging
+
+from psycopg.rows import class_row
+
+from workers.queue.attempts import rescue
+from workers.queue.database import Pool
+from workers.queue.jobs import get_job, queue_again
+from workers.queue.port import Slips
+from workers.queue.rows import Job
+
+logger = logging.getLogger(__name__)
+
+
+async def rescue_lost_jobs(pool: Pool, slips: Slips, stale_seconds: float) -> int:
+    """Queue again whatever has not been heard of for ``stale_seconds`` by the database's clock.
+
+    Safe to run anywhere at any time, also twice at once.
+
+    Returns:
+        Number of jobs that were taken from lost workers.
+    """
+    async with pool.connection() as connection:
+        async with connection.transaction(), connection.cursor(row_factory=class_row(Job)) as cursor:
+            await cursor.execute(
+                """
+                SELECT * FROM jobs
+                WHERE state IN ('running', 'canceling')
+                  AND heartbeat_at < now() - make_interval(secs => %s)
+                ORDER BY id FOR UPDATE SKIP LOCKED
+                """,
+                [stale_seconds],
+            )
+            lost = await cursor.fetchall()
+            for job in lost:
+                logger.warning("worker %s was lost with job %s", job.worker, job.id)
+                message = (
+                    f"The worker {job.worker} was not heard of for {stale_seconds:g} s: it was killed, froze "
+                    "or lost the database."
+                )
+                await rescue(connection, slips, job, {"type": "worker_lost", "message": message})
+        async with connection.transaction():
+            for job_id in await slips.lost(connection):
+                again = await get_job(connection, job_id, lock=True)
+                if again is not None and again.state == "queued":
+                    logger.warning("job %s had no slip in the queue and got a new one", job_id)
+                    await queue_again(connection, slips, again)
+    return len(lost)

@@ -1,0 +1,1 @@
+"""``octasplat serve``: everything that one machine needs, started, watched and stopped together."""

@@ -1,0 +1,97 @@
+"""Processes that are started again when they end, later and later if they keep ending."""
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping
+
+from workers.parent import PARENT
+
+logger = logging.getLogger(__name__)
+
+FIRST_WAIT_SECONDS = 0.5
+LONGEST_WAIT_SECONDS = 30.0
+STEADY_SECONDS = 60.0
+"""A process that lived so long before it ended is started again at once."""
+
+
+class KeptChild:
+    """A process that is started again whenever it ends.
+
+    Args:
+        name: for the log.
+        arguments: of this Python.
+        environment: added to this process's own.
+        on_line: told each line of its stdout; None leaves stdout as it is.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        arguments: tuple[str, ...],
+        environment: Mapping[str, str],
+        on_line: Callable[[str], None] | None = None,
+    ) -> None:
+        self.name = name
+        self._arguments = arguments
+        self._environment = {**os.environ, **environment, PARENT: str(os.getpid())}
+        self._on_line = on_line
+        self._process: asyncio.subprocess.Process | None = None
+        self._stopping = asyncio.Event()
+        self.starts = 0
+        self.last_code: int | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Process id while it runs."""
+        return self._process.pid if self._process is not None else None
+
+    def change_environment(self, name: str, value: str) -> None:
+        """Set a variable for the next starts."""
+        self._environment[name] = value
+
+    async def keep(self) -> None:
+        """Start it, and again, until :meth:`stop`."""
+        wait = FIRST_WAIT_SECONDS
+        while not self._stopping.is_set():
+            began = time.monotonic()
+            self.last_code = await self._run_once()
+            if self._stopping.is_set():
+                return
+            wait = FIRST_WAIT_SECONDS if time.monotonic() - began > STEADY_SECONDS else wait
+            logger.warning("%s ended (%s); starting it again in %.1f s", self.name, self.last_code, wait)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(wait):
+                    await self._stopping.wait()
+            wait = min(LONGEST_WAIT_SECONDS, 2 * wait)
+
+    def stop(self) -> None:
+        """Ask it to end, and start it no more; a second time kills it."""
+        again = self._stopping.is_set()
+        self._stopping.set()
+        if self._process is not None and self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.send_signal(signal.SIGKILL if again else signal.SIGTERM)
+
+    async def _run_once(self) -> int:
+        self.starts += 1
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            *self._arguments,
+            env=self._environment,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE if self._on_line is not None else None,
+            start_new_session=True,
+        )
+        if self._stopping.is_set():
+            self._process.terminate()
+        if self._on_line is not None and self._process.stdout is not None:
+            async for line in self._process.stdout:
+                self._on_line(line.decode(errors="replace").strip())
+        code = await self._process.wait()
+        self._process = None
+        return code

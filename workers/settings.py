@@ -1,0 +1,148 @@
+"""Settings of everything that talks to the database, from the environment; the service adds its own."""
+
+import os
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import platformdirs
+from pydantic import AliasChoices, Field, SecretStr, ValidationError
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from engine.errors import ConfigError
+from workers.queue.embedded_postgres import EmbeddedPostgres
+from workers.queue.retention import Retention
+
+PREFIX = "OCTASPLAT_"
+
+
+S = TypeVar("S", bound="WorkerSettings")
+
+
+def default_data_folder() -> Path:
+    """Where one machine keeps everything; root's home is shut to the database's user, so root has another."""
+    if os.geteuid() == 0:
+        return Path("/var/lib/octasplat")
+    return platformdirs.user_data_path("octasplat")
+
+
+class WorkerSettings(BaseSettings):
+    """Settings of a worker; each can be given as ``OCTASPLAT_<NAME>``.
+
+    Attributes:
+        data: folder of the private database, the store and the work under way.
+        database_url: a Postgres to use instead of the private one; also ``DATABASE_URL``.
+        storage: a folder or ``s3://bucket/prefix``; by default ``store`` in the data folder.
+        work: folder for the work under way; by default ``work`` in the data folder.
+        floor_bytes: room that a folder's disk keeps free.
+        heartbeat_seconds: how often a worker says that it lives.
+        stale_seconds: after how long without it its jobs go to others.
+        rescue_seconds: how often lost jobs are looked for.
+        poll_seconds: how often a worker looks whether its job was cancelled, and for new ones.
+        silent_seconds: a job's program that says nothing for so long is killed and tried again.
+        grace_seconds: how long a program may take to write its checkpoint when its worker has to stop.
+        memory_limit_bytes: a program that needs more is stopped; None sets no limit.
+        threads: of one job's program; 0 takes all cores.
+        listen: hear of new jobs at once; False behind a pooler in transaction mode.
+        kind_modules: further modules that register kinds of jobs.
+        webhook_hosts: hosts of an inner network that webhooks may be sent to, also without TLS.
+        keep_jobs_hours: how long finished jobs are kept with their results; 0 keeps them for ever.
+        keep_jobs_hours_by_kind: the same for single kinds of jobs, e.g. ``{"render": 24}``.
+        keep_datasets_hours: the same for datasets of which there are no jobs any more.
+        keep_open_datasets_hours: the same for datasets that were never committed.
+        keep_unused_hours: contents of the store that nothing names are removed after this time, which must be
+            longer than any upload takes.
+        collect_seconds: how often they are looked for.
+    """
+
+    model_config = SettingsConfigDict(env_prefix=PREFIX, extra="ignore", frozen=True)
+
+    data: Path = Field(default_factory=default_data_folder)
+    database_url: SecretStr | None = Field(
+        None, validation_alias=AliasChoices("database_url", f"{PREFIX}DATABASE_URL", "DATABASE_URL")
+    )
+    storage: str | None = None
+    work: Path | None = None
+    floor_bytes: int = Field(2 << 30, ge=0)
+    heartbeat_seconds: float = Field(5.0, gt=0)
+    stale_seconds: float = Field(20.0, gt=0)
+    rescue_seconds: float = Field(3.0, gt=0)
+    poll_seconds: float = Field(1.0, gt=0)
+    silent_seconds: float = Field(600.0, gt=0)
+    grace_seconds: float = Field(30.0, gt=0)
+    memory_limit_bytes: int | None = Field(None, gt=0)
+    threads: int = Field(0, ge=0)
+    listen: bool = True
+    kind_modules: tuple[str, ...] = ()
+    webhook_hosts: tuple[str, ...] = ()
+    keep_jobs_hours: float = Field(0.0, ge=0)
+    keep_jobs_hours_by_kind: dict[str, Annotated[float, Field(ge=0)]] = {}
+    keep_datasets_hours: float = Field(0.0, ge=0)
+    keep_open_datasets_hours: float = Field(720.0, ge=0)
+    keep_unused_hours: float = Field(24.0, gt=0)
+    collect_seconds: float = Field(3600.0, gt=0)
+
+    @property
+    def storage_address(self) -> str:
+        """What :func:`workers.storage.opening.open_storage` takes."""
+        return self.storage or str(self.data.absolute() / "store")
+
+    @property
+    def work_folder(self) -> Path:
+        """Where work under way lies."""
+        return (self.work or self.data / "work").absolute()
+
+    @property
+    def retention(self) -> Retention:
+        """How long things are kept."""
+        return Retention(
+            jobs_hours=self.keep_jobs_hours,
+            jobs_hours_by_kind=self.keep_jobs_hours_by_kind,
+            datasets_hours=self.keep_datasets_hours,
+            open_datasets_hours=self.keep_open_datasets_hours,
+        )
+
+    def conninfo(self) -> str:
+        """How to connect to the database.
+
+        Raises:
+            DatabaseError: no address was given and no private database was started.
+        """
+        if self.database_url is not None:
+            return self.database_url.get_secret_value()
+        return EmbeddedPostgres(self.data.absolute()).conninfo()
+
+    def checked(self) -> "WorkerSettings":
+        """The settings themselves, if they fit together.
+
+        Raises:
+            ConfigError: they do not.
+        """
+        if self.stale_seconds < 2 * self.heartbeat_seconds:
+            raise ConfigError(
+                f"{PREFIX}STALE_SECONDS is {self.stale_seconds:g}, which must be at least twice "
+                f"{PREFIX}HEARTBEAT_SECONDS ({self.heartbeat_seconds:g}), or jobs "
+                "would be taken from live workers."
+            )
+        return self
+
+
+def load_settings(model: type[S], *, data: Path | None = None, **changes: object) -> S:
+    """Settings from the environment, with what a command line says on top.
+
+    Args:
+        model: which settings.
+        data: the data folder, or None for what the environment says.
+        changes: further values; None leaves a setting as it is.
+
+    Raises:
+        ConfigError: a value cannot be used.
+    """
+    given = {name: value for name, value in {"data": data, **changes}.items() if value is not None}
+    try:
+        settings = model()
+        # Validated again, as a copy alone would not be.
+        return model.model_validate({**settings.model_dump(), **given}) if given else settings
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{PREFIX}{name.upper()}: {first['msg']} (it is {first.get('input')!r}).") from None

@@ -1,0 +1,54 @@
+"""What the program of a job is given, and how it crosses into the child process."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from engine.events import Listener, ignore
+
+RUN, POSES, RESULTS, SCENE = "run", "poses", "results", "scene"
+"""Folders of an attempt: the engine's output, found poses, what is to be published, the photographs."""
+
+EXIT_REFUSED = 1
+"""The job cannot be done and another try would end the same way; the last line says why."""
+EXIT_UNEXPECTED = 70
+"""A fault of the program."""
+EXIT_STOPPED = 75
+"""Stopped as asked; what is needed to go on is in the folder."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One job, as its program sees it.
+
+    Attributes:
+        folder: the attempt's own folder; ``folder / RUN`` holds the source job's results, or what an earlier
+            attempt left to go on from.
+        options: complete options, as JSON values.
+        scene: folder of the photographs, or None.
+        title: what the user calls the photographs.
+        threads: to use; 0 means all cores.
+        listener: hears the progress.
+        should_stop: asked now and then; True asks to stop with what is needed to go on.
+    """
+
+    folder: Path
+    options: Mapping[str, Any]
+    scene: Path | None = None
+    title: str = ""
+    threads: int = 0
+    listener: Listener = ignore
+    should_stop: Callable[[], bool] = field(default=lambda: False)
+
+    @property
+    def run(self) -> Path:
+        """The engine's output folder."""
+        return self.folder / RUN
+
+    @property
+    def results(self) -> Path:
+        """Folder of the files to publish; made when it is first asked for."""
+        folder = self.folder / RESULTS
+        folder.mkdir(exist_ok=True)
+        return folder
