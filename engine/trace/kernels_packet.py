@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
+from engine.trace.kernels_footprint import CELLS, footprints, rays_between, write_bins
 from engine.trace.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
 from engine.trace.kernels_simd import (
     boxes_in_pyramid,
@@ -30,6 +31,8 @@ ROW_BYTES, NODE_BYTES, BLOCK_BYTES = ROWS * WIDTH * 8, BOX_ROWS * WIDTH * 4, LEA
 AHEAD = 8
 """Candidates between asking for a record and reading it."""
 RECORD_BYTES = RECORD_WORDS * 4
+CHUNK = 128
+"""Candidates that a ray tests before it composites what lies safely in front of the rest."""
 SIDES = 5
 """Planes of a pyramid: four through its sides, one through its apex across the axis."""
 
@@ -64,11 +67,11 @@ def packet_starts(origins, directions, most, least_cosine, starts):
 
 
 @njit(error_model="numpy")
-def make_pyramid(directions, first, last, planes):
-    """Inward normals of the pyramid around rays ``first`` to ``last``, and its axis as the fifth plane.
+def make_pyramid(directions, first, last, planes, frame, below):
+    """The pyramid around rays ``first`` to ``last``.
 
-    Returns the four slopes (a low, a high, b low, b high) along the axes e1, e2, and writes axis, e1, e2 to
-    rows 4, 5 and 6 of ``planes``.
+    Writes its inward normals and its axis to the rows of ``planes``, its ``frame``, and the tables ``below``
+    of its rays (:mod:`engine.trace.kernels_footprint`).
     """
     x = y = z = 0.0
     for r in range(first, last):
@@ -104,16 +107,22 @@ def make_pyramid(directions, first, last, planes):
     for side in range(SIDES):
         for axis in range(3):
             rows[side, 3 + axis] = 3 + axis if planes[side, axis] > 0.0 else axis
-    planes[5, 0], planes[5, 1], planes[5, 2] = e0, e1, e2
-    planes[6, 0], planes[6, 1], planes[6, 2] = f0, f1, f2
-    return a_low, a_high, b_low, b_high
+    frame[0], frame[1], frame[2] = x, y, z
+    frame[3], frame[4], frame[5] = e0, e1, e2
+    frame[6], frame[7], frame[8] = f0, f1, f2
+    frame[9], frame[10], frame[11], frame[12] = a_low, a_high, b_low, b_high
+    write_bins(directions, first, last, frame, below)
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
-def gather_candidates(nodes, level_starts, blocks, count, planes, ox, oy, oz, stack, found):
-    """Curve places of the Gaussians whose ellipse reaches into the pyramid; returns how many there are.
+def gather_candidates(
+    nodes, level_starts, blocks, count, planes, frame, below, ox, oy, oz, stack, bins, distances,
+    found, keys, bounds, cells, masks,
+):  # fmt: skip
+    """The Gaussians whose ellipse a ray of the pyramid may meet; returns how many there are.
 
-    Only as many as fit are written to ``found``.
+    Of each: its place on the curve, a key with its likely distance in the upper half, the least distance, the
+    cell of its outline's middle, and the bits of the rays. Only as many as fit are written.
     """
     n_found = 0
     top = len(level_starts) - 2
@@ -122,6 +131,7 @@ def gather_candidates(nodes, level_starts, blocks, count, planes, ox, oy, oz, st
     depth = 1
     room = len(found)
     nodes_at, blocks_at, planes_at = nodes.ctypes.data, blocks.ctypes.data, planes.ctypes.data
+    frame_at, bins_at, distances_at = frame.ctypes.data, bins.ctypes.data, distances.ctypes.data
     while depth > 0:
         depth -= 1
         node = stack[2 * depth]
@@ -136,60 +146,37 @@ def gather_candidates(nodes, level_starts, blocks, count, planes, ox, oy, oz, st
                 stack[2 * depth + 1] = level - 1
                 depth += 1
                 continue
-            reached = ellipses_in_pyramid(blocks_at + child * BLOCK_BYTES, planes_at, ox, oy, oz)
+            block_at = blocks_at + child * BLOCK_BYTES
+            reached = ellipses_in_pyramid(block_at, planes_at, ox, oy, oz)
+            if reached != 0:
+                reached &= footprints(block_at, frame_at, ox, oy, oz, bins_at, distances_at)
             while reached != 0:
-                place = child * WIDTH + lowest_bit(reached)
+                lane = lowest_bit(reached)
                 reached &= reached - 1
-                if place < count:
-                    if n_found < room:
-                        found[n_found] = place
-                    n_found += 1
+                rays, cell = rays_between(bins, lane, below)
+                if rays == 0:
+                    continue  # it lies between the rays
+                if n_found < room:
+                    found[n_found] = child * WIDTH + lane
+                    # non-negative floats sort like their bits
+                    likely = np.uint64(float32_bits(np.float32(distances[1, lane])))
+                    keys[n_found] = (likely << np.uint64(32)) | np.uint64(n_found)
+                    bounds[n_found] = distances[0, lane]
+                    cells[n_found] = cell
+                    masks[n_found] = rays
+                n_found += 1
     return n_found
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
-def sort_by_least_distance(
-    found, count, blocks, order, planes, slopes, ox, oy, oz, keys, scratch, histogram, bounds, ids, near
+def sort_candidates(
+    found, count, order, keys, scratch, histogram, bounds, cells, masks, ids, near, block_rays
 ):
-    """Ids of the candidates by the least distance at which a ray of the packet can meet them."""
-    ax, ay, az = planes[4, 0], planes[4, 1], planes[4, 2]
-    for k in range(count):
-        place = found[k]
-        block = place // WIDTH
-        lane = place % WIDTH
-        m0, m1, m2 = blocks[block, 0, lane] - ox, blocks[block, 1, lane] - oy, blocks[block, 2, lane] - oz
-        u = blocks[block, 3, lane] * ax + blocks[block, 4, lane] * ay + blocks[block, 5, lane] * az
-        v = blocks[block, 6, lane] * ax + blocks[block, 7, lane] * ay + blocks[block, 8, lane] * az
-        middle = m0 * ax + m1 * ay + m2 * az
-        reach = math.sqrt(u * u + v * v)
-        least = middle - reach
-        # The plane's depth along the axis is largest and least at the pyramid's edges, if it meets all four.
-        u0, u1, u2 = (
-            np.float64(blocks[block, 3, lane]),
-            np.float64(blocks[block, 4, lane]),
-            np.float64(blocks[block, 5, lane]),
-        )
-        v0, v1, v2 = (
-            np.float64(blocks[block, 6, lane]),
-            np.float64(blocks[block, 7, lane]),
-            np.float64(blocks[block, 8, lane]),
-        )
-        n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-        height = m0 * n0 + m1 * n1 + m2 * n2
-        on_axis = ax * n0 + ay * n1 + az * n2
-        on_e = planes[5, 0] * n0 + planes[5, 1] * n1 + planes[5, 2] * n2
-        on_f = planes[6, 0] * n0 + planes[6, 1] * n1 + planes[6, 2] * n2
-        if height < 0.0:
-            height, on_axis, on_e, on_f = -height, -on_axis, -on_e, -on_f
-        steepest = on_axis + max(slopes[0] * on_e, slopes[1] * on_e) + max(slopes[2] * on_f, slopes[3] * on_f)
-        if steepest > 0.0:
-            least = max(least, height / steepest)
-        # Most rays meet it about where the axis does.
-        likely = height / on_axis if on_axis > 0.0 else middle
-        likely = max(min(max(likely, middle - reach), middle + reach), 0.0)
-        bounds[k] = max(least * (1.0 - 1e-6), 0.0)
-        # non-negative floats sort like their bits
-        keys[k] = (np.uint64(float32_bits(np.float32(likely))) << np.uint64(32)) | np.uint64(k)
+    """Ids of the candidates in chunks by distance; within a chunk those that the same rays may meet together.
+
+    ``near[k]``, where a chunk begins, is the least distance at which a ray can meet candidates k and after;
+    ``block_rays[b]`` has a bit for each ray that may meet one of the eight candidates of block b.
+    """
     if count > 48:
         sort_keys(keys, scratch, count, histogram)
     else:
@@ -197,10 +184,24 @@ def sort_by_least_distance(
     nearest = np.float32(np.inf)
     near[count] = nearest
     for k in range(count - 1, -1, -1):
-        which = np.int64(keys[k] & np.uint64(0xFFFFFFFF))
-        ids[k] = order[found[which]]
-        nearest = min(nearest, bounds[which])
+        nearest = min(nearest, bounds[np.int64(keys[k] & np.uint64(0xFFFFFFFF))])
         near[k] = nearest
+    for b in range((count + WIDTH - 1) // WIDTH):
+        block_rays[b] = 0
+    for start in range(0, count, CHUNK):
+        end = min(start + CHUNK, count)
+        histogram[: CELLS + 1] = 0
+        for k in range(start, end):
+            histogram[cells[np.int64(keys[k] & np.uint64(0xFFFFFFFF))] + 1] += 1
+        for cell in range(CELLS):
+            histogram[cell + 1] += histogram[cell]
+        for k in range(start, end):
+            which = np.int64(keys[k] & np.uint64(0xFFFFFFFF))
+            cell = cells[which]
+            place = start + histogram[cell]
+            histogram[cell] += 1
+            ids[place] = order[found[which]]
+            block_rays[place // WIDTH] |= masks[which]
 
 
 @njit
@@ -299,14 +300,16 @@ def write_rows(rows, ids, count, records, sh, ox, oy, oz):
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
-def meet_blocks(rows, first, last, dx, dy, dz, met):
-    """Candidates of blocks ``first`` to ``last`` whose octagon the ray meets; returns how many.
+def meet_blocks(rows, block_rays, ray, first, last, dx, dy, dz, met):
+    """Candidates of blocks ``first`` to ``last`` whose octagon the packet's ray ``ray`` meets; how many.
 
     Leaves t, u and v of each in the rows.
     """
     count = 0
     rows_at = rows.ctypes.data
     for b in range(first, last):
+        if (block_rays[b] >> np.uint64(ray)) & np.uint64(1) == 0:
+            continue
         mask = meet_block(rows_at + b * ROW_BYTES, dx, dy, dz)
         while mask != 0:
             met[count] = b * WIDTH + lowest_bit(mask)

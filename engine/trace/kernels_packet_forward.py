@@ -3,10 +3,13 @@
 import numpy as np
 from numba import njit, prange
 
+from engine.trace.kernels_footprint import BINS, FRAME_WORDS
 from engine.trace.kernels_native import next_from_counter
 from engine.trace.kernels_packet import (
     ALPHA_0,
+    CHUNK,
     ROWS,
+    SIDES,
     STACK,
     T_ROW,
     U_ROW,
@@ -15,7 +18,7 @@ from engine.trace.kernels_packet import (
     gather_candidates,
     make_pyramid,
     meet_blocks,
-    sort_by_least_distance,
+    sort_candidates,
     write_rows,
 )
 from engine.trace.kernels_sh import write_basis
@@ -23,8 +26,7 @@ from engine.trace.kernels_simd import float32_bits, float32_from_bits, write_ran
 from engine.trace.kernels_tree import WIDTH
 
 RANKED = 96
-STRIDE = 16
-"""Blocks of candidates that a ray tests before it composites what lies safely in front of the rest."""
+STRIDE = CHUNK // WIDTH
 
 
 @njit(error_model="numpy")
@@ -87,7 +89,11 @@ def trace_from_counter(
     feature_count = features.shape[1]
     near_limit = np.float32(t_min)
     basis = np.empty(16, np.float64)
-    planes = np.empty((7, 6), np.float64)
+    planes = np.empty((SIDES, 6), np.float64)
+    frame = np.empty(FRAME_WORDS, np.float64)
+    bins = np.empty((4, WIDTH), np.int32)
+    distances = np.empty((2, WIDTH), np.float64)
+    below = np.empty((2, BINS + 1), np.uint64)
     stack = np.empty(STACK, np.int64)
     histogram = np.empty(256, np.int32)
     ranked = np.empty(RANKED, np.uint64)
@@ -98,6 +104,9 @@ def trace_from_counter(
     ids = np.empty(room, np.int32)
     near = np.empty(room + 1, np.float32)
     bounds = np.empty(room, np.float32)
+    cells = np.empty(room, np.int32)
+    masks = np.empty(room, np.uint64)
+    block_rays = np.empty(room // WIDTH, np.uint64)
     rows = np.empty((room // WIDTH, ROWS, WIDTH), np.float64)
     slot_of = np.empty(room, np.int32)
     met = np.empty(room + WIDTH, np.int32)
@@ -112,8 +121,11 @@ def trace_from_counter(
             np.float64(origins[first, 1]),
             np.float64(origins[first, 2]),
         )
-        slopes = make_pyramid(directions, first, last, planes)
-        count = gather_candidates(nodes, level_starts, blocks, len(order), planes, ox, oy, oz, stack, found)
+        make_pyramid(directions, first, last, planes, frame, below)
+        count = gather_candidates(
+            nodes, level_starts, blocks, len(order), planes, frame, below, ox, oy, oz, stack, bins, distances,
+            found, keys, bounds, cells, masks,
+        )  # fmt: skip
         if count > room:
             room = (count * 5 // 4 + WIDTH - 1) // WIDTH * WIDTH
             found = np.empty(room, np.int32)
@@ -121,29 +133,19 @@ def trace_from_counter(
             ids = np.empty(room, np.int32)
             near = np.empty(room + 1, np.float32)
             bounds = np.empty(room, np.float32)
+            cells = np.empty(room, np.int32)
+            masks = np.empty(room, np.uint64)
+            block_rays = np.empty(room // WIDTH, np.uint64)
             rows = np.empty((room // WIDTH, ROWS, WIDTH), np.float64)
             slot_of = np.empty(room, np.int32)
             met = np.empty(room + WIDTH, np.int32)
             pending = np.empty(room + WIDTH, np.uint64)
             count = gather_candidates(
-                nodes, level_starts, blocks, len(order), planes, ox, oy, oz, stack, found
-            )
-        sort_by_least_distance(
-            found,
-            count,
-            blocks,
-            order,
-            planes,
-            slopes,
-            ox,
-            oy,
-            oz,
-            keys,
-            pending,
-            histogram,
-            bounds,
-            ids,
-            near,
+                nodes, level_starts, blocks, len(order), planes, frame, below, ox, oy, oz, stack, bins,
+                distances, found, keys, bounds, cells, masks,
+            )  # fmt: skip
+        sort_candidates(
+            found, count, order, keys, pending, histogram, bounds, cells, masks, ids, near, block_rays
         )
         write_rows(rows, ids, count, records, sh, ox, oy, oz)
         block_count = (count + WIDTH - 1) // WIDTH
@@ -172,7 +174,7 @@ def trace_from_counter(
             b0 = 0
             while b0 < block_count and not stop:
                 b1 = min(b0 + STRIDE, block_count)
-                n_met = meet_blocks(rows, b0, b1, dx, dy, dz, met)
+                n_met = meet_blocks(rows, block_rays, r - first, b0, b1, dx, dy, dz, met)
                 for m in range(n_met):
                     k = met[m]
                     t = np.float32(rows[k // WIDTH, T_ROW, k % WIDTH])

@@ -10,36 +10,36 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 LANES = 8
-_I64 = ir.IntType(64)
-_DOUBLE8 = ir.VectorType(ir.DoubleType(), LANES)
-_FLOAT8 = ir.VectorType(ir.FloatType(), LANES)
+I64 = ir.IntType(64)
+DOUBLE8 = ir.VectorType(ir.DoubleType(), LANES)
+FLOAT8 = ir.VectorType(ir.FloatType(), LANES)
 
 
-class _Vector:
+class Vector:
     """A vector value with the operators that the formulas need."""
 
     def __init__(self, builder, value):
         self.builder, self.value = builder, value
 
     def _other(self, other):
-        if isinstance(other, _Vector):
+        if isinstance(other, Vector):
             return other.value
-        return ir.Constant(_DOUBLE8, [float(other)] * LANES)
+        return ir.Constant(DOUBLE8, [float(other)] * LANES)
 
     def __add__(self, other):
-        return _Vector(self.builder, self.builder.fadd(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fadd(self.value, self._other(other), ("contract",)))
 
     def __sub__(self, other):
-        return _Vector(self.builder, self.builder.fsub(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fsub(self.value, self._other(other), ("contract",)))
 
     def __mul__(self, other):
-        return _Vector(self.builder, self.builder.fmul(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fmul(self.value, self._other(other), ("contract",)))
 
     def __truediv__(self, other):
-        return _Vector(self.builder, self.builder.fdiv(self.value, self._other(other)))
+        return Vector(self.builder, self.builder.fdiv(self.value, self._other(other)))
 
     def _compare(self, operator, other):
-        return _Vector(self.builder, self.builder.fcmp_ordered(operator, self.value, self._other(other)))
+        return Vector(self.builder, self.builder.fcmp_ordered(operator, self.value, self._other(other)))
 
     def __le__(self, other):
         return self._compare("<=", other)
@@ -54,57 +54,76 @@ class _Vector:
         return self._compare(">", other)
 
     def __and__(self, other):
-        return _Vector(self.builder, self.builder.and_(self.value, other.value))
+        return Vector(self.builder, self.builder.and_(self.value, other.value))
 
     def __invert__(self):
-        return _Vector(self.builder, self.builder.not_(self.value))
+        return Vector(self.builder, self.builder.not_(self.value))
 
     def __abs__(self):
-        integers = ir.VectorType(_I64, LANES)
+        integers = ir.VectorType(I64, LANES)
         no_sign = ir.Constant(integers, [0x7FFFFFFFFFFFFFFF] * LANES)
         bits = self.builder.and_(self.builder.bitcast(self.value, integers), no_sign)
-        return _Vector(self.builder, self.builder.bitcast(bits, _DOUBLE8))
+        return Vector(self.builder, self.builder.bitcast(bits, DOUBLE8))
 
     def larger(self, other):
         """The larger of two lanes; the second where they cannot be compared."""
-        return _Vector(self.builder, self.builder.select((self > other).value, self.value, other.value))
+        return Vector(self.builder, self.builder.select((self > other).value, self.value, self._other(other)))
+
+    def smaller(self, other):
+        """The smaller of two lanes; the second where they cannot be compared."""
+        return Vector(self.builder, self.builder.select((self < other).value, self.value, self._other(other)))
+
+    def where(self, yes, no):
+        """Lanes of ``yes`` where this comparison holds, else those of ``no``."""
+        return Vector(self.builder, self.builder.select(self.value, self._other(yes), self._other(no)))
+
+    def root(self):
+        """Square roots."""
+        function_type = ir.FunctionType(DOUBLE8, [DOUBLE8])
+        function = cgutils.get_or_insert_function(self.builder.module, function_type, "llvm.sqrt.v8f64")
+        return Vector(self.builder, self.builder.call(function, [self.value]))
+
+    def integers(self):
+        """Towards zero, as int32; the lanes must fit."""
+        return Vector(self.builder, self.builder.fptosi(self.value, ir.VectorType(ir.IntType(32), LANES)))
 
     def mask(self):
         """Truth of the lanes as the low bits of an int64."""
-        return self.builder.zext(self.builder.bitcast(self.value, ir.IntType(LANES)), _I64)
+        return self.builder.zext(self.builder.bitcast(self.value, ir.IntType(LANES)), I64)
 
 
-class _Lanes:
-    """Loads and stores rows of eight lanes at an address; broadcasts scalars."""
+class Lanes:
+    """Loads and stores rows of eight lanes at an address."""
 
     def __init__(self, builder, address, element):
-        self.builder, self.size = builder, 8 if element is _DOUBLE8 else 4
+        self.builder, self.size = builder, 8 if element is DOUBLE8 else 4
         self.element = element
         self.address = address
 
     def _pointer(self, row):
         offset = (
-            ir.Constant(_I64, row * LANES * self.size)
+            ir.Constant(I64, row * LANES * self.size)
             if isinstance(row, int)
-            else self.builder.mul(row, ir.Constant(_I64, LANES * self.size))
+            else self.builder.mul(row, ir.Constant(I64, LANES * self.size))
         )
         address = self.builder.add(self.address, offset)
         return self.builder.inttoptr(address, self.element.as_pointer())
 
     def __getitem__(self, row):
         value = self.builder.load(self._pointer(row), align=4)
-        if self.element is _FLOAT8:
-            value = self.builder.fpext(value, _DOUBLE8)
-        return _Vector(self.builder, value)
+        if self.element is FLOAT8:
+            value = self.builder.fpext(value, DOUBLE8)
+        return Vector(self.builder, value)
 
     def __setitem__(self, row, vector):
         self.builder.store(vector.value, self._pointer(row), align=8)
 
 
-def _broadcast(builder, scalar):
-    one = builder.insert_element(ir.Constant(_DOUBLE8, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
+def broadcast(builder, scalar):
+    """A vector of eight times the same double."""
+    one = builder.insert_element(ir.Constant(DOUBLE8, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return _Vector(builder, builder.shuffle_vector(one, ir.Constant(_DOUBLE8, ir.Undefined), zeros))
+    return Vector(builder, builder.shuffle_vector(one, ir.Constant(DOUBLE8, ir.Undefined), zeros))
 
 
 @intrinsic
@@ -116,14 +135,14 @@ def meet_block(typingctx, block, dx, dy, dz):
     signature = types.int64(types.uintp, types.float64, types.float64, types.float64)
 
     def codegen(context, builder, sig, args):
-        rows = _Lanes(builder, args[0], _DOUBLE8)
-        d = [_broadcast(builder, component) for component in args[1:]]
+        rows = Lanes(builder, args[0], DOUBLE8)
+        d = [broadcast(builder, component) for component in args[1:]]
 
         def along(row):
             return rows[row] * d[0] + rows[row + 1] * d[1] + rows[row + 2] * d[2]
 
         cosine = along(0)
-        one = _Vector(builder, ir.Constant(_DOUBLE8, [1.0] * LANES))
+        one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
         inverse = one / cosine
         u = along(3) * inverse
         v = along(6) * inverse
@@ -148,8 +167,8 @@ def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
     signature = types.int64(types.uintp, types.uintp, types.float64, types.float64, types.float64)
 
     def codegen(context, builder, sig, args):
-        rows = _Lanes(builder, args[0], _FLOAT8)
-        o = [_broadcast(builder, component) for component in args[2:]]
+        rows = Lanes(builder, args[0], FLOAT8)
+        o = [broadcast(builder, component) for component in args[2:]]
         inside = None
         for side in range(5):
             distance = None
@@ -174,8 +193,8 @@ def ellipses_in_pyramid(typingctx, block, planes, ox, oy, oz):
     signature = types.int64(types.uintp, types.uintp, types.float64, types.float64, types.float64)
 
     def codegen(context, builder, sig, args):
-        rows = _Lanes(builder, args[0], _FLOAT8)
-        o = [_broadcast(builder, component) for component in args[2:]]
+        rows = Lanes(builder, args[0], FLOAT8)
+        o = [broadcast(builder, component) for component in args[2:]]
         centre = [rows[axis] - o[axis] for axis in range(3)]
         legs = [rows[3 + k] for k in range(6)]
         inside = None
@@ -194,10 +213,10 @@ def ellipses_in_pyramid(typingctx, block, planes, ox, oy, oz):
 def _plane(builder, planes, side, axis):
     """Broadcast component of a normal, and the row of the box's corner along it."""
     words = builder.inttoptr(planes, ir.DoubleType().as_pointer())
-    value = builder.load(builder.gep(words, [ir.Constant(_I64, side * 6 + axis)]))
-    rows = builder.inttoptr(planes, _I64.as_pointer())
-    row = builder.load(builder.gep(rows, [ir.Constant(_I64, side * 6 + 3 + axis)]))
-    return _broadcast(builder, value), row
+    value = builder.load(builder.gep(words, [ir.Constant(I64, side * 6 + axis)]))
+    rows = builder.inttoptr(planes, I64.as_pointer())
+    row = builder.load(builder.gep(rows, [ir.Constant(I64, side * 6 + 3 + axis)]))
+    return broadcast(builder, value), row
 
 
 @intrinsic
@@ -207,12 +226,12 @@ def write_ranks(typingctx, keys, first, count, ranks):
 
     def codegen(context, builder, sig, args):
         keys, first, count, ranks = args
-        word = ir.Constant(_I64, 8)
-        integers = ir.VectorType(_I64, LANES)
+        word = ir.Constant(I64, 8)
+        integers = ir.VectorType(I64, LANES)
         offset = builder.mul(first, word)
         mine = builder.load(builder.inttoptr(builder.add(keys, offset), integers.as_pointer()), align=8)
         below = cgutils.alloca_once_value(builder, ir.Constant(integers, [0] * LANES))
-        base = builder.inttoptr(keys, _I64.as_pointer())
+        base = builder.inttoptr(keys, I64.as_pointer())
         undefined = ir.Constant(integers, ir.Undefined)
         zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
         with cgutils.for_range(builder, count) as loop:

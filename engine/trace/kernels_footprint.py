@@ -1,0 +1,128 @@
+"""Which rays of a packet may meet which candidate, as the bits of one word, and at which distance.
+
+A ray is the point (a, b) where it passes the plane at distance one along the packet's axis. The outline of a
+candidate's ellipse, seen from the packet's origin, lies between two values of a and two of b; the rays
+between them are found by a table over bins of a and b.
+"""
+
+import llvmlite.ir as ir
+import numpy as np
+from numba import njit, types
+from numba.extending import intrinsic
+
+from engine.trace.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
+
+BINS = 64
+GRID = 8
+CELLS = GRID * GRID
+"""Cells of the pyramid's cross section along a Z-order curve."""
+FRAME_WORDS = 15
+"""A packet's axis, e and f; its slopes a low, a high, b low, b high; bins per slope along a and b."""
+_GRAZING = 1e-6
+"""Room for the rounding of normals, as a fraction of the ellipse's size."""
+
+
+@njit(error_model="numpy")
+def write_bins(directions, first, last, frame, below):
+    """Bins per slope into the frame, and the bits of the rays in bins before i into ``below[axis, i]``."""
+    frame[13] = BINS / (frame[10] - frame[9])
+    frame[14] = BINS / (frame[12] - frame[11])
+    below[:] = 0
+    for r in range(first, last):
+        d0, d1, d2 = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
+        inverse = 1.0 / (d0 * frame[0] + d1 * frame[1] + d2 * frame[2])
+        bit = np.uint64(1) << np.uint64(r - first)
+        for axis in range(2):
+            k = 3 + 3 * axis
+            slope = (d0 * frame[k] + d1 * frame[k + 1] + d2 * frame[k + 2]) * inverse
+            place = (slope - frame[9 + 2 * axis]) * frame[13 + axis]
+            below[axis, np.int64(min(max(place, 0.0), BINS - 1.0)) + 1] |= bit
+    for i in range(BINS):
+        below[0, i + 1] |= below[0, i]
+        below[1, i + 1] |= below[1, i]
+
+
+@intrinsic
+def footprints(typingctx, block, frame, ox, oy, oz, bins, distances):
+    """Outlines and distances of the eight ellipses of a block of leaves, seen from o.
+
+    Writes the first and last bin along a, then along b, as rows of eight int32 to ``bins``, and two rows of
+    doubles to ``distances``: the least distance at which a ray of the packet can meet the ellipse, and that
+    at which most do. An ellipse that reaches behind the origin is everywhere. Bit k of the result: octagon k
+    has not vanished.
+    """
+    double, address = types.float64, types.uintp
+    signature = types.int64(address, address, double, double, double, address, address)
+
+    def codegen(context, builder, sig, args):
+        block, frame, ox, oy, oz, bins, distances = args
+        rows = Lanes(builder, block, FLOAT8)
+        words = builder.inttoptr(frame, ir.DoubleType().as_pointer())
+        f = [
+            broadcast(builder, builder.load(builder.gep(words, [ir.Constant(I64, k)])))
+            for k in range(FRAME_WORDS)
+        ]
+        m = [rows[k] - broadcast(builder, o) for k, o in enumerate((ox, oy, oz))]
+        u, v = [rows[3 + k] for k in range(3)], [rows[6 + k] for k in range(3)]
+        middle, u_axis, v_axis = dot(m, f[0:3]), dot(u, f[0:3]), dot(v, f[0:3])
+        depth2, reach2 = middle * middle, u_axis * u_axis + v_axis * v_axis
+        in_front = (depth2 > reach2 * 1.1) & (middle > 0.0)
+        room = (dot(u, u) + dot(v, v)).root() / middle * _GRAZING + 1e-9
+        inverse = _one(builder) / (depth2 - reach2)
+        out = Lanes(builder, bins, ir.VectorType(ir.IntType(32), LANES))
+        for axis in range(2):
+            e = f[3 + 3 * axis : 6 + 3 * axis]
+            # The outline touches slope s + d, s that of the centre, where
+            # (u' - d u)^2 + (v' - d v)^2 = (d middle)^2 with u' = u.e - s u.
+            centre = dot(m, e) / middle
+            u_e, v_e = dot(u, e) - centre * u_axis, dot(v, e) - centre * v_axis
+            b = u_e * u_axis + v_e * v_axis
+            root = (b * b + (depth2 - reach2) * (u_e * u_e + v_e * v_e)).root()
+            low = centre - (b + root) * inverse - room
+            high = centre + (root - b) * inverse + room
+            start, scale = f[9 + 2 * axis], f[13 + axis]
+            first, last = ((edge - start) * scale for edge in (low, high))
+            first, last = in_front.where(first, 0.0), in_front.where(last, BINS - 1.0)
+            out[2 * axis] = first.larger(0.0).smaller(BINS - 1.0).integers()
+            out[2 * axis + 1] = last.larger(0.0).smaller(BINS - 1.0).integers()
+        # The plane's depth along the axis is largest and least at the pyramid's edges, if it meets all four.
+        n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+        height, on_axis = dot(m, n), dot(n, f[0:3])
+        on_e, on_f = dot(n, f[3:6]), dot(n, f[6:9])
+        behind = height < 0.0
+        height, on_axis, on_e, on_f = (
+            behind.where(_one(builder) * 0.0 - term, term) for term in (height, on_axis, on_e, on_f)
+        )
+        steepest = on_axis + (f[9] * on_e).larger(f[10] * on_e) + (f[11] * on_f).larger(f[12] * on_f)
+        reach = reach2.root()
+        near = middle - reach
+        least = (steepest > 0.0).where(near.larger(height / steepest), near)
+        likely = (on_axis > 0.0).where(height / on_axis, middle)
+        likely = likely.larger(near).smaller(middle + reach)
+        out = Lanes(builder, distances, DOUBLE8)
+        out[0] = (least * (1.0 - 1e-6)).larger(0.0)
+        out[1] = likely.larger(0.0)
+        return (reach2 >= 0.0).mask()
+
+    return signature, codegen
+
+
+def dot(a, b):
+    """Sum of products."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _one(builder):
+    return Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
+
+
+@njit(error_model="numpy")
+def rays_between(bins, lane, below):
+    """Bits of the rays in the bins of one lane, and the cell of their middle."""
+    i0, i1, j0, j1 = bins[0, lane], bins[1, lane], bins[2, lane], bins[3, lane]
+    mask = below[0, i1 + 1] & ~below[0, i0] & below[1, j1 + 1] & ~below[1, j0]
+    i, j = (i0 + i1) * GRID // (2 * BINS), (j0 + j1) * GRID // (2 * BINS)
+    cell = 0
+    for bit in range(3):
+        cell |= ((i >> bit) & 1) << (2 * bit) | ((j >> bit) & 1) << (2 * bit + 1)
+    return mask, cell
