@@ -1,5 +1,6 @@
 """Reading a COLMAP model, with or without rigs, binary or text, into plain records."""
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,12 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where a scene keeps its model; the first that holds one counts."""
 
 _PARTS = ("cameras", "images", "points3D")
+LEAST_QUATERNION = 1e-6
+"""Quaternions shorter than this say nothing about a rotation."""
+UNIT_TOLERANCE = 1e-9
+"""Lengths of quaternions this near to 1 need no correction."""
+TOLD_TOLERANCE = 1e-3
+"""Lengths of quaternions this near to 1 are unit ones that a text file rounded, which is not worth telling."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +94,63 @@ def read_colmap_model(root: Path) -> ColmapModel:
             f"The COLMAP model in {folder} cannot be read ({reason}); copy it anew or run COLMAP again."
         ) from error
     warnings: list[str] = []
+    _normalise_rotations(reconstruction, folder, warnings)
     images = _posed_images(reconstruction, folder, warnings)
     cameras = _cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
     points = _sparse_points(reconstruction, folder, warnings)
     return ColmapModel(folder, cameras, images, points, tuple(warnings))
+
+
+def _normalise_rotations(reconstruction: Any, folder: Path, warnings: list[str]) -> None:
+    """Bring the quaternions of frames and rigs to unit length, before poses are composed of them.
+
+    pycolmap takes them as they are, and composes anything, even zeros, to something like a pose.
+    """
+    scaled = 0
+    for frame in reconstruction.frames.values():
+        if not frame.has_pose:
+            continue
+        length = frame.rig_from_world.rotation.norm()
+        if not length > LEAST_QUATERNION or not math.isfinite(length):
+            names = sorted(reconstruction.images[data.id].name for data in frame.image_ids)
+            raise DatasetError(
+                f"The pose of {' and '.join(names)} in {folder} has the rotation quaternion "
+                f"{_wxyz(frame.rig_from_world)}, which is no rotation; run COLMAP again or remove the image."
+            )
+        frame.rig_from_world, off = _with_unit_rotation(frame.rig_from_world)
+        scaled += off
+    for rig in reconstruction.rigs.values():
+        for sensor, pose in dict(rig.non_ref_sensors).items():
+            if pose is None:
+                continue
+            length = pose.rotation.norm()
+            if not length > LEAST_QUATERNION or not math.isfinite(length):
+                raise DatasetError(
+                    f"Camera {sensor.id} of rig {rig.rig_id} in {folder} has the rotation quaternion "
+                    f"{_wxyz(pose)}, which is no rotation; run COLMAP again."
+                )
+            unit, off = _with_unit_rotation(pose)
+            rig.set_sensor_from_rig(sensor, unit)
+            scaled += off
+    if scaled:
+        warnings.append(
+            f"{scaled} rotations of the model in {folder} were quaternions of another length than 1 "
+            "and were normalised."
+        )
+
+
+def _with_unit_rotation(pose: Any) -> tuple[Any, bool]:
+    """``pose`` with its quaternion at length 1, and whether that is worth telling."""
+    length = pose.rotation.norm()
+    if abs(length - 1) <= UNIT_TOLERANCE:
+        return pose, False
+    unit = pycolmap.Rotation3d(pose.rotation.quat / length)
+    return pycolmap.Rigid3d(unit, pose.translation), abs(length - 1) > TOLD_TOLERANCE
+
+
+def _wxyz(pose: Any) -> str:
+    x, y, z, w = pose.rotation.quat.tolist()
+    return f"({w:g}, {x:g}, {y:g}, {z:g})"
 
 
 def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tuple[PosedImage, ...]:

@@ -235,6 +235,47 @@ def test_poses_must_be_finite(tmp_path, make_scene):
         load_scene(root)
 
 
+def set_quaternion(root, wxyz: list[float], text: bool) -> None:
+    """Replace the rotation of the first image of a model without rigs."""
+    path = root / "sparse/0" / ("images.txt" if text else "images.bin")
+    if text:
+        lines = path.read_text().splitlines()
+        first = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+        words = lines[first].split()
+        lines[first] = " ".join([words[0], *(f"{value:g}" for value in wxyz), *words[5:]])
+        path.write_text("\n".join(lines) + "\n")
+    else:
+        data = bytearray(path.read_bytes())
+        data[12:44] = np.array(wxyz).tobytes()
+        path.write_bytes(data)
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("wxyz", [[0, 0, 0, 0], [1e-30, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1]])
+def test_rotations_must_be_rotations(tmp_path, make_scene, wxyz, text):
+    root = make_scene(tmp_path, with_rigs=False, text=text)
+    set_quaternion(root, wxyz, text)
+    with pytest.raises(DatasetError, match=r"pose of view_\d\.png .*rotation|sparse/0 cannot be read"):
+        load_scene(root)
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize(("factor", "told"), [(2.5, True), (1 + 1e-5, False)])
+def test_rotations_of_another_length_are_normalised(tmp_path, make_scene, factor, told, text):
+    root = make_scene(tmp_path, with_rigs=False, text=text)
+    quaternion = np.array([0.5, -0.1, 0.7, 0.5])  # of length 1
+    set_quaternion(root, (factor * quaternion).tolist(), text)
+    scene = load_scene(root)
+    set_quaternion(root, quaternion.tolist(), text)
+    wanted = load_scene(root)
+    for view, other in zip(scene.views, wanted.views, strict=True):
+        np.testing.assert_allclose(
+            view.rotation_cam_from_world, other.rotation_cam_from_world, rtol=0, atol=2e-5 if text else 1e-12
+        )
+        np.testing.assert_allclose(np.linalg.det(view.rotation_cam_from_world), 1.0, atol=1e-12)
+    assert any("1 rotations" in warning and "normalised" in warning for warning in scene.warnings) is told
+
+
 def test_camera_parameters_must_be_possible(tmp_path, make_scene):
     root = make_scene(tmp_path)
     path = root / "sparse/0/cameras.bin"
