@@ -32,11 +32,18 @@ _DOING = {
     "export": "Exporting",
     "generate": "Generating",
     "render": "Rendering",
+    "features": "Finding features",
+    "matches": "Matching",
     "poses": "Finding poses",
     "upload": "Uploading",
     "download": "Downloading",
     "read": "Reading",
+    "depth": "Rendering depth",
+    "fusing": "Fusing depth",
+    "meshing": "Meshing",
+    "colouring": "Colouring",
 }
+# What a finished stage did, and what its steps are; "" where nobody would want them counted.
 _DONE = {
     "load": ("Loaded", "photograph"),
     "train": ("Trained", "iteration"),
@@ -44,10 +51,16 @@ _DONE = {
     "export": ("Exported", "file"),
     "generate": ("Generated", "photograph"),
     "render": ("Rendered", "image"),
+    "features": ("Found features", "photograph"),
+    "matches": ("Matched", "pair"),
     "poses": ("Found the poses", "photograph"),
     "upload": ("Uploaded", "kB"),
     "download": ("Downloaded", "kB"),
     "read": ("Read", "file"),
+    "depth": ("Rendered", "depth map"),
+    "fusing": ("Fused the depth maps", ""),
+    "meshing": ("Made the mesh", ""),
+    "colouring": ("Coloured", "point"),
 }
 
 
@@ -71,7 +84,8 @@ class _State:
 
     def finished(self, event: StageFinished) -> str:
         verb, what = _DONE.get(event.stage, (f"Finished {event.stage}", "step"))
-        count = f" {self.step:,} {what}{'' if self.step == 1 or what == 'kB' else 's'}" if self.step else ""
+        plural = "" if self.step == 1 or what == "kB" else "s"
+        count = f" {self.step:,} {what}{plural}" if self.step and what else ""
         line = f"{verb}{count} in {duration(event.seconds)}"
         if event.stage == "train" and self.training is not None:
             line += f": {training_state(self.training, self.held_out)}"

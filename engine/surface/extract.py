@@ -66,7 +66,7 @@ def extract_surface(
         cameras: where depth and colours are rendered from.
         options: all settings.
         scratch: folder for a temporary file of 8 bytes for every pixel of the depth maps.
-        listener: hears the stages ``render``, ``fusing``, ``meshing`` and ``colouring``.
+        listener: hears the stages ``depth``, ``fusing``, ``meshing`` and ``colouring``.
         should_stop: asked now and then.
 
     Raises:
@@ -89,7 +89,7 @@ def extract_surface(
 
     if not options.unbounded and options.bounds is None:
         focus(cameras)  # complain before the long work
-    with stage("render", len(cameras)) as progress:
+    with stage("depth", len(cameras)) as progress:
         maps = render_depth_maps(tracer, cameras, options, scratch, progress)
     region = choose_region(maps, options)
     with stage("fusing", 2 * len(cameras)) as progress:

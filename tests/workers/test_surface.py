@@ -1,5 +1,6 @@
 """``octasplat surface``."""
 
+import re
 import signal
 import time
 
@@ -46,7 +47,12 @@ def test_file_alone_is_seen_from_all_around(run, octasplat, tmp_path):
         "surface", run.output / "scene.ply", "-o", tmp_path / "a.ply", "--resolution", 32, "--depth-side", 24
     )
     assert result.exit_code == 0, result.output
-    assert "Rendered 96 images" in result.output
+    lines = result.output.splitlines()
+    started = ["Rendering depth", "Fusing depth", "Meshing", "Colouring"]
+    assert [line for line in lines if line in started] == started
+    finished = [line.partition(" in ")[0] for line in lines if line.endswith(" s")]
+    assert finished[:3] == ["Rendered 96 depth maps", "Fused the depth maps", "Made the mesh"]
+    assert re.fullmatch(r"Coloured [\d,]+ points", finished[3])
 
 
 @pytest.mark.parametrize(
