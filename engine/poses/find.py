@@ -3,7 +3,8 @@
 import shutil
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,13 +18,15 @@ from engine.scene.images import read_image_info
 
 T = TypeVar("T")
 
-STAGE = "poses"
+FEATURES, MATCHES, STAGE = "features", "matches", "poses"
 MODEL = Path("sparse") / "0"
 MIN_PHOTOGRAPHS = 3
 SMALL_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 _LOOK_SECONDS = 0.5
+_SIGN_SECONDS = 30.0
+"""How often a step that takes long tells that it is alive."""
 
 
 class PosesConfig(BaseModel):
@@ -67,8 +70,8 @@ def find_poses(
 ) -> Path:
     """Find where photographs were taken, and a sparse point cloud.
 
-    The steps of the stage are photographs: each counts once for its features, once for its matches and once
-    for its pose. A result that is there already is taken as it is.
+    There are three stages: ``features``, whose steps are photographs, ``matches``, whose steps are pairs of
+    them, and ``poses``, whose steps are photographs again. A result that is there already is taken as it is.
 
     Args:
         images: folder of photographs, also in folders below it.
@@ -89,8 +92,6 @@ def find_poses(
     if model.is_dir():
         return model
     names = photographs_in(images)
-    began = time.monotonic()
-    listener(StageStarted(STAGE, 3 * len(names)))
     work = output / "work"
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -98,18 +99,26 @@ def find_poses(
         run = _Run(images, names, work, config, threads or -1, listener, should_stop)
         run.extract()
         run.match()
-        best = run.map()
-        _check(best, len(names), config, listener)
-        found = work / "found"
-        found.mkdir()
-        best.write_binary(str(found))
-        model.parent.mkdir(parents=True, exist_ok=True)
-        found.rename(model)
+        with _stage(STAGE, len(names), listener):
+            best = run.map()
+            _check(best, len(names), config, listener)
+            found = work / "found"
+            found.mkdir()
+            best.write_binary(str(found))
+            model.parent.mkdir(parents=True, exist_ok=True)
+            found.rename(model)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    listener(StageProgress(STAGE, 3 * len(names), 3 * len(names)))
-    listener(StageFinished(STAGE, time.monotonic() - began))
     return model
+
+
+@contextmanager
+def _stage(name: str, steps: int, listener: Listener) -> Iterator[None]:
+    began = time.monotonic()
+    listener(StageStarted(name, steps))
+    yield
+    listener(StageProgress(name, steps, steps))
+    listener(StageFinished(name, time.monotonic() - began))
 
 
 def photographs_in(folder: Path) -> list[str]:
@@ -177,18 +186,20 @@ class _Run:
                 )
             )
         mode = pycolmap.CameraMode.SINGLE if len(sizes) == 1 else pycolmap.CameraMode.AUTO
-        self._watched(
-            lambda token: pycolmap.extract_features(
-                self._database,
-                self._images,
-                image_names=self._names,
-                camera_mode=mode,
-                extraction_options=options,
-                device=pycolmap.Device.cpu,
-                cancellation_token=token,
-            ),
-            lambda: len(feature_counts(self._database)),
-        )
+        count = len(self._names)
+        with _stage(FEATURES, count, self._listener):
+            self._watched(
+                lambda token: pycolmap.extract_features(
+                    self._database,
+                    self._images,
+                    image_names=self._names,
+                    camera_mode=mode,
+                    extraction_options=options,
+                    device=pycolmap.Device.cpu,
+                    cancellation_token=token,
+                ),
+                lambda: StageProgress(FEATURES, len(feature_counts(self._database)), count),
+            )
         poor = [name for name, count in feature_counts(self._database).items() if count < 50]
         if poor:
             self._listener(
@@ -202,7 +213,8 @@ class _Run:
         options.num_threads = self._threads
         options.use_gpu = False
         exhaustive = count <= config.exhaustive_up_to
-        pairs = count * (count - 1) / 2 if exhaustive else 2 * count * config.overlap
+        # Far neighbours that do not exist make the second number a little too high.
+        pairs = count * (count - 1) // 2 if exhaustive else 2 * count * config.overlap
         if not exhaustive:
             self._listener(
                 Warned(
@@ -232,7 +244,10 @@ class _Run:
                 cancellation_token=token,
             )
 
-        self._watched(run, lambda: count + int(count * min(1.0, pairs_matched(self._database) / pairs)))
+        with _stage(MATCHES, pairs, self._listener):
+            self._watched(
+                run, lambda: StageProgress(MATCHES, min(pairs, pairs_matched(self._database)), pairs)
+            )
 
     def map(self) -> Any:
         """The model with the most photographs.
@@ -259,7 +274,7 @@ class _Run:
                 next_image_callback=registered,
                 cancellation_token=token,
             ),
-            lambda: 2 * len(self._names) + min(self._registered, len(self._names)),
+            lambda: StageProgress(STAGE, min(self._registered, len(self._names)), len(self._names)),
         )
         if not models:
             raise DatasetError(
@@ -268,7 +283,7 @@ class _Run:
             )
         return max(models.values(), key=lambda model: model.num_reg_images())
 
-    def _watched(self, run: Callable[[Any], T], done: Callable[[], int]) -> T:
+    def _watched(self, run: Callable[[Any], T], progress: Callable[[], StageProgress]) -> T:
         """Run in a thread; tell of the progress and hear of the wish to stop meanwhile.
 
         Raises:
@@ -286,15 +301,15 @@ class _Run:
 
         thread = threading.Thread(target=inside, daemon=True)
         thread.start()
-        total, last = 3 * len(self._names), -1
+        last, told = None, 0.0
         while thread.is_alive():
             thread.join(_LOOK_SECONDS)
             if self._should_stop():
                 token.cancel()
-            step = done()
-            if step != last:
-                last = step
-                self._listener(StageProgress(STAGE, step, total))
+            now = progress()
+            if now != last or time.monotonic() - told > _SIGN_SECONDS:
+                last, told = now, time.monotonic()
+                self._listener(now)
         if self._should_stop():
             raise Cancelled("Stopped while finding poses; the same command begins them again.")
         if "error" in outcome:

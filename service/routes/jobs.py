@@ -4,7 +4,7 @@ import uuid
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from engine.errors import ConfigError
 from service.auth import Principal, Reader, Writer
@@ -38,18 +38,18 @@ async def create_job(
     """Accept a job; poll the address in `Location`, or listen to its `/events`."""
     if service.draining:
         raise Problem(503, "draining", "The service is about to stop.", headers={"Retry-After": "10"})
-    kind, accepted = _accepted(new)
+    kind = _accepted(new)
     if new.webhook is not None:
         check_address(service, new.webhook.url, "#/webhook/url")
     async with service.pool.connection() as connection, connection.transaction():
 
         async def make() -> uuid.UUID:
             await check_new_job(connection, who.owner, service.settings.quota)
-            dataset_id, source_id = await _inputs(connection, who, kind, new)
+            dataset_id, source_id, options = await _inputs(connection, who, kind, new)
             made = rows.NewJob(
                 owner=who.owner,
                 kind=kind.name,
-                options=accepted,
+                options=options.model_dump(mode="json"),
                 queue=new.queue,
                 priority=new.priority,
                 dataset_id=dataset_id,
@@ -220,22 +220,23 @@ def stages_of(job: Job) -> list[str]:
         return []
 
 
-def _accepted(new: NewJob) -> tuple[JobKind, dict[str, object]]:
-    """The kind and its complete options."""
+def _accepted(new: NewJob) -> JobKind:
+    """The kind, which takes the options."""
     try:
         kind = kind_named(new.kind)
     except ConfigError as error:
         raise Problem(422, "kind", str(error), errors=[{"pointer": "#/kind", "detail": str(error)}]) from None
     try:
-        return kind, kind.resolve(new.options).model_dump(mode="json")
+        kind.resolve(new.options)
     except ValidationError as error:
         raise refused_options(error) from None
+    return kind
 
 
 async def _inputs(
     connection: Connection, who: Principal, kind: JobKind, new: NewJob
-) -> tuple[uuid.UUID | None, uuid.UUID | None]:
-    """What the job works on, checked."""
+) -> tuple[uuid.UUID | None, uuid.UUID | None, BaseModel]:
+    """What the job works on, checked: dataset, source, and the complete options that fit these."""
     options = kind.options.model_validate(kind.resolve(new.options).model_dump(mode="json"))
     if kind.needs == "result":
         if new.source_id is None or new.dataset_id is not None:
@@ -248,7 +249,7 @@ async def _inputs(
         names = {artifact.name for artifact in await rows.artifacts_of(connection, source.id)}
         if kind.source_files and kind.source_files[0] not in names:
             raise _input_problem("source_id", f"The job in source_id has no {kind.source_files[0]}.")
-        return source.dataset_id, source.id
+        return source.dataset_id, source.id, options
     if new.dataset_id is None or new.source_id is not None:
         raise _input_problem("dataset_id", f"A job of the kind {kind.name} works on dataset_id, a dataset.")
     dataset = await get_dataset(connection, new.dataset_id, lock=True)
@@ -259,7 +260,7 @@ async def _inputs(
     if kind.needs_poses(options) and not dataset.has_poses:
         detail = "The dataset holds no COLMAP model; set the option poses to auto, or send a model."
         raise Problem(422, "poses", detail, errors=[{"pointer": "#/options/poses", "detail": detail}])
-    return dataset.id, None
+    return dataset.id, None, kind.settle(options, dataset.has_poses)
 
 
 def _input_problem(name: str, detail: str) -> Problem:

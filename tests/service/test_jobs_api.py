@@ -105,7 +105,19 @@ def test_dataset_must_be_committed_and_have_poses(talk: Callable[..., None]) -> 
         assert is_problem(await http.post("/v1/jobs", json={"dataset_id": without}), 422, "poses")
         found = {"dataset_id": without, "options": {"poses": "auto"}}
         answer = await http.post("/v1/jobs", json=found)
-        assert answer.status_code == 202 and answer.json()["stages"][0] == "poses"
+        assert answer.status_code == 202
+        assert answer.json()["stages"][:4] == ["features", "matches", "poses", "load"]
+
+    talk(conversation)
+
+
+def test_poses_are_found_only_where_they_are_missing(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        for has_poses, kept, first in ((True, "given", "load"), (False, "auto", "features")):
+            dataset = await committed_dataset(service, has_poses=has_poses)
+            asked = {"dataset_id": dataset, "options": {"poses": "missing"}}
+            job = (await http.post("/v1/jobs", json=asked)).json()
+            assert (job["options"]["poses"], job["stages"][0]) == (kept, first)
 
     talk(conversation)
 

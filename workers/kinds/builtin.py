@@ -28,6 +28,7 @@ def register_all() -> None:
             stages=_reconstruction_stages,
             resolve=resolve_reconstruction,
             needs_poses=lambda options: cast(ReconstructOptions, options).poses == "given",
+            settle=_settled_poses,
         )
     )
     register(
@@ -72,4 +73,12 @@ def register_all() -> None:
 
 def _reconstruction_stages(options: BaseModel) -> tuple[str, ...]:
     stages = ("load", "train", "evaluate", "export")
-    return stages if cast(ReconstructOptions, options).poses == "given" else ("poses", *stages)
+    given = cast(ReconstructOptions, options).poses == "given"
+    return stages if given else ("features", "matches", "poses", *stages)
+
+
+def _settled_poses(options: BaseModel, has_poses: bool) -> BaseModel:
+    """Known together with the dataset, so that no job shows stages that it will not have."""
+    if cast(ReconstructOptions, options).poses != "missing":
+        return options
+    return options.model_copy(update={"poses": "given" if has_poses else "auto"})

@@ -26,6 +26,7 @@ class JobKind:
             left out.
         needs_photographs: whether it reads the photographs of the source job as well.
         needs_poses: whether its dataset must hold a COLMAP model, given the options.
+        settle: the options as they are kept, given whether the dataset holds a COLMAP model.
     """
 
     name: str
@@ -38,6 +39,7 @@ class JobKind:
     source_files: tuple[str, ...] = ()
     needs_photographs: Callable[[BaseModel], bool] = lambda _options: False
     needs_poses: Callable[[BaseModel], bool] = lambda _options: False
+    settle: Callable[[BaseModel, bool], BaseModel] = lambda options, _has_poses: options
 
 
 _KINDS: dict[str, JobKind] = {}

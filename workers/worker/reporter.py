@@ -91,8 +91,12 @@ class Reporter:
             }
         elif kind == "checkpoint_written":
             self._want_checkpoint(event["iteration"])
-        elif kind == "stage_finished" and event["stage"] in ("poses", "train"):
-            self._want_checkpoint(1 << 40 if event["stage"] == "train" else 0)
+        elif kind == "stage_finished":
+            # The last step comes before the end in the journal too, and is not lost to the next first one.
+            if self._progress is not None and "event" in self._progress:
+                self._events.append(("progress", self._progress.pop("event")))
+            if event["stage"] in ("poses", "train"):
+                self._want_checkpoint(1 << 40 if event["stage"] == "train" else 0)
         elif kind == "preview_written":
             self._preview = event
             self._wake.set()
