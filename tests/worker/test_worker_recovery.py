@@ -2,19 +2,16 @@
 
 import os
 import signal
-import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 import psycopg
 import pytest
-from worker_bench import Bench, alive, child_pids
+from worker_bench import Bench, alive, child_pids, wait_for_end
 
-from workers.queue.rows import Job
-
-SLOW = {"steps": 200, "seconds": 0.02, "checkpoint_every": 10}
-"""Some four seconds with a checkpoint every 0.2 s."""
+TAKEN_OVER_SECONDS = 20.0
+"""After 2.4 s a worker is missed; the rest is for a machine that is busy."""
 
 
 @pytest.fixture
@@ -22,10 +19,6 @@ def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
     bench = Bench(conninfo, tmp_path)
     yield bench
     bench.close()
-
-
-def has_checkpoint(job: Job) -> bool:
-    return job.checkpoint is not None and job.state == "running"
 
 
 def starts(bench: Bench, job_id: uuid.UUID) -> list[int]:
@@ -47,48 +40,46 @@ def test_job_is_done_and_its_journal_tells_of_it(bench: Bench) -> None:
 
 def test_killed_worker_takes_its_child_along_and_another_goes_on(bench: Bench) -> None:
     first = bench.worker(name="first")
-    job_id = bench.submit(options=SLOW)
-    bench.wait(job_id, has_checkpoint)
+    job_id = bench.submit(options=bench.held())
+    bench.wait_at_gate(job_id)
     (child,) = child_pids(first)
     bench.worker(name="second")
+    bench.up("second")
     first.kill()
-    killed = time.monotonic()
-    job = bench.wait(job_id, lambda job: job.worker == "second")
-    assert time.monotonic() - killed < 2.4 + 2.0
+    job = bench.wait(job_id, lambda job: job.worker == "second", TAKEN_OVER_SECONDS)
     assert not alive(child)
     assert (job.attempt, job.rescues) == (2, 1)
+    bench.open_gate()
     assert bench.over(job_id).state == "succeeded"
-    began = starts(bench, job_id)
-    assert len(began) == 2 and began[0] == 0 and began[1] >= 10
-    assert bench.results(job_id)["sum.txt"] == str(sum(range(201))).encode()
+    assert starts(bench, job_id) == [0, 30]
+    assert bench.results(job_id)["sum.txt"] == str(sum(range(61))).encode()
 
 
 def test_killed_child_is_started_again_from_the_checkpoint(bench: Bench) -> None:
     worker = bench.worker()
-    job_id = bench.submit(options=SLOW)
-    bench.wait(job_id, has_checkpoint)
+    job_id = bench.submit(options=bench.held())
+    bench.wait_at_gate(job_id)
     os.kill(child_pids(worker)[0], signal.SIGKILL)
+    bench.open_gate()
     job = bench.over(job_id)
     assert (job.state, job.attempt) == ("succeeded", 2)
-    assert starts(bench, job_id)[1] >= 10
+    assert starts(bench, job_id) == [0, 30]
     rescued = [event.data for event in bench.events(job_id) if event.kind == "rescued"]
     assert len(rescued) == 1 and "signal 9" in rescued[0]["reason"]
 
 
 def test_frozen_worker_is_fenced_when_it_comes_back(bench: Bench) -> None:
     first = bench.worker(name="first")
-    job_id = bench.submit(options={**SLOW, "steps": 400})
-    bench.wait(job_id, has_checkpoint)
+    job_id = bench.submit(options=bench.held())
+    bench.wait_at_gate(job_id)
     (child,) = child_pids(first)
     first.send_signal(signal.SIGSTOP)
     bench.worker(name="second")
     bench.wait(job_id, lambda job: job.worker == "second" and job.attempt == 2)
     assert alive(child)  # the ghost's child goes on working
     first.send_signal(signal.SIGCONT)
-    deadline = time.monotonic() + 5
-    while alive(child) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not alive(child)
+    wait_for_end(child)
+    bench.open_gate()
     job = bench.over(job_id)
     assert (job.state, job.attempt, job.worker) == ("succeeded", 2, "second")
     events = bench.events(job_id)
@@ -110,7 +101,7 @@ def test_job_that_kills_its_program_fails_with_the_reason(bench: Bench) -> None:
 def test_job_that_kills_its_worker_fails_too(bench: Bench) -> None:
     """The rescue counts, as no worker lives to do so."""
     bench.worker(queues="", name="care")
-    job_id = bench.submit(options={"steps": 1000, "seconds": 0.02, "checkpoint_every": 10_000})
+    job_id = bench.submit(options={"steps": 100_000, "seconds": 0.02, "checkpoint_every": 1_000_000})
     for _ in range(4):
         worker = bench.worker(name="victim")
         bench.wait(job_id, lambda job: job.state == "running")
@@ -123,43 +114,43 @@ def test_job_that_kills_its_worker_fails_too(bench: Bench) -> None:
 
 
 def test_terminated_worker_hands_back_at_once(bench: Bench) -> None:
-    first = bench.worker(name="first")
-    job_id = bench.submit(options=SLOW)
-    bench.wait(job_id, has_checkpoint)
-    step = bench.job(job_id).checkpoint
-    bench.worker(name="second")
-    time.sleep(1.0)
+    first = bench.worker(name="first", STALE_SECONDS="600")
+    job_id = bench.submit(options=bench.held())
+    bench.wait_at_gate(job_id)
+    bench.worker(name="second", STALE_SECONDS="600")
+    bench.up("second")
     first.terminate()
-    asked = time.monotonic()
-    bench.wait(job_id, lambda job: job.worker == "second")
-    assert time.monotonic() - asked < 2.0
-    assert first.wait(10) == 0
+    bench.wait(job_id, lambda job: job.worker == "second")  # long before anybody could miss the first
+    assert first.wait(60) == 0
+    bench.open_gate()
     job = bench.over(job_id)
     assert (job.state, job.attempt, job.rescues) == ("succeeded", 2, 0)
-    assert step is not None and starts(bench, job_id)[1] > step["step"]
+    assert starts(bench, job_id) == [0, 35]
     assert [event.kind for event in bench.events(job_id)].count("handed_back") == 1
 
 
 def test_cancelled_job_stops_and_goes_on_when_retried(bench: Bench) -> None:
     worker = bench.worker()
-    job_id = bench.submit(options=SLOW)
-    bench.wait(job_id, has_checkpoint)
+    job_id = bench.submit(options=bench.held())
+    bench.wait_at_gate(job_id)
     assert bench.cancel(job_id).state == "canceling"
-    assert bench.cancel(job_id).state == "canceling"
-    job = bench.over(job_id, seconds=5)
+    assert bench.cancel(job_id).state in ("canceling", "canceled")
+    job = bench.over(job_id)
     assert (job.state, job.error) == ("canceled", None) and child_pids(worker) == []
     assert bench.cancel(job_id).state == "canceled"
+    bench.open_gate()
     assert bench.retry(job_id).state == "queued"
     assert bench.over(job_id).state == "succeeded"
-    assert starts(bench, job_id)[1] >= 10
+    assert starts(bench, job_id) == [0, 35]
 
 
 def test_retry_from_the_start_forgets_the_checkpoint(bench: Bench) -> None:
     bench.worker()
-    job_id = bench.submit(options=SLOW)
-    bench.wait(job_id, has_checkpoint)
+    job_id = bench.submit(options=bench.held())
+    bench.wait_at_gate(job_id)
     bench.cancel(job_id)
     bench.over(job_id)
+    bench.open_gate()
     bench.retry(job_id, fresh=True)
     assert bench.over(job_id).state == "succeeded"
     assert starts(bench, job_id) == [0]
@@ -167,10 +158,10 @@ def test_retry_from_the_start_forgets_the_checkpoint(bench: Bench) -> None:
 
 def test_deaf_program_is_killed_after_the_grace(bench: Bench) -> None:
     worker = bench.worker(GRACE_SECONDS="0.5")
-    job_id = bench.submit(options={"steps": 10_000, "deaf": True})
+    job_id = bench.submit(options={"steps": 100_000, "deaf": True})
     bench.wait(job_id, lambda job: job.step is not None and job.step > 0)
     bench.cancel(job_id)
-    assert bench.over(job_id, seconds=5).state == "canceled"
+    assert bench.over(job_id).state == "canceled"
     assert child_pids(worker) == []
 
 
@@ -181,31 +172,6 @@ def test_queued_job_is_cancelled_without_a_worker(bench: Bench) -> None:
     bench.worker()
     assert bench.over(other).state == "succeeded"
     assert bench.job(job_id).attempt == 0
-
-
-def test_lost_database_stops_the_child_before_others_take_over(bench: Bench) -> None:
-    """The worker is cut off by refusing its connections, as a partition would."""
-    worker = bench.worker(name="cut-off")
-    job_id = bench.submit(options={**SLOW, "steps": 2000})
-    bench.wait(job_id, has_checkpoint)
-    (child,) = child_pids(worker)
-    name = psycopg.conninfo.conninfo_to_dict(bench.conninfo)["dbname"]
-    admin = psycopg.conninfo.make_conninfo(bench.conninfo, dbname="postgres")
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f'ALTER DATABASE "{name}" ALLOW_CONNECTIONS false')
-        connection.execute(
-            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = %s", [name]
-        )
-        cut = time.monotonic()
-        while alive(child):
-            assert time.monotonic() - cut < 2.4, "the child outlived the stale limit"
-            time.sleep(0.02)
-        assert worker.wait(10) == 69  # to be started again
-        connection.execute(f'ALTER DATABASE "{name}" ALLOW_CONNECTIONS true')
-    bench.worker(name="after", queues="cpu")
-    bench.wait(job_id, lambda job: job.worker == "after" and job.attempt == 2)
-    bench.wait(job_id, lambda _job: any(event.kind == "resumed" for event in bench.events(job_id)))
-    assert next(e.data["step"] for e in bench.events(job_id) if e.kind == "resumed") >= 10
 
 
 def test_silent_program_is_tried_again(bench: Bench) -> None:
@@ -270,7 +236,7 @@ def test_priority_and_queues(bench: Bench) -> None:
 
 def test_child_knows_no_secrets(bench: Bench) -> None:
     worker = bench.worker()
-    job_id = bench.submit(options={"steps": 1000})
+    job_id = bench.submit(options={"steps": 100_000})
     bench.wait(job_id, lambda job: job.step is not None)
     environment = Path(f"/proc/{child_pids(worker)[0]}/environ").read_bytes()
     assert b"DATABASE_URL" not in environment and b"SECRET" not in environment

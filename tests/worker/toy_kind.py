@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
@@ -24,7 +25,28 @@ class ToyOptions(BaseModel):
     fault: bool = False
     silent_at: int | None = None
     hog_bytes: int = 0
+    hold_at: int | None = None
+    """Goes on beyond this step once the file ``gate`` is there."""
+    gate: str = ""
+    hog_behind_gate_bytes: int = 0
+    silent_behind_gate: bool = False
     deaf: bool = False
+
+
+def _hold(task: Task, options: ToyOptions, hog: bytearray) -> None:
+    told = False
+    while not Path(options.gate).exists():
+        if task.should_stop():
+            if not options.deaf:
+                return
+            if not told:
+                print("the toy hears and does not heed", flush=True)  # noqa: T201
+                told = True
+        task.listener(StageProgress("train", options.hold_at or 0, options.steps))
+        time.sleep(0.05)
+    hog.extend(b"x" * options.hog_behind_gate_bytes)
+    while options.silent_behind_gate or options.hog_behind_gate_bytes:
+        time.sleep(0.02)
 
 
 def run(task: Task) -> None:
@@ -51,6 +73,8 @@ def run(task: Task) -> None:
         if options.silent_at == step:
             time.sleep(3600)
         task.listener(StageProgress("train", step, options.steps))
+        if options.hold_at == step:
+            _hold(task, options, hog)
         stop = task.should_stop() and not options.deaf
         if stop or step % options.checkpoint_every == 0:
             path = checkpoints / f"iteration_{step:07d}.npz"

@@ -1,13 +1,14 @@
 """Starts real workers and asks the database about their jobs."""
 
 import asyncio
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ FAST = {
     "THREADS": "1",
     "KIND_MODULES": '["toy_kind"]',
 }
+PATIENCE_SECONDS = 120.0
+"""Nothing is expected to take so long; on a busy machine all takes many times longer than on an idle one."""
 
 
 @dataclass
@@ -41,6 +44,11 @@ class Bench:
     conninfo: str
     folder: Path
     processes: list["subprocess.Popen[bytes]"] = field(default_factory=list)
+
+    @property
+    def gate(self) -> Path:
+        """The file that toys wait for; beside the folder, as that may be on a disk that is full."""
+        return self.folder.with_name(f"{self.folder.name}.gate")
 
     def worker(self, *, queues: str = "cpu", name: str = "w", **settings: str) -> "subprocess.Popen[bytes]":
         """Start a worker in a process."""
@@ -118,7 +126,7 @@ class Bench:
         artifacts: list[Artifact] = self.do(lambda c: artifacts_of(c, job_id))
         return {a.name: b"".join(storage.read(a.sha256)) for a in artifacts}
 
-    def wait(self, job_id: uuid.UUID, ready: Callable[[Job], bool], seconds: float = 30) -> Job:
+    def wait(self, job_id: uuid.UUID, ready: Callable[[Job], bool], seconds: float = PATIENCE_SECONDS) -> Job:
         """Wait until the job is as asked for."""
         deadline = time.monotonic() + seconds
         while not ready(job := self.job(job_id)):
@@ -126,9 +134,46 @@ class Bench:
             time.sleep(0.03)
         return job
 
-    def over(self, job_id: uuid.UUID, seconds: float = 30) -> Job:
+    def over(self, job_id: uuid.UUID, seconds: float = PATIENCE_SECONDS) -> Job:
         """Wait until the job is over."""
         return self.wait(job_id, lambda job: job.is_over, seconds)
+
+    def held(self, **options: Any) -> dict[str, Any]:
+        """Options of a toy that has checkpoints at 10, 20 and 30 and waits at 35 for :meth:`open_gate`."""
+        slow = {"steps": 60, "seconds": 0.01, "checkpoint_every": 10}
+        return {**slow, "hold_at": 35, "gate": str(self.gate), **options}
+
+    def wait_at_gate(self, job_id: uuid.UUID) -> Job:
+        """Wait until such a toy is there, and its checkpoint kept."""
+        return self.wait(
+            job_id, lambda job: job.state == "running" and (job.checkpoint or {}).get("step") == 30
+        )
+
+    def open_gate(self) -> None:
+        """Let toys go on."""
+        self.gate.touch()
+
+    def up(self, name: str) -> None:
+        """Wait until a worker takes jobs."""
+        deadline = time.monotonic() + PATIENCE_SECONDS
+        while f"worker {name} takes" not in (self.folder / f"{name}.log").read_text(errors="replace"):
+            assert time.monotonic() < deadline, self.worker_logs()
+            time.sleep(0.05)
+
+    @contextlib.contextmanager
+    def cut_off(self) -> Iterator[None]:
+        """Nobody has a connection to the database, and none is given."""
+        name = psycopg.conninfo.conninfo_to_dict(self.conninfo)["dbname"]
+        admin = psycopg.conninfo.make_conninfo(self.conninfo, dbname="postgres")
+        with psycopg.connect(admin, autocommit=True) as connection:
+            connection.execute(f'ALTER DATABASE "{name}" ALLOW_CONNECTIONS false')
+            connection.execute(
+                "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = %s", [name]
+            )
+            try:
+                yield
+            finally:
+                connection.execute(f'ALTER DATABASE "{name}" ALLOW_CONNECTIONS true')
 
     def worker_logs(self) -> str:
         """What the workers said."""
@@ -147,3 +192,12 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+def wait_for_end(pid: int, seconds: float = PATIENCE_SECONDS) -> float:
+    """Wait until a process is gone; returns how long that took in seconds."""
+    began = time.monotonic()
+    while alive(pid):
+        assert time.monotonic() - began < seconds, f"process {pid} lives on after {seconds:g} s"
+        time.sleep(0.02)
+    return time.monotonic() - began

@@ -167,11 +167,12 @@ class _Worker:
         if not await self._room_comes():
             await self._refuse(job_id, slip)
             return
+        since = time.monotonic()
         attempt = await claim(self._pool, job_id, slip, self._name)
         if attempt is None:
             return
         try:
-            await Supervisor(attempt, self._around).run()
+            await Supervisor(attempt, self._around, since).run()
         except LostDatabase as error:
             logger.warning("job %s was let go: %s", job_id, error)
             self._lost = True

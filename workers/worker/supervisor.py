@@ -1,17 +1,15 @@
 """One attempt at a job: the child at work, the heartbeat beside it, and a verdict at the end."""
 
 import asyncio
-import contextlib
 import logging
+import math
 import time
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 from typing import Any, TypeVar
-
-import psycopg
-from psycopg_pool import PoolTimeout
 
 from engine.errors import OctasplatError
 from workers.kinds import JobKind, kind_named
@@ -24,6 +22,7 @@ from workers.storage.errors import BlobMissing, DigestMismatch, StorageError
 from workers.storage.protocol import Storage
 from workers.storage.room import Room
 from workers.worker.child_process import ChildProcess
+from workers.worker.contact import DATABASE_ERRORS, Contact
 from workers.worker.reporter import Reporter
 from workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED
 from workers.worker.workspace import Checkpoint, Workspace
@@ -31,15 +30,9 @@ from workers.worker.workspace import Checkpoint, Workspace
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-LOST_SHARE = 2 / 3
-"""A worker that could not write for this share of the stale limit stops its child before others take over."""
-LATE_SHARE = 0.9
-"""A child that has not stopped by this share of the stale limit is killed."""
 CANCEL_SECONDS = 10.0
-DATABASE_ERRORS = (
-    psycopg.OperationalError, psycopg.InterfaceError, psycopg.errors.IdleInTransactionSessionTimeout,
-    PoolTimeout, TimeoutError, OSError,
-)  # fmt: skip
+_EYE = ThreadPoolExecutor(1, "watch")
+"""A thread for watching children; the common ones may all be waiting for a store that is cut off as well."""
 
 
 class LostDatabase(Exception):
@@ -81,9 +74,10 @@ class Supervisor:
     Args:
         attempt: the claimed job.
         around: the worker.
+        since: when the claim was asked for, by ``time.monotonic()``.
     """
 
-    def __init__(self, attempt: Attempt, around: Surroundings) -> None:
+    def __init__(self, attempt: Attempt, around: Surroundings, since: float) -> None:
         self._attempt = attempt
         self._around = around
         self._settings = around.settings
@@ -92,8 +86,9 @@ class Supervisor:
         self._reporter = Reporter(attempt, self._workspace)
         self._child: ChildProcess | None = None
         self._end: End | None = None
-        self._ended = asyncio.Event()
-        self._last_contact = time.monotonic()
+        self._kill_at = math.inf
+        self._news = asyncio.Event()
+        self._contact = Contact(attempt, around.settings, since)
 
     async def run(self) -> None:
         """Work until the job is over, handed back or lost.
@@ -101,7 +96,10 @@ class Supervisor:
         Raises:
             LostDatabase: the database did not answer for too long.
         """
-        watch = asyncio.create_task(self._watch())
+        watches = [
+            asyncio.create_task(watch())
+            for watch in (self._watch_contact, self._watch_clock, self._watch_leaving)
+        ]
         try:
             await asyncio.to_thread(self._workspace.open)
             await self._work()
@@ -110,11 +108,11 @@ class Supervisor:
         except DATABASE_ERRORS as error:
             raise LostDatabase(str(error)) from error
         finally:
-            watch.cancel()
+            for watch in watches:
+                watch.cancel()
             if self._child is not None:
                 self._child.kill()
-            with contextlib.suppress(asyncio.CancelledError):
-                await watch
+            await asyncio.gather(*watches, return_exceptions=True)
             await self._reporter.close()
             await asyncio.to_thread(self._workspace.close)
 
@@ -246,77 +244,67 @@ class Supervisor:
     async def _wait_for_child(self, child: ChildProcess) -> int:
         """Wait for the child's end, which is brought about if anything asks for it."""
         exited = asyncio.create_task(child.wait())
-        ended = asyncio.create_task(self._ended.wait())
         limits = asyncio.create_task(self._watch_limits(child))
+        asked = False
         try:
-            await asyncio.wait({exited, ended}, return_when=asyncio.FIRST_COMPLETED)
-            if not exited.done():
-                grace = self._grace_seconds()
-                if grace > 0:
+            while not exited.done():
+                left = self._kill_at - time.monotonic()
+                if left <= 0:
+                    child.kill()
+                    break
+                if self._end is not None and not asked:
                     child.ask_to_stop()
-                    await asyncio.wait({exited}, timeout=grace)
-                child.kill()
+                    asked = True
+                self._news.clear()
+                news = asyncio.create_task(self._news.wait())
+                timeout = left if math.isfinite(left) else None
+                await asyncio.wait({exited, news}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+                news.cancel()
             return await exited
         finally:
-            for each in (ended, limits):
-                each.cancel()
+            limits.cancel()
 
-    def _grace_seconds(self) -> float:
-        """How long the child may take to stop."""
-        if self._end in (End.FENCED, End.SILENT, End.MEMORY, None):
-            return 0.0
-        if self._end is End.LOST:
-            return (LATE_SHARE - LOST_SHARE) * self._settings.stale_seconds
-        if self._end is End.CANCELED:
-            return min(CANCEL_SECONDS, self._settings.grace_seconds)
-        return self._settings.grace_seconds
-
-    async def _watch(self) -> None:
+    async def _watch_contact(self) -> None:
         """Say that the worker lives, and hear of the wishes of others."""
-        settings = self._settings
-        leaving = asyncio.create_task(self._around.leaving.wait())
-        next_beat = time.monotonic() + settings.heartbeat_seconds
         try:
-            while self._end not in (End.FENCED, End.LOST):
-                await asyncio.wait({leaving}, timeout=settings.poll_seconds)
-                if leaving.done():
-                    self._stop(End.LEAVING)
-                    await asyncio.sleep(settings.poll_seconds)
-                beats = time.monotonic() >= next_beat
-                try:
-                    async with asyncio.timeout(settings.heartbeat_seconds):
-                        state = await (self._attempt.beat() if beats else self._attempt.look())
-                except Fenced:
-                    self._stop(End.FENCED)
-                    return
-                except DATABASE_ERRORS:
-                    if time.monotonic() - self._last_contact > LOST_SHARE * settings.stale_seconds:
-                        self._stop(End.LOST)
-                    continue
-                self._last_contact = time.monotonic()
-                if beats:
-                    next_beat = self._last_contact + settings.heartbeat_seconds
-                if state == "canceling":
-                    self._stop(End.CANCELED)
-        finally:
-            leaving.cancel()
+            await self._contact.keep(lambda state: self._stop(End.CANCELED) if state == "canceling" else None)
+        except Fenced:
+            self._stop(End.FENCED)
+
+    async def _watch_clock(self) -> None:
+        await self._contact.until_lost()
+        self._stop(End.LOST)
+
+    async def _watch_leaving(self) -> None:
+        await self._around.leaving.wait()
+        self._stop(End.LEAVING)
 
     async def _watch_limits(self, child: ChildProcess) -> None:
-        """Stop a child that is silent or too big."""
-        settings = self._settings
+        """Stop a child that is silent or too big, also one that was asked to stop already."""
+        settings, loop = self._settings, asyncio.get_running_loop()
         while True:
             await asyncio.sleep(min(1.0, settings.silent_seconds / 4))
             if time.monotonic() - child.last_heard > settings.silent_seconds:
                 self._stop(End.SILENT)
             limit = settings.memory_limit_bytes
-            if limit is not None and await asyncio.to_thread(child.memory_bytes) > limit:
+            if limit is not None and await loop.run_in_executor(_EYE, child.memory_bytes) > limit:
                 self._stop(End.MEMORY)
 
     def _stop(self, end: End) -> None:
-        """The first reason counts, but for the two that forbid to write anything."""
+        """The first reason counts, but for the two that forbid writing; of the deadlines the earliest."""
         if self._end is None or end in (End.FENCED, End.LOST):
             self._end = end
-        self._ended.set()
+        self._kill_at = min(self._kill_at, self._deadline(end))
+        self._news.set()
+
+    def _deadline(self, end: End) -> float:
+        """Until when the child may go on to stop by itself, by ``time.monotonic()``."""
+        now, grace = time.monotonic(), self._settings.grace_seconds
+        if end is End.LOST:
+            return self._contact.late_at
+        if end is End.CANCELED:
+            return now + min(CANCEL_SECONDS, grace)
+        return now + grace if end is End.LEAVING else now
 
     async def _said(self, say: Callable[[], Awaitable[T]]) -> T:
         """Write the verdict, trying again for as long as the job is surely ours.
@@ -329,6 +317,6 @@ class Supervisor:
                 async with asyncio.timeout(self._settings.heartbeat_seconds):
                     return await say()
             except DATABASE_ERRORS as error:
-                if time.monotonic() - self._last_contact > LOST_SHARE * self._settings.stale_seconds:
+                if self._contact.is_lost:
                     raise LostDatabase(str(error)) from error
                 await asyncio.sleep(self._settings.poll_seconds)
