@@ -36,6 +36,13 @@ _LABELS = {
     "fps": "Images per second",
     "q": "Squared octagon radius, standard deviations",
 }
+_TITLES = {
+    "evaluate": "Measure it again",
+    "export": "Write other formats",
+    "render": "Render a video or images",
+}
+"""What to do with a result, shorter than the kinds say it; a kind that is not here keeps its own title."""
+_SHORT = re.compile(r"\b(sh|ssim|l1|l2|fov)\b", re.IGNORECASE)
 _CHOICES = {
     ("poses", "given"): "use the COLMAP model",
     ("poses", "auto"): "find them",
@@ -129,7 +136,14 @@ def options_form(kind: JobKind) -> OptionsForm:
             continue
         title = item.path.rpartition(".")[0]
         sections.setdefault(title, Section(_section_title(title))).fields.append(item)
-    return OptionsForm(kind.name, kind.title, first, [sections[name] for name in sorted(sections)])
+    return OptionsForm(
+        kind.name, _TITLES.get(kind.name, kind.title), first, [sections[name] for name in sorted(sections)]
+    )
+
+
+def _label(name: str) -> str:
+    words = name.replace("_", " ").removesuffix(" px").capitalize()
+    return _SHORT.sub(lambda found: found[0].upper(), words)
 
 
 def _section_title(path: str) -> str:
@@ -211,7 +225,7 @@ def _field(
         control = "list"
     return Field(
         path=path,
-        label=_LABELS.get(name, name.replace("_", " ").removesuffix(" px").capitalize()),
+        label=_LABELS.get(name) or _label(name),
         control=control,
         help=words if presets and (words := _HELPS.get(path)) else _sentence(text),
         choices=choices,

@@ -100,33 +100,50 @@ const steps = {
 
     /** A job that waits, runs and ends while its page and the list are open; nothing is reloaded by hand. */
     async watch() {
-        const found = { states: [], list: [] };
         const page = await open(), list = await open();
+        // The pages themselves note what they show, also between two looks from here and across a reload.
+        const note = () => {
+            const noted = JSON.parse(sessionStorage.getItem("noted") ?? '{"states": [], "list": [], "stages": [], "curves": 0, "preview": false}');
+            const add = (list, value) => { if (value && list.at(-1) !== value) list.push(value); };
+            const look = () => {
+                const state = document.getElementById("status")?.dataset.state;
+                add(noted.states, state);
+                add(noted.list, document.querySelector(".job .chip")?.textContent);
+                if (state === "running") {
+                    add(noted.stages, document.querySelector(".stages .now")?.firstChild.textContent.trim());
+                    noted.curves = Math.max(noted.curves, document.querySelectorAll(".chart canvas").length);
+                    noted.preview ||= document.querySelector("#preview .below") !== null;
+                }
+                sessionStorage.setItem("noted", JSON.stringify(noted));
+            };
+            document.addEventListener("DOMContentLoaded", () => {
+                look();
+                new MutationObserver(look).observe(document.body, { subtree: true, childList: true, characterData: true, attributes: true, attributeFilter: ["data-state", "class"] });
+            });
+        };
+        for (const each of [page, list]) await each.addInitScript(note);
         await list.goto(`${job.url}/`);
         await page.goto(`${job.url}/jobs/${job.job}`);
-        const seen = async () => {
-            const state = await page.getAttribute("#status", "data-state").catch(() => null);
-            if (state && found.states.at(-1) !== state) { found.states.push(state); await shot(page, `job_${state}`); }
-            const chip = await list.locator(".job .chip").first().textContent().catch(() => null);
-            if (chip && found.list.at(-1) !== chip) found.list.push(chip);
-            return state;
-        };
-        const began = Date.now();
-        while (await seen() !== "succeeded") {
-            if (Date.now() - began > job.seconds * 1000) throw new Error(`the job is ${found.states}`);
-            found.curves = Math.max(found.curves ?? 0, await page.locator(".chart canvas").count());
-            found.preview ||= await page.locator("#preview .below").count() > 0;
-            await page.waitForTimeout(300);
-        }
-        await list.waitForFunction(() => document.querySelector(".job .chip")?.textContent === "Done");
+        await shot(page, "job_queued");
+        await page.waitForSelector("#status[data-state=running], #status[data-state=succeeded]");
+        // Pictures for the eye, as far as the job is slow enough for them.
+        const curves = page.waitForFunction(() => document.querySelectorAll(".chart canvas").length === 3 || document.querySelector("#status[data-state=succeeded]"));
+        await curves.then(() => shot(page, "job_running"), () => {});
+        await page.waitForSelector("#status[data-state=succeeded], #status[data-state=failed], #status[data-state=canceled]");
+        await list.waitForFunction(() => ["Done", "Failed", "Cancelled"].includes(document.querySelector(".job .chip")?.textContent));
         await shot(list, "jobs");
         await page.waitForSelector("#viewer[data-ready=yes]");
         await page.waitForTimeout(700);
         await shot(page, "result");
-        found.view = await brightness(page);
-        found.nameless = [...await nameless(page), ...await nameless(list)];
-        found.overflow = await overflow(page);
-        return found;
+        const noted = (page) => page.evaluate(() => JSON.parse(sessionStorage.getItem("noted")));
+        const { states, stages, curves: live, preview } = await noted(page);
+        return {
+            states, stages, preview, liveCurves: live, list: (await noted(list)).list,
+            curves: await page.locator(".chart canvas").count(),
+            view: await brightness(page),
+            nameless: [...await nameless(page), ...await nameless(list)],
+            overflow: await overflow(page),
+        };
     },
 
     /** The result by pointer: sorting, another view, the difference, the report, a download. */
@@ -163,7 +180,7 @@ const steps = {
     /** From the list to the viewer and back with keys alone; nothing is clicked. */
     async keyboard() {
         const found = {};
-        const page = await open();
+        const page = await open({ width: 760, height: 600 });
         await page.goto(`${job.url}/`);
         await page.keyboard.press("Tab");
         found.first = await page.evaluate(() => document.activeElement.textContent);
@@ -182,17 +199,22 @@ const steps = {
         await page.waitForURL("**/jobs/*-*");
         await page.waitForSelector("#viewer[data-ready=yes]");
         await tabTo(() => document.activeElement.tagName === "CANVAS");
-        await page.waitForTimeout(500);
         const picture = () => page.locator("#viewer canvas").screenshot().then((png) => png.toString("base64"));
-        const start = await picture();
+        // The picture once it stands still.
+        const still = async () => {
+            for (let before = await picture(), k = 0; ; k++) {
+                await page.waitForTimeout(150);
+                const now = await picture();
+                if (now === before || k > 40) return now;
+                before = now;
+            }
+        };
+        const start = await still();
         const changes = {};
         for (const key of ["ArrowLeft", "ArrowUp", "KeyW", "KeyD", "KeyE", "Minus"]) {
-            const before = await picture();
-            await page.keyboard.down(key);
-            await page.waitForTimeout(350);
-            await page.keyboard.up(key);
-            await page.waitForTimeout(500);
-            changes[key] = (await picture()) !== before;
+            const before = await still();
+            await page.keyboard.press(key);
+            changes[key] = (await still()) !== before;
         }
         found.changes = changes;
         await page.keyboard.press("KeyN");
@@ -200,10 +222,7 @@ const steps = {
         await page.keyboard.press("KeyF");
         found.flies = await page.getAttribute("[data-do=fly]", "aria-pressed");
         await page.keyboard.press("KeyR");
-        for (let k = 0; k < 20 && !found.back; k++) {
-            await page.waitForTimeout(300);
-            found.back = (await picture()) === start;
-        }
+        for (let k = 0; k < 20 && !found.back; k++) found.back = (await still()) === start;
         await tabTo(() => document.activeElement.closest("thead") !== null);
         await page.keyboard.press("Tab");
         await page.keyboard.press("Enter");

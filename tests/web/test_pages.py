@@ -105,7 +105,7 @@ def test_the_form_asks_for_what_was_filled_in(flow: Flow) -> None:
     job = flow.service.ask("GET", f"/v1/jobs/{flow.job}")
     options = job["options"]
     assert job["label"] == "a still life"
-    assert options["preset"] == "fast" and options["poses"] == "missing" and options["test_every"] == 4
+    assert options["preset"] == "fast" and options["poses"] == "given" and options["test_every"] == 4
     assert options["train"]["iterations"] == 600 and options["train"]["rays"] == 1024
     # Of the preset, as the field was left empty.
     assert options["train"]["sh_every"] == preset("fast").sh_every
@@ -114,9 +114,11 @@ def test_the_form_asks_for_what_was_filled_in(flow: Flow) -> None:
 
 
 def test_a_job_is_followed_to_its_end(watched: dict[str, Any]) -> None:
-    assert watched["states"][-1] == "succeeded" and "running" in watched["states"]
+    states = watched["states"]
+    assert states[-1] == "succeeded" and "running" in states, states
     assert watched["list"][-1] == "Done"
-    assert watched["curves"] == 3
+    assert watched["stages"], "no stage was shown by its name"
+    assert watched["liveCurves"] == 3 and watched["curves"] == 3
     assert watched["view"]["deviation"] > 15  # there is a picture in the viewer
     assert watched["nameless"] == []
     assert watched["overflow"] <= 0

@@ -13,12 +13,16 @@ export class Walking {
         Object.assign(this, { canvas, camera, controls, radius, wake });
         this.flying = false;
         this.keys = new Set();
+        // A tap that is shorter than a frame counts as well: its key goes with the next step.
+        this.fresh = new Set();
+        this.tapped = new Set();
         this.fast = false;
         this.distance = radius;
         canvas.addEventListener("keydown", (event) => {
             if (event.ctrlKey || event.metaKey || event.altKey) return;
             this.fast = event.shiftKey;
             if (HELD.has(event.code)) {
+                if (!this.keys.has(event.code)) this.fresh.add(event.code);
                 this.keys.add(event.code);
                 event.preventDefault();
                 wake();
@@ -26,9 +30,10 @@ export class Walking {
         });
         canvas.addEventListener("keyup", (event) => {
             this.fast = event.shiftKey;
-            this.keys.delete(event.code);
+            if (this.fresh.has(event.code)) this.tapped.add(event.code);
+            else this.keys.delete(event.code);
         });
-        canvas.addEventListener("blur", () => this.keys.clear());
+        canvas.addEventListener("blur", () => [this.keys, this.fresh, this.tapped].forEach((keys) => keys.clear()));
         canvas.addEventListener("pointermove", (event) => this.drag(event));
         canvas.addEventListener("wheel", (event) => {
             if (!this.flying) return;
@@ -109,6 +114,9 @@ export class Walking {
             const offset = this.camera.position.clone().sub(this.controls.target).multiplyScalar(Math.exp(-nearer * 1.5 * seconds));
             this.camera.position.copy(this.controls.target).add(offset);
         }
+        this.tapped.forEach((key) => this.keys.delete(key));
+        this.fresh.clear();
+        this.tapped.clear();
         this.wake();
         return true;
     }
