@@ -48,6 +48,7 @@ class Reporter:
         self._stage = ""
         self._stages: tuple[str, ...] = ()
         self._stage_began = 0.0
+        self._steps = 0
         self._first_step: int | None = None
         self._wanted: tuple[str, int] | None = None
         self._preview: dict[str, Any] | None = None
@@ -77,7 +78,8 @@ class Reporter:
         kind = event["kind"]
         if kind == "stage_started":
             self._stage, self._stage_began, self._first_step = event["stage"], time.monotonic(), None
-            self._progress = {"stage": self._stage, "step": 0, "total_steps": event["total_steps"] or None}
+            self._steps = int(event["total_steps"])
+            self._progress = {"stage": self._stage, "step": 0, "total_steps": self._steps or None}
         elif kind == "stage_progress":
             self._count(event)
         elif kind == "training_progress":
@@ -96,7 +98,7 @@ class Reporter:
             if self._progress is not None and "event" in self._progress:
                 self._events.append(("progress", self._progress.pop("event")))
             if event["stage"] in ("poses", "train"):
-                self._want_checkpoint(1 << 40 if event["stage"] == "train" else 0)
+                self._want_checkpoint(self._steps if event["stage"] == "train" else 0)
         elif kind == "preview_written":
             self._preview = event
             self._wake.set()

@@ -132,7 +132,8 @@ class Supervisor:
             return
         self._child = await ChildProcess.start(task, self._reporter.hear, self._reporter.log)
         code = await self._wait_for_child(self._child)
-        await self._reporter.finish()
+        if self._end not in (End.FENCED, End.LOST):
+            await self._reporter.finish()
         # A program that was done before it heard of the wish to stop has succeeded.
         if code == 0 and self._end in (None, End.CANCELED, End.LEAVING):
             await self._publish()
