@@ -2,13 +2,15 @@
 
     python benchmarks/growth.py [--largest 1000000]
 
-Three things, at about ten hits a ray whatever the count: 65,536 rays of one camera image; as many rays of a
-window that shrinks as the Gaussians do, so that neighbouring rays share as much as in a photograph of
-matching resolution; and whole training iterations on synthetic photographs.
+At about ten hits a ray whatever the count: 65,536 rays of one camera image; as many rays of a window that
+shrinks as the Gaussians do, so that neighbouring rays share as much as in a photograph of matching
+resolution; whole training iterations on synthetic photographs; and the peak memory of such a training with
+harmonics of degree 2, each count in a process of its own.
 """
 
 import argparse
-import resource
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -91,11 +93,11 @@ class CloudPhotographs:
         return np.repeat(grey[:, None], 3, axis=1), np.ones_like(grey), np.ones_like(grey)
 
 
-def milliseconds_an_iteration(gaussians: FlatGaussians, iterations: int = 50) -> float:
+def milliseconds_an_iteration(gaussians: FlatGaussians, iterations: int = 50, sh_degree: int = 0) -> float:
     """Mean wall time of a training iteration, rebuilds of the hierarchy included, densification not."""
     config = TrainConfig(
-        iterations=iterations, max_gaussians=len(gaussians), sh_degree=0, checkpoint_every=10_000,
-        probe_rays=256, densify=McmcConfig(start=10_000),
+        iterations=iterations, max_gaussians=len(gaussians), sh_degree=sh_degree, sh_every=1,
+        checkpoint_every=10_000, probe_rays=256, densify=McmcConfig(start=10_000),
     )  # fmt: skip
     marks: list[tuple[int, float]] = []
 
@@ -112,6 +114,19 @@ def milliseconds_an_iteration(gaussians: FlatGaussians, iterations: int = 50) ->
     return 1e3 * (ended - began) / (last - first)
 
 
+def peak_bytes(count: int) -> int:
+    """Peak memory of a process that trains ``count`` Gaussians with harmonics of degree 2 50 times."""
+    script = (
+        "import resource, growth; growth.milliseconds_an_iteration(growth.sorted_cloud({}), 50, 2);"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script.format(count)],
+        cwd=Path(__file__).parent, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return int(done.stdout)
+
+
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -120,17 +135,21 @@ def main() -> None:
     options = parser.parse_args()
     counts = [n for n in (SMALLEST, 100_000, 1_000_000) if n <= options.largest]
     print("Gaussians   image: fwd  bwd us/ray  hits   window: fwd  bwd us/ray  hits   iteration ms   peak MB")
+    peaks = []
     for count in counts:
         gaussians = sorted_cloud(count)
         image = microseconds_a_ray(gaussians, 1.0)
         window = microseconds_a_ray(gaussians, 3.0 * (count / SMALLEST) ** 0.5)
         iteration = milliseconds_an_iteration(gaussians, options.iterations)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        peaks.append(peak_bytes(count))
         print(
             f"{count:9d}        {image[0]:6.2f} {image[1]:5.2f}      {image[2]:5.1f}         {window[0]:6.2f}"
-            f" {window[1]:5.2f}      {window[2]:5.1f}        {iteration:6.1f}     {peak:8.0f}",
+            f" {window[1]:5.2f}      {window[2]:5.1f}        {iteration:6.1f}     {peaks[-1] / 1e6:8.0f}",
             flush=True,
         )
+    if len(counts) > 1:
+        more = (peaks[-1] - peaks[-2]) / (counts[-1] - counts[-2])
+        print(f"{more:.0f} bytes for each further Gaussian")
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from engine.files import write_json
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
+from engine.threads import use_threads
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig
 from engine.train.dense_points import dense_points
@@ -82,6 +83,7 @@ def reconstruct(
         Cancelled: stopped as asked.
     """
     began = time.perf_counter()
+    use_threads(threads)
     is_new = _claim_output(scene, output, config, resume)
     events = JsonLinesListener(output / EVENTS)
     tell = broadcast([events, listener])
@@ -132,6 +134,7 @@ def evaluate(
         ConfigError: ``output`` is no run.
         DatasetError: the photographs cannot be used.
     """
+    use_threads(threads)
     config = read_config(output / CONFIG)
     if not (output / SCENE).exists():
         raise OutputError(

@@ -9,6 +9,7 @@ import OpenImageIO as oiio
 from jaxtyping import Float32, UInt8
 
 from engine.errors import DatasetError
+from engine.threads import one_torch_thread
 
 Pixels = np.ndarray[Any, np.dtype[Any]]
 
@@ -146,7 +147,7 @@ def resize(pixels: Pixels, width_px: int, height_px: int, mode: str = "bicubic")
     import torch  # here, so that reading a model alone does not wait for it
 
     planes = torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1)[None]
-    with torch.no_grad():
+    with torch.no_grad(), one_torch_thread():
         small = torch.nn.functional.interpolate(planes, (height_px, width_px), mode=mode, antialias=True)
     return np.ascontiguousarray(small[0].permute(1, 2, 0).numpy())
 

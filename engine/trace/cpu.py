@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from engine.gaussians.model import FlatGaussians
+from engine.threads import use_threads
 from engine.trace.arrays import aligned_empty, contiguous
 from engine.trace.kernels_hit import RECORD_WORDS
 from engine.trace.kernels_records import refresh_records, write_boxes, write_records
@@ -127,7 +128,7 @@ class CpuTracer:
         return self._singles.backward(hits, gradients, self._records, gaussians, self._features)
 
     def _use_threads(self) -> None:
-        numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
+        use_threads(self.threads)
 
 
 def _parameters(gaussians: FlatGaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,31 @@
+"""How many threads the libraries below may take: numba's kernels, torch, and through the tracer Embree."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+def use_threads(threads: int) -> int:
+    """Let numba's parallel kernels take ``threads`` threads when this thread calls them; 0 means all.
+
+    Returns:
+        The number that they take, which is never more than numba was started with.
+    """
+    import numba  # here, so that reading photographs alone does not wait for it
+
+    most = int(numba.config.NUMBA_NUM_THREADS)
+    count = min(threads, most) if threads > 0 else most
+    numba.set_num_threads(count)
+    return count
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Keep torch to the calling thread, where several photographs are worked on side by side already."""
+    import torch  # here, as it takes a second and most work needs none of it
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

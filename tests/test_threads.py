@@ -1,0 +1,73 @@
+"""Threads that libraries take: as many as were asked for, everywhere."""
+
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.scene.images import resize
+from engine.threads import one_torch_thread, use_threads
+
+
+@pytest.fixture(autouse=True)
+def _restore() -> Iterator[None]:
+    before = numba.get_num_threads(), torch.get_num_threads()
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
+
+
+@pytest.mark.parametrize("asked", [1, 2, 0, 10_000])
+def test_numba_takes_what_is_asked_and_there(asked: int) -> None:
+    most = numba.config.NUMBA_NUM_THREADS
+    expected = most if asked in (0, 10_000) else min(asked, most)
+    assert use_threads(asked) == expected == numba.get_num_threads()
+
+
+def test_photographs_are_resized_on_the_calling_thread_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.set_num_threads(2)
+    seen = []
+    interpolate = torch.nn.functional.interpolate
+
+    def watched(*args: object, **named: object) -> torch.Tensor:
+        seen.append(torch.get_num_threads())
+        return interpolate(*args, **named)
+
+    monkeypatch.setattr(torch.nn.functional, "interpolate", watched)
+    small = resize(np.full((8, 8, 3), 7, np.uint8), 4, 4)
+    assert small.shape == (4, 4, 3) and (small == 7).all()
+    assert seen == [1] and torch.get_num_threads() == 2
+
+
+def test_torch_gets_its_threads_back_after_a_failure() -> None:
+    torch.set_num_threads(2)
+    with pytest.raises(ValueError, match="no"), one_torch_thread():
+        assert torch.get_num_threads() == 1
+        raise ValueError("no")
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.heavy
+def test_a_run_on_one_thread_uses_one(tmp_path: Path) -> None:
+    """A whole command takes hardly more CPU time than time on the clock, whatever the environment says."""
+    scene = tmp_path / "scene"
+    write_generated_scene(
+        scene, GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=500)
+    )
+    command = [
+        sys.executable, "-m", "workers", "reconstruct", str(scene), "-o", str(tmp_path / "out"), "--quiet",
+        "--threads", "1", "--max-side", "48", "--iterations", "100", "--rays", "4096",
+    ]  # fmt: skip
+    began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "4"})
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert after.ru_utime - before.ru_utime < 1.1 * wall
