@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from engine.edit.deform import DeformReport, deform_to, deformation_corners
@@ -192,10 +193,13 @@ def run_deform(
     method: str,
     reach: float | None,
     axes: str,
+    mirrored: bool | None,
     report_path: Path | None,
     quiet: bool,
 ) -> None:
     """Bind the scene to a proxy at rest and write it for each deformed proxy.
+
+    ``mirrored`` says whether the proxy was mirrored; None looks at it.
 
     Raises:
         OctasplatError: something cannot be read or written, or the proxies are not the same mesh.
@@ -207,7 +211,7 @@ def run_deform(
     gaussians = open_scene(source, quiet=quiet)
     say = speaker(quiet)
     rest = read_mesh(proxy_path)
-    proxy = _as_proxy(proxy_path, rest, axes)
+    proxy = _as_proxy(proxy_path, rest, axes, mirrored)
     corners = deformation_corners(gaussians)
     try:
         binding = bind(proxy, corners, "mvc" if method == "mvc" else "nearest", reach)
@@ -228,8 +232,8 @@ def run_deform(
                 f"{path}: is not the mesh {proxy_path} with vertices moved; both need the same vertices and "
                 "faces in the same order."
             )
-        moved = binding.deform(_turned(mesh, axes))
-        result, report = deform_to(gaussians, corners, moved)
+        vertices = _turned(mesh, axes)
+        result, report = deform_to(gaussians, corners, binding.deform(vertices), binding.mirrored(vertices))
         for line in deform_lines(path, report):
             say(line)
         write_scene(result, target, say)
@@ -245,16 +249,19 @@ def deform_lines(path: Path, report: DeformReport) -> list[str]:
         f"median {report.residual_median:.2g}, 95th percentile {report.residual_p95:.2g}, "
         f"largest {report.residual_max:.2g}."
     )
+    lines = [line]
+    if report.mirrored:
+        lines.append(f"  {report.mirrored:,} mirrored with the proxy")
     if report.collapsed:
-        return [line, f"  {report.collapsed:,} lost their area and were only placed"]
-    return [line]
+        lines.append(f"  {report.collapsed:,} lost their area and were only placed")
+    return lines
 
 
-def _as_proxy(path: Path, mesh: Mesh, axes: str) -> Any:
+def _as_proxy(path: Path, mesh: Mesh, axes: str, mirrored: bool | None) -> Any:
     from engine.edit.proxy import Proxy
 
     try:
-        return Proxy(_turned(mesh, axes), mesh.triangles)
+        return Proxy(_turned(mesh, axes), mesh.triangles, mirrored)
     except SceneFileError as error:
         raise SceneFileError(f"{path}: {error}") from None
 
@@ -266,4 +273,10 @@ def _turned(mesh: Mesh, axes: str) -> Any:
 
 
 def _same_faces(one: Mesh, other: Mesh) -> bool:
-    return one.triangles.shape == other.triangles.shape and bool((one.triangles == other.triangles).all())
+    """Whether the same vertices make triangles; programs may have turned over those of a mirrored mesh."""
+    if one.triangles.shape != other.triangles.shape:
+        return False
+    if np.array_equal(one.triangles, other.triangles):
+        return True
+    first, second = (np.sort(mesh.triangles, axis=1) for mesh in (one, other))
+    return np.array_equal(first[np.lexsort(first.T)], second[np.lexsort(second.T)])

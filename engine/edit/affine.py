@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64
 
+from engine.edit.apply import apply_legs
 from engine.edit.local_maps import legs_world
-from engine.edit.recovery import apply_legs
 from engine.errors import ConfigError
 from engine.gaussians.model import FlatGaussians
 

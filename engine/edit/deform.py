@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 
+from engine.edit.apply import apply_legs_to, blocks, without_harmonics
 from engine.edit.local_maps import has_area, legs_world
 from engine.edit.octagon_fit import fit_octagons
-from engine.edit.recovery import apply_legs
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES, corner_directions
 
@@ -30,6 +30,7 @@ class DeformReport:
         moved: Gaussians with new parameters.
         unmoved: Gaussians that keep every bit.
         collapsed: moved ones that lost their area; they were placed, with their old frame and size.
+        mirrored: moved ones in a part of space that was mirrored.
         residual_median: how far the deformation is from affine over one Gaussian: root mean square distance
             of its corners from the fit, in standard deviations; median of the moved ones.
         residual_p95: 95th percentile.
@@ -39,6 +40,7 @@ class DeformReport:
     moved: int
     unmoved: int
     collapsed: int
+    mirrored: int
     residual_median: float
     residual_p95: float
     residual_max: float
@@ -49,49 +51,81 @@ def deformation_corners(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 8 3"
 
     An octagon of radius sqrt(2) standard deviations, whatever the opacity; its mean is the centre.
     """
-    spokes = np.einsum("kc,nic->nki", CUBATURE_RADIUS * corner_directions(), legs_world(gaussians))
-    result: np.ndarray = gaussians.means_world.astype(np.float64)[:, None] + spokes
-    return result
+    corners = np.empty((len(gaussians), SIDES, 3))
+    geometry = without_harmonics(gaussians)
+    for block in blocks(len(gaussians)):
+        part = geometry.select(block)
+        spokes = np.einsum("kc,nic->nki", CUBATURE_RADIUS * corner_directions(), legs_world(part))
+        corners[block] = part.means_world.astype(np.float64)[:, None] + spokes
+    return corners
 
 
-def deform(gaussians: FlatGaussians, corner_map: CornerMap) -> tuple[FlatGaussians, DeformReport]:
+def deform(
+    gaussians: FlatGaussians, corner_map: CornerMap, mirrored: bool = False
+) -> tuple[FlatGaussians, DeformReport]:
     """The scene under ``corner_map``, any function that takes and returns points of shape (n, 8, 3).
 
     Points that it returns exactly as they were leave their Gaussian as it was, bit for bit.
+
+    Args:
+        gaussians: the scene.
+        corner_map: asked once, about all points.
+        mirrored: whether the map mirrors space, which eight points of one plane cannot tell.
+
+    Raises:
+        ValueError: a moved point is not finite.
     """
     corners = deformation_corners(gaussians)
-    return deform_to(gaussians, corners, corner_map(corners))
+    return deform_to(gaussians, corners, corner_map(corners), mirrored)
 
 
 def deform_to(
     gaussians: FlatGaussians,
     corners_world: Float64[np.ndarray, "n 8 3"],
     moved_world: Float[np.ndarray, "n 8 3"],
+    mirrored: bool | Bool[np.ndarray, " n"] = False,
 ) -> tuple[FlatGaussians, DeformReport]:
     """The scene with its :func:`deformation_corners` moved from ``corners_world`` to ``moved_world``.
+
+    Args:
+        gaussians: the scene.
+        corners_world: as :func:`deformation_corners` gave them.
+        moved_world: where they are now.
+        mirrored: whether space was mirrored, everywhere or around each Gaussian. There the view-dependent
+            colours are mirrored, too, and the normals lie on the mirrored side.
 
     Raises:
         ValueError: a moved point is not finite.
     """
-    moves = moved_world.astype(np.float64) - corners_world
-    if not np.isfinite(moves).all():
-        raise ValueError("the deformation gave points that are not finite")
     count = len(gaussians)
-    unmoved = ~moves.any(axis=(1, 2))
-    everywhere = np.ones((count, SIDES), dtype=bool)
-    fit = fit_octagons(gaussians, moves, everywhere, np.full(count, CUBATURE_RADIUS))
-    rounding = 8 * np.finfo(np.float64).eps * np.abs(moved_world).max(axis=(1, 2)).astype(np.float64)
-    collapsed = ~unmoved & ~has_area(fit.legs_world, rounding)
-    legs = np.where(collapsed[:, None, None], 0.0, fit.legs_world)
-    result = apply_legs(gaussians, fit.means_world, legs, np.ones(count), unmoved)
-    residuals = fit.residuals[~unmoved & ~collapsed]
-    median, p95 = np.quantile(residuals, [0.5, 0.95]).tolist() if len(residuals) else (0.0, 0.0)
+    signs = np.where(np.broadcast_to(np.asarray(mirrored, dtype=bool), (count,)), -1.0, 1.0)
+    means, legs = np.empty((count, 3)), np.empty((count, 3, 2))
+    unmoved, collapsed = np.empty(count, dtype=bool), np.empty(count, dtype=bool)
+    residuals = np.empty(count)
+    geometry = without_harmonics(gaussians)
+    for block in blocks(count):
+        moved = moved_world[block].astype(np.float64)
+        moves = moved - corners_world[block]
+        if not np.isfinite(moves).all():
+            raise ValueError("the deformation gave points that are not finite")
+        present, radii = np.ones(moves.shape[:2], dtype=bool), np.full(len(moves), CUBATURE_RADIUS)
+        fit = fit_octagons(geometry.select(block), moves, present, radii)
+        rounding = 8 * np.finfo(np.float64).eps * np.abs(moved).max(axis=(1, 2))
+        unmoved[block] = ~moves.any(axis=(1, 2))
+        collapsed[block] = ~unmoved[block] & ~has_area(fit.legs_world, rounding)
+        means[block], residuals[block] = fit.means_world, fit.residuals
+        legs[block] = np.where(collapsed[block, None, None], 0.0, fit.legs_world)
+    result = gaussians.copy()
+    apply_legs_to(result, np.flatnonzero(~unmoved), means, legs, signs)
+    known = residuals[~unmoved & ~collapsed]
+    median, p95 = np.quantile(known, [0.5, 0.95]).tolist() if len(known) else (0.0, 0.0)
     report = DeformReport(
         int((~unmoved).sum()),
         int(unmoved.sum()),
         int(collapsed.sum()),
+        int((~unmoved & (signs < 0)).sum()),
         median,
         p95,
-        float(residuals.max(initial=0.0)),
+        float(known.max(initial=0.0)),
     )
     return result, report

@@ -94,16 +94,17 @@ def triangle_weights(points, corners, candidates, sample_distances, falloff, cho
 
 
 @njit(cache=True, parallel=True)
-def blend(points, chosen, weights, derivatives, centres, moved_centres, result):
-    """Result = mean over the chosen triangles t, by their weights, of F_t (x - c_t) + c'_t."""
+def blend(points, starts, triangles, weights, derivatives, centres, moved_centres, result):
+    """Result = mean over the triangles t of each point, by their weights, of F_t (x - c_t) + c'_t.
+
+    The triangles of point i stand from ``starts[i]`` to ``starts[i + 1]``; a point without any stays.
+    """
     for i in prange(points.shape[0]):
         x = y = z = total = 0.0
-        for k in range(chosen.shape[1]):
-            weight = np.float64(weights[i, k])
-            if weight == 0.0:
-                continue
+        for k in range(starts[i], starts[i + 1]):
+            weight = np.float64(weights[k])
             total += weight
-            t = chosen[i, k]
+            t = triangles[k]
             d0 = points[i, 0] - centres[t, 0]
             d1 = points[i, 1] - centres[t, 1]
             d2 = points[i, 2] - centres[t, 2]
@@ -111,7 +112,10 @@ def blend(points, chosen, weights, derivatives, centres, moved_centres, result):
             x += weight * (f[0, 0] * d0 + f[0, 1] * d1 + f[0, 2] * d2 + moved_centres[t, 0])
             y += weight * (f[1, 0] * d0 + f[1, 1] * d1 + f[1, 2] * d2 + moved_centres[t, 1])
             z += weight * (f[2, 0] * d0 + f[2, 1] * d1 + f[2, 2] * d2 + moved_centres[t, 2])
-        result[i, 0], result[i, 1], result[i, 2] = x / total, y / total, z / total
+        if total > 0.0:
+            result[i, 0], result[i, 1], result[i, 2] = x / total, y / total, z / total
+        else:
+            result[i, 0], result[i, 1], result[i, 2] = points[i, 0], points[i, 1], points[i, 2]
 
 
 @njit(cache=True, parallel=True)

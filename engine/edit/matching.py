@@ -1,13 +1,15 @@
 """Which vertex of an edited mesh is which corner of which Gaussian."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int32, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from engine.edit.apply import blocks
 from engine.edit.mesh import Mesh
 from engine.edit.octagon_fit import LEAST_CORNERS
 from engine.errors import SceneFileError
@@ -15,6 +17,7 @@ from engine.gaussians.octagon import SIDES, corner_directions
 
 ID_TOLERANCE = 1e-3
 """Numbers that an editor blended between vertices are further than this from whole ones."""
+VERTICES_AT_ONCE = 1 << 18
 ADVICE = "Edit the mesh that was exported as PLY and save it as PLY, or the GLB with its attributes."
 UV_TOLERANCE = 0.02
 """Share of the texture by which coordinates may differ from those exported (some editors keep 16 bits)."""
@@ -92,39 +95,51 @@ def _match_by_ids(path: Path, mesh: Mesh, gid: np.ndarray, corner: np.ndarray, r
             "name the scene that the mesh was exported from."
         )
     vertices = np.flatnonzero(known)
-    keys = np.round(gid[vertices]).astype(np.int64) * SIDES + np.round(corner[vertices]).astype(np.int64)
-    keys, positions, node_of_vertex = _unite_split_vertices(len(mesh), vertices, keys, mesh.vertices)
-    if not len(keys):
+    if not len(vertices):
         raise SceneFileError(f"{path}: none of its vertices carries the number of a Gaussian and a corner.")
-    instance = _instances(keys, node_of_vertex, mesh.triangles)
-    octagons = _assemble(keys, positions, instance)
-    gids, corners, present, ambiguous = octagons
+    keys = np.round(gid[vertices]).astype(np.int64) * SIDES + np.round(corner[vertices]).astype(np.int64)
+    united = len(vertices)
+    if (keys[1:] > keys[:-1]).all():  # in the order of the export, nothing twice: most edits leave it so
+        instance = keys // SIDES
+    else:
+        keys, vertices, node_of_vertex = _unite_split_vertices(vertices, keys, mesh.vertices)
+        instance = _instances(keys, node_of_vertex, mesh.triangles)
+    gids, corners, present, ambiguous = _assemble(keys, mesh.vertices, vertices, instance)
     # Vertices that another object brought when it was joined carry zeros, not ids of their own.
     first = np.concatenate([[True], gids[1:] != gids[:-1]])
     enough = present.sum(axis=1) >= LEAST_CORNERS
     kept = first | enough
-    united = len(vertices)
     foreign = len(mesh) - united + int(present[~kept].sum())
-    return Octagons(gids[kept], corners[kept], present[kept], ~first[kept], "ids", foreign, ambiguous)
+    if not kept.all():
+        gids, corners, present, first = gids[kept], corners[kept], present[kept], first[kept]
+    return Octagons(gids, corners, present, ~first, "ids", foreign, ambiguous)
 
 
 def _unite_split_vertices(
-    count: int, vertices: np.ndarray, keys: np.ndarray, positions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    vertices: Int64[np.ndarray, " k"], keys: Int64[np.ndarray, " k"], positions: Float64[np.ndarray, "v 3"]
+) -> tuple[Int64[np.ndarray, " u"], Int64[np.ndarray, " u"], Int32[np.ndarray, " v"]]:
     """Vertices that share corner and place are one: GLB splits them where normals or seams differ.
 
     Returns:
-        Keys and positions of the united vertices, sorted by key, and the united vertex of each vertex (-1:
+        Keys of the united vertices in order, one vertex for each, and the united vertex of each vertex (-1:
         none).
     """
-    places = positions[vertices]
-    order = np.lexsort((places[:, 2], places[:, 1], places[:, 0], keys))
-    keys, places, vertices = keys[order], places[order], vertices[order]
+    order = np.argsort(keys, kind="stable")
+    keys, vertices = keys[order], vertices[order]
+    del order
+    tied = np.zeros(len(keys), dtype=bool)
+    tied[1:] = keys[1:] == keys[:-1]
+    tied[:-1] |= tied[1:]
+    rows = np.flatnonzero(tied)  # few, so that sorting by place, too, costs little
+    places = positions[vertices[rows]]
+    by_place = np.lexsort((places[:, 2], places[:, 1], places[:, 0], keys[rows]))
+    vertices[rows] = vertices[rows[by_place]]
+    places = places[by_place]
     new = np.ones(len(keys), dtype=bool)
-    new[1:] = (keys[1:] != keys[:-1]) | (places[1:] != places[:-1]).any(axis=1)
-    node_of_vertex = np.full(count, -1, np.int64)
-    node_of_vertex[vertices] = np.cumsum(new) - 1
-    return keys[new], places[new], node_of_vertex
+    new[rows[1:]] = (keys[rows[1:]] != keys[rows[:-1]]) | (places[1:] != places[:-1]).any(axis=1)
+    node_of_vertex = np.full(len(positions), -1, np.int32)
+    node_of_vertex[vertices] = np.cumsum(new, dtype=np.int32) - 1
+    return keys[new], vertices[new], node_of_vertex
 
 
 def _instances(
@@ -154,23 +169,35 @@ def _instances(
 
 
 def _assemble(
-    keys: Int64[np.ndarray, " u"], positions: np.ndarray, instance: Int64[np.ndarray, " u"]
+    keys: Int64[np.ndarray, " u"],
+    positions: Float64[np.ndarray, "v 3"],
+    vertices: Int64[np.ndarray, " u"],
+    instance: Int64[np.ndarray, " u"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Octagons in order of Gaussian, then the most complete first, and the number of ambiguous corners."""
-    _, numbers = np.unique(instance, return_inverse=True)
+    if (instance[1:] >= instance[:-1]).all():  # no need to sort
+        numbers = np.zeros(len(instance), np.int64)
+        numbers[1:] = np.cumsum(instance[1:] != instance[:-1])
+    else:
+        _, numbers = np.unique(instance, return_inverse=True)
     count = int(numbers.max()) + 1
     gids = np.zeros(count, np.int64)
     gids[numbers] = keys // SIDES
-    claims = np.zeros((count, SIDES), np.int64)
-    np.add.at(claims, (numbers, keys % SIDES), 1)
-    corners = np.zeros((count, SIDES, 3))
-    corners[numbers, keys % SIDES] = positions
-    present = claims == 1
-    corners[~present] = 0.0
     first_vertex = np.full(count, len(keys))
     np.minimum.at(first_vertex, numbers, np.arange(len(keys)))
+    places = numbers * SIDES + keys % SIDES
+    del numbers
+    claims = np.bincount(places, minlength=count * SIDES).reshape(count, SIDES)
+    present, ambiguous = claims == 1, int((claims > 1).sum())
+    del claims
     order = np.lexsort((first_vertex, -present.sum(axis=1), gids))
-    return gids[order], corners[order], present[order], int((claims > 1).sum())
+    corners = np.zeros((count, SIDES, 3))
+    for block in blocks(len(places), VERTICES_AT_ONCE):
+        corners.reshape(-1, 3)[places[block]] = positions[vertices[block]]
+    corners[~present] = 0.0
+    if (order[1:] > order[:-1]).all():
+        return gids, corners, present, ambiguous
+    return gids[order], corners[order], present[order], ambiguous
 
 
 def _match_by_order(path: Path, mesh: Mesh, opacities: np.ndarray, radii: np.ndarray) -> Octagons:
@@ -187,7 +214,7 @@ def _match_by_order(path: Path, mesh: Mesh, opacities: np.ndarray, radii: np.nda
     if len(gids) != count or not _uv_agree(mesh, radii[gids], radii):
         raise SceneFileError(
             f"{path}: cannot be matched to the scene; its vertices carry no ids (attributes gid and corner), "
-            "and their texture coordinates show that their order has changed. {ADVICE}"
+            f"and their texture coordinates show that their order has changed. {ADVICE}"
         )
     corners = mesh.vertices.reshape(count, SIDES, 3)
     return Octagons(
@@ -205,16 +232,30 @@ def _uv_agree(mesh: Mesh, radii: np.ndarray, all_radii: np.ndarray) -> bool:
     """Whether the texture coordinates are those of octagons in this order; a mesh without them passes."""
     if mesh.uv is None:
         return True
-    seen = (mesh.uv.reshape(-1, SIDES, 2) - 0.5).astype(np.float64)
-    known = np.logical_and.reduce(np.isfinite(seen), axis=2)
-    seen = np.where(known[:, :, None], seen, 0.0)
+    seen = mesh.uv.reshape(-1, SIDES, 2)
     # The common factor, the exporter's 1 / sqrt(Q), is fitted: it may not be known here.
-    template = radii[:, None, None] * corner_directions()
     for flip in (1.0, -1.0):
-        wanted = template * np.array([1.0, flip])
-        norm = float(np.sum(wanted[known] ** 2))
-        factor = float(np.sum(wanted[known] * seen[known])) / norm if norm else 0.0
-        off = np.abs(seen - factor * wanted).max(axis=2)[known]
-        if factor > 0.0 and len(off) and off.max() <= UV_TOLERANCE * factor * all_radii.max():
+        products = [
+            (np.sum(wanted * wanted), np.sum(wanted * here)) for wanted, here in _uv_pairs(seen, radii, flip)
+        ]
+        norm, overlap = np.sum(products, axis=0)
+        factor = overlap / norm if norm else 0.0
+        if norm == 0.0:
             return True
-    return not known.any()
+        if factor > 0.0:
+            tolerance = UV_TOLERANCE * factor * all_radii.max()
+            pairs = _uv_pairs(seen, radii, flip)
+            if all(np.abs(here - factor * wanted).max(initial=0.0) <= tolerance for wanted, here in pairs):
+                return True
+    return False
+
+
+def _uv_pairs(
+    seen: Float[np.ndarray, "m 8 2"], radii: Float[np.ndarray, " m"], flip: float
+) -> Iterator[tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "k 2"]]]:
+    """Texture coordinates about their middle, block by block: expected, up to a factor, and seen."""
+    for block in blocks(len(seen)):
+        here = seen[block].astype(np.float64) - 0.5
+        wanted = radii[block, None, None] * corner_directions() * np.array([1.0, flip])
+        known = np.isfinite(here).all(axis=2)
+        yield wanted[known], here[known]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int32, Int64
 
 from engine.edit.mesh import Mesh
 from engine.edit.mesh_ply import stated_q
@@ -47,12 +47,16 @@ def read_obj(path: Path) -> Mesh:
     if not parts.positions:
         raise SceneFileError(f"{path}: is no OBJ mesh; it has no line that begins with 'v'.")
     positions = np.concatenate(parts.positions)
-    triangles = np.concatenate([*parts.triangles, np.zeros((0, 3), np.int64)])
+    parts.positions.clear()
+    uv = _uv_of_vertices(path, parts, len(positions))
+    parts.uv.clear()
+    parts.triangle_uv.clear()
+    triangles = np.concatenate([*parts.triangles, np.zeros((0, 3), np.int32)], dtype=np.int64)
     rounding = 0.5 * 10.0**-parts.decimals
     return Mesh(
         positions,
         triangles,
-        uv=_uv_of_vertices(path, parts, triangles, len(positions)),
+        uv=uv,
         q=stated_q(tuple(parts.comments)),
         rounding=rounding,
     )
@@ -94,14 +98,14 @@ def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
         values = _numbers(path, text.translate(None, b"v"), int(is_position.sum()), "v")
         if values.shape[1] < 3:
             raise SceneFileError(f"{path}: a line 'v' has fewer than three numbers.")
-        parts.positions.append(values[:, :3])
+        parts.positions.append(values[:, :3].copy())  # without the colours behind them
         parts.vertex_count += len(values)
         for line in text.split(b"\n", DIGIT_LINES)[:DIGIT_LINES]:
             words = line.split()[1:4]
             parts.decimals = max([parts.decimals, *(len(word.partition(b".")[2]) for word in words)])
     if is_uv.any():
         text = _lines(data, is_uv, lengths).translate(None, b"vt")
-        parts.uv.append(_numbers(path, text, int(is_uv.sum()), "vt")[:, :2])
+        parts.uv.append(_numbers(path, text, int(is_uv.sum()), "vt")[:, :2].astype(np.float32))
         parts.uv_count += int(is_uv.sum())
     if is_face.any():
         _take_faces(path, _lines(data, is_face, lengths), int(is_face.sum()), parts)
@@ -176,27 +180,29 @@ def _add_fans(vertex: np.ndarray, texture: np.ndarray | None, parts: _Parts) -> 
     fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
     # Numbers count from 1; negative ones count back from the newest vertex.
     positions = np.where(vertex > 0, vertex - 1, vertex + parts.vertex_count)
-    parts.triangles.append(positions[:, fan].reshape(-1, 3))
+    parts.triangles.append(_small(positions[:, fan].reshape(-1, 3)))
     if texture is None:
-        parts.triangle_uv.append(np.full((len(vertex) * len(fan), 3), -1, np.int64))
+        parts.triangle_uv.append(np.full((len(vertex) * len(fan), 3), -1, np.int32))
     else:
         places = np.where(texture > 0, texture - 1, texture + parts.uv_count)
-        parts.triangle_uv.append(places[:, fan].reshape(-1, 3))
+        parts.triangle_uv.append(_small(places[:, fan].reshape(-1, 3)))
 
 
-def _uv_of_vertices(
-    path: Path, parts: _Parts, triangles: Int64[np.ndarray, "t 3"], count: int
-) -> Float32[np.ndarray, "v 2"] | None:
+def _small(numbers: Int64[np.ndarray, "t 3"]) -> Int32[np.ndarray, "t 3"]:
+    """Numbers in half the memory; those that no mesh can hold stay too large."""
+    return np.clip(numbers, -1, np.iinfo(np.int32).max).astype(np.int32)
+
+
+def _uv_of_vertices(path: Path, parts: _Parts, count: int) -> Float32[np.ndarray, "v 2"] | None:
     if not parts.uv or not parts.triangle_uv:
         return None
-    table = np.concatenate(parts.uv).astype(np.float32)
-    places = np.concatenate(parts.triangle_uv).reshape(-1)
-    named = places >= 0
-    if named.any() and places.max() >= len(table):
-        raise SceneFileError(f"{path}: a face names a texture coordinate that is not there.")
+    table = np.concatenate(parts.uv)
     uv = np.full((count, 2), np.nan, np.float32)
-    vertices = triangles.reshape(-1)[named]
-    if len(vertices) and not (vertices.min() >= 0 and vertices.max() < count):
-        raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
-    uv[vertices] = table[places[named]]
+    for triangles, places in zip(parts.triangles, parts.triangle_uv, strict=True):
+        if places.max(initial=-1) >= len(table):
+            raise SceneFileError(f"{path}: a face names a texture coordinate that is not there.")
+        vertices, places = triangles[places >= 0], places[places >= 0]
+        if len(vertices) and not (vertices.min() >= 0 and vertices.max() < count):
+            raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
+        uv[vertices] = table[places]
     return uv

@@ -37,7 +37,9 @@ def read_ply_mesh(path: Path) -> Mesh:
         if name is None:
             raise SceneFileError(f"{path}: its faces have no list 'vertex_indices'.")
         triangles = _fans(np.asarray(read_ply(path, ["face"])[1]["face"][name]))
-    positions = np.stack([table[name] for name in _POSITION], axis=-1).astype(np.float64)
+    positions = np.empty((len(table), 3))
+    for axis, name in enumerate(_POSITION):
+        positions[:, axis] = table[name]
     return Mesh(
         positions,
         triangles,
@@ -65,6 +67,8 @@ def _fans(polygons: np.ndarray) -> Int64[np.ndarray, "t 3"]:
     sides = polygons.shape[1]
     if sides < 3:
         return np.zeros((0, 3), np.int64)
+    if sides == 3:
+        return polygons.astype(np.int64)
     fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
     return polygons.astype(np.int64)[:, fan].reshape(-1, 3)
 

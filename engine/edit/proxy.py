@@ -5,7 +5,6 @@ smooth weights; made for open surfaces such as a cloth or a hull. *Mean value*: 
 combination of all vertices of a closed cage around it, which reproduces every affine map exactly.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -13,15 +12,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
+from engine.edit.apply import ROWS_AT_ONCE, blocks
 from engine.edit.kernels_proxy import blend, mean_value_weights, triangle_weights, winding_numbers
+from engine.edit.mirroring import was_mirrored
 from engine.errors import SceneFileError
 
 Method = Literal["nearest", "mvc"]
 CANDIDATES = 24
 MOST_CUTS = 16
-POINTS_AT_ONCE = 1 << 18
-STORED_BYTES = 1 << 30
-"""Mean-value coordinates are kept from frame to frame up to this size, and computed anew beyond."""
+STORED_BYTES = 1 << 29
+"""What ties the corners to the proxy is kept from frame to frame up to this size, and found anew beyond."""
+BLOCK_NUMBERS = 1 << 23
+"""Most mean-value coordinates that are computed at once."""
 DEFAULT_REACH = 0.1
 """How far a surface moves what is around it, as a share of the diagonal of its bounding box."""
 
@@ -33,10 +35,12 @@ class Proxy:
     Attributes:
         vertices_world: positions at rest.
         triangles: vertex indices; those without area are of no use and left out.
+        told_mirrored: whether its deformations mirror it, if somebody knows; else they are looked at.
     """
 
     vertices_world: Float64[np.ndarray, "v 3"]
     triangles: Int64[np.ndarray, "t 3"]
+    told_mirrored: bool | None = None
 
     def __post_init__(self) -> None:
         """Leave out triangles without area."""
@@ -50,6 +54,12 @@ class Proxy:
     def diagonal(self) -> float:
         """Diagonal of the bounding box, world units."""
         return float(np.linalg.norm(np.ptp(self.vertices_world, axis=0)))
+
+    def mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> bool:
+        """Whether moving the vertices to ``vertices_world`` mirrors the space around the mesh."""
+        if self.told_mirrored is not None:
+            return self.told_mirrored
+        return was_mirrored(self.vertices_world, vertices_world, self.triangles, self.is_closed())
 
     def is_closed(self) -> bool:
         """Whether every edge has two triangles, which run along it in opposite directions."""
@@ -70,6 +80,10 @@ class Binding(Protocol):
 
     def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
         """Where the corners are once the proxy's vertices are at ``vertices_world``."""
+        ...
+
+    def mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
+        """Around which Gaussians space was mirrored then."""
         ...
 
 
@@ -98,15 +112,34 @@ def bind(
     return NearestBinding(proxy, corners_world, reach)
 
 
+@dataclass(frozen=True)
+class _Ties:
+    """Triangles that move points, those of point i from ``starts[i]`` to ``starts[i + 1]``, with weights."""
+
+    starts: Int64[np.ndarray, " p1"]
+    triangles: Int32[np.ndarray, " k"]
+    weights: Float32[np.ndarray, " k"]
+
+    @property
+    def nbytes(self) -> int:
+        return self.starts.nbytes + self.triangles.nbytes + self.weights.nbytes
+
+
 class NearestBinding:
     """Corners bound to the triangles near them."""
 
     def __init__(self, proxy: Proxy, corners_world: Float64[np.ndarray, "n 8 3"], reach_world: float) -> None:
         self._proxy = proxy
         self._corners = corners_world
-        points = corners_world.reshape(-1, 3)
-        self._chosen, self._weights, distances = nearest_triangles(proxy, points)
-        self._influence = _fade(distances, reach_world).reshape(corners_world.shape[:2])
+        self._reach = reach_world
+        self._near = NearTriangles(proxy)
+        self._influence = np.empty(corners_world.shape[:2])
+        self._stored: list[_Ties | None] = []
+        room = STORED_BYTES
+        for block in blocks(len(corners_world)):
+            ties, self._influence[block] = self._tie(corners_world[block])
+            room -= ties.nbytes
+            self._stored.append(ties if room >= 0 else None)
         self._frames = _triangle_frames(proxy.vertices_world[proxy.triangles])
         self._centres = proxy.vertices_world[proxy.triangles].mean(axis=1)
 
@@ -119,13 +152,33 @@ class NearestBinding:
     def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
         """Corners after the proxy's vertices moved."""
         moved = _checked(vertices_world, self._proxy)[self._proxy.triangles]
-        derivatives = _moved_frames(moved, self._proxy.vertices_world[self._proxy.triangles]) @ np.linalg.inv(
-            self._frames
-        )
-        points = self._corners.reshape(-1, 3)
-        result = np.empty_like(points)
-        blend(points, self._chosen, self._weights, derivatives, self._centres, moved.mean(axis=1), result)
-        return _mix(self._corners, result.reshape(self._corners.shape), self._influence)
+        rest = self._proxy.vertices_world[self._proxy.triangles]
+        side = -1.0 if self._proxy.mirrored(vertices_world) else 1.0
+        derivatives = _moved_frames(moved, rest, side) @ np.linalg.inv(self._frames)
+        moved_centres = moved.mean(axis=1)
+        result = np.empty_like(self._corners)
+        for block, stored in zip(blocks(len(self._corners)), self._stored, strict=True):
+            corners = self._corners[block]
+            ties = self._tie(corners)[0] if stored is None else stored
+            points, places = np.ascontiguousarray(corners.reshape(-1, 3)), np.empty((corners.size // 3, 3))
+            blend(
+                points, ties.starts, ties.triangles, ties.weights, derivatives, self._centres, moved_centres,
+                places,
+            )  # fmt: skip
+            result[block] = _mix(corners, places.reshape(corners.shape), self._influence[block])
+        return result
+
+    def mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
+        """Which Gaussians follow the proxy more than not, if it was mirrored."""
+        return _followers(self._influence, self._proxy.mirrored(vertices_world))
+
+    def _tie(self, corners_world: Float64[np.ndarray, "n 8 3"]) -> tuple[_Ties, Float64[np.ndarray, "n 8"]]:
+        """What moves these corners, and how much they follow it."""
+        chosen, weights, distances = self._near.to(corners_world.reshape(-1, 3))
+        influence = _fade(distances, self._reach)
+        used = (weights > 0) & (influence > 0)[:, None]
+        starts = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
+        return _Ties(starts, chosen[used], weights[used]), influence.reshape(corners_world.shape[:2])
 
 
 class MeanValueBinding:
@@ -146,16 +199,17 @@ class MeanValueBinding:
         inside = (winding != 0).astype(np.float64)
         self._influence = np.repeat(inside[:, None], corners_world.shape[1], axis=1)
         if reach_world is not None and reach_world > 0:
-            points = corners_world.reshape(-1, 3)
-            faded = _fade(nearest_triangles(proxy, points)[2], reach_world).reshape(corners_world.shape[:2])
-            self._influence = np.maximum(self._influence, faded)
+            near = NearTriangles(proxy)
+            for block in blocks(len(corners_world)):
+                distances = near.to(corners_world[block].reshape(-1, 3))[2]
+                faded = _fade(distances, reach_world).reshape(-1, corners_world.shape[1])
+                self._influence[block] = np.maximum(self._influence[block], faded)
         self._rows = np.flatnonzero(self._influence.max(axis=1) > 0)
-        self._stored: np.ndarray | None = None
-        if self._rows.size * corners_world.shape[1] * len(proxy.vertices_world) * 8 <= STORED_BYTES:
-            points = corners_world[self._rows].reshape(-1, 3)
-            self._stored = np.empty((len(points), len(proxy.vertices_world)))
-            for part, weights in self._coordinates(points):
-                self._stored[part] = weights
+        numbers_a_row = corners_world.shape[1] * len(proxy.vertices_world)
+        self._rows_at_once = max(1, min(ROWS_AT_ONCE, BLOCK_NUMBERS // numbers_a_row))
+        self._stored: list[np.ndarray] | None = None
+        if self._rows.size * numbers_a_row * 8 <= STORED_BYTES:
+            self._stored = [self._coordinates(self._rows[block]) for block in self._blocks()]
 
     @property
     def moving(self) -> Bool[np.ndarray, " n"]:
@@ -166,66 +220,60 @@ class MeanValueBinding:
     def deform(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Float64[np.ndarray, "n 8 3"]:
         """Corners after the cage's vertices moved."""
         shifts = _checked(vertices_world, self._proxy) - self._proxy.vertices_world
-        points = self._corners[self._rows].reshape(-1, 3)
-        moved = np.empty_like(points)
-        if self._stored is not None:
-            moved[:] = points + self._stored @ shifts
-        else:
-            for part, weights in self._coordinates(points):
-                moved[part] = points[part] + weights @ shifts
         result = self._corners.copy()
-        result[self._rows] = moved.reshape(-1, *self._corners.shape[1:])
-        return _mix(self._corners, result, self._influence)
+        for number, block in enumerate(self._blocks()):
+            rows = self._rows[block]
+            weights = self._coordinates(rows) if self._stored is None else self._stored[number]
+            corners = self._corners[rows]
+            moved = corners + (weights @ shifts).reshape(corners.shape)
+            result[rows] = _mix(corners, moved, self._influence[rows])
+        return result
 
-    def _coordinates(self, points: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-        """The coordinates of ``points``, in batches."""
-        count = len(self._proxy.vertices_world)
-        step = max(1, min(POINTS_AT_ONCE, (1 << 26) // count))
-        for start in range(0, len(points), step):
-            part = slice(start, min(start + step, len(points)))
-            weights = np.empty((part.stop - part.start, count))
-            mean_value_weights(
-                points[part],
-                self._proxy.vertices_world,
-                self._proxy.triangles,
-                self._proxy.diagonal,
-                weights,
-            )
-            yield part, weights
+    def mirrored(self, vertices_world: Float64[np.ndarray, "v 3"]) -> Bool[np.ndarray, " n"]:
+        """Which Gaussians follow the cage more than not, if it was mirrored."""
+        return _followers(self._influence, self._proxy.mirrored(vertices_world))
+
+    def _blocks(self) -> list[slice]:
+        return list(blocks(len(self._rows), self._rows_at_once))
+
+    def _coordinates(self, rows: Int64[np.ndarray, " r"]) -> Float64[np.ndarray, "p v"]:
+        """The coordinates of the corners of some Gaussians."""
+        points = self._corners[rows].reshape(-1, 3)
+        weights = np.empty((len(points), len(self._proxy.vertices_world)))
+        mean_value_weights(
+            points, self._proxy.vertices_world, self._proxy.triangles, self._proxy.diagonal, weights
+        )
+        return weights
 
 
-def nearest_triangles(
-    proxy: Proxy, points: Float64[np.ndarray, "p 3"]
-) -> tuple[Int32[np.ndarray, "p k"], Float32[np.ndarray, "p k"], Float64[np.ndarray, " p"]]:
-    """Triangles near each point with smooth weights, and the distance to the nearest one.
+class NearTriangles:
+    """Finds the triangles near points.
 
-    Candidates come from points spread over the triangles, one on a triangle of usual size, so that a large
+    Candidates come from samples spread over the triangles, one on a triangle of usual size, so that a large
     one is found from everywhere on it.
     """
-    corners = np.ascontiguousarray(proxy.vertices_world[proxy.triangles])
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
-    spacing = float(np.median(edges))
-    samples, owners = _spread_samples(corners, edges.max(axis=1), spacing)
-    tree = KDTree(samples)
-    count = min(CANDIDATES, len(samples))
-    chosen = np.zeros((len(points), count), np.int32)
-    weights = np.zeros((len(points), count), np.float32)
-    distances = np.zeros(len(points))
-    for start in range(0, len(points), POINTS_AT_ONCE):
-        part = slice(start, start + POINTS_AT_ONCE)
-        apart, near = tree.query(points[part], k=count)
-        candidates = owners[near.reshape(-1, count)]
-        triangle_weights(
-            np.ascontiguousarray(points[part]),
-            corners,
-            candidates,
-            apart.reshape(-1, count),
-            spacing,
-            chosen[part],
-            weights[part],
-            distances[part],
-        )
-    return chosen, weights, distances
+
+    def __init__(self, proxy: Proxy) -> None:
+        self._corners = np.ascontiguousarray(proxy.vertices_world[proxy.triangles])
+        edges = np.linalg.norm(self._corners - np.roll(self._corners, 1, axis=1), axis=-1)
+        self._spacing = float(np.median(edges))
+        samples, self._owners = _spread_samples(self._corners, edges.max(axis=1), self._spacing)
+        self._tree = KDTree(samples)
+        self._count = min(CANDIDATES, len(samples))
+
+    def to(
+        self, points: Float64[np.ndarray, "p 3"]
+    ) -> tuple[Int32[np.ndarray, "p k"], Float32[np.ndarray, "p k"], Float64[np.ndarray, " p"]]:
+        """Triangles near each point with smooth weights, and the distance to the nearest one."""
+        count, points = self._count, np.ascontiguousarray(points)
+        chosen = np.zeros((len(points), count), np.int32)
+        weights = np.zeros((len(points), count), np.float32)
+        distances = np.zeros(len(points))
+        apart, near = self._tree.query(points, k=count, workers=-1)
+        candidates = self._owners[near.reshape(-1, count)]
+        apart = apart.reshape(-1, count)
+        triangle_weights(points, self._corners, candidates, apart, self._spacing, chosen, weights, distances)
+        return chosen, weights, distances
 
 
 def _spread_samples(
@@ -252,16 +300,16 @@ def _area_vectors(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3
 
 def _triangle_frames(corners: Float64[np.ndarray, "t 3 3"]) -> Float64[np.ndarray, "t 3 3"]:
     """Columns: two edges and the unit normal."""
-    return _moved_frames(corners, corners)
+    return _moved_frames(corners, corners, 1.0)
 
 
 def _moved_frames(
-    corners: Float64[np.ndarray, "t 3 3"], rest: Float64[np.ndarray, "t 3 3"]
+    corners: Float64[np.ndarray, "t 3 3"], rest: Float64[np.ndarray, "t 3 3"], side: float
 ) -> Float64[np.ndarray, "t 3 3"]:
-    """Columns: two edges, and the normal stretched by the root of the change in area."""
+    """Columns: two edges, and the normal stretched by the root of the change in area, on ``side`` 1 or -1."""
     vectors, area = _area_vectors(corners), np.linalg.norm(_area_vectors(rest), axis=-1)
     now = np.linalg.norm(vectors, axis=-1)
-    normals = vectors / np.maximum(np.sqrt(now * area), 1e-300)[:, None]
+    normals = side * vectors / np.maximum(np.sqrt(now * area), 1e-300)[:, None]
     edges = [corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]]
     return np.stack([*edges, normals], axis=-1)
 
@@ -283,6 +331,12 @@ def _mix(
     """Corners that follow by their influence; those with none stay exactly."""
     share = influence[:, :, None]
     result: np.ndarray = np.where(share > 0, rest + share * (moved - rest), rest)
+    return result
+
+
+def _followers(influence: Float64[np.ndarray, "n 8"], mirrored: bool) -> Bool[np.ndarray, " n"]:
+    """Gaussians that follow a mirrored proxy by more than half, where the blend is a mirroring, too."""
+    result: np.ndarray = (influence.mean(axis=1) > 0.5) & mirrored
     return result
 
 

@@ -5,18 +5,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from pydantic import BaseModel, ConfigDict, Field
 
+from engine.edit.apply import apply_legs_to, blocks, without_harmonics
 from engine.edit.axes import TURNS, Axes, detect_axes, infer_q, usual_axes
-from engine.edit.harmonics import rotate_sh
-from engine.edit.local_maps import (
-    frames_from_skewed_legs,
-    has_area,
-    legs_world,
-    solid_derivatives,
-    surface_turns,
-)
+from engine.edit.local_maps import has_area, legs_world, solid_derivatives
 from engine.edit.matching import Octagons, match_octagons
 from engine.edit.mesh import Mesh
 from engine.edit.octagon_fit import LEAST_CORNERS, fit_octagons
@@ -34,6 +28,8 @@ from engine.gaussians.octagon import (
 
 STRAINED = 0.3
 """Residual, in standard deviations, above which one Gaussian is a coarse stand-in for what the edit made."""
+AXES_SAMPLES = 100_000
+"""Octagons that are looked at to find turned axes."""
 
 
 class EditOptions(BaseModel):
@@ -148,19 +144,23 @@ def recover_edit(
     q = options.q or infer_q(mesh, opacities, CHI2_2_99)
     radii = octagon_radii(opacities, q)
     octagons = match_octagons(path, mesh, opacities, radii)
-    old, old_corners = _unedited(gaussians, octagons, radii)
+    file_rounding = mesh.rounding
+    del mesh  # the largest thing around, where the caller keeps it no longer
+    geometry = without_harmonics(gaussians)
     report = EditReport(len(gaussians), matched_by=octagons.matched_by, axes_usual=usual_axes(path), q=q)
     if options.axes == "auto":
-        report.axes = detect_axes(usual_axes(path), octagons.corners_world, octagons.present, old_corners)
+        some = np.unique(np.linspace(0, len(octagons) - 1, AXES_SAMPLES).astype(np.int64))
+        unedited = octagon_corners_world(geometry.select(octagons.gids[some]), radii[octagons.gids[some]])
+        corners, present = octagons.corners_world[some], octagons.present[some]
+        report.axes = detect_axes(usual_axes(path), corners, present, unedited)
     else:
         report.axes = options.axes
-    corners = octagons.corners_world @ TURNS[report.axes].T
-    octagons = replace(octagons, corners_world=corners)
+    if report.axes != "x0":
+        octagons = replace(octagons, corners_world=octagons.corners_world @ TURNS[report.axes].T)
     if octagons.is_copy.any():
-        distances = np.linalg.norm(corners - old_corners, axis=2).mean(axis=1, where=octagons.present)
-        octagons = octagons.nearest_first(distances)
-        old, old_corners = _unedited(gaussians, octagons, radii)
-    recovered = _recover(old, old_corners, octagons, radii[octagons.gids], mesh.rounding, options, report)
+        octagons = octagons.nearest_first(_mean_moves(geometry, octagons, radii))
+    old = geometry.select(octagons.gids)
+    recovered = _recover(old, octagons, radii[octagons.gids], file_rounding, options, report)
     result = _assemble(gaussians, old, octagons, recovered, radii, options, report)
     report.foreign_vertices = octagons.foreign_vertices
     report.ambiguous_corners = octagons.ambiguous_corners
@@ -170,51 +170,63 @@ def recover_edit(
     return result, report
 
 
-def _unedited(
-    gaussians: FlatGaussians, octagons: Octagons, radii: Float[np.ndarray, " n"]
-) -> tuple[FlatGaussians, Float[np.ndarray, "m 8 3"]]:
-    """The Gaussian of each octagon as it was, and its corners as they were exported."""
-    old = gaussians.select(octagons.gids)
-    return old, octagon_corners_world(old, radii[octagons.gids])
+def _mean_moves(
+    geometry: FlatGaussians, octagons: Octagons, radii: Float[np.ndarray, " n"]
+) -> Float64[np.ndarray, " m"]:
+    """How far each octagon is from where it was exported, as the mean over its corners, world units."""
+    result = np.empty(len(octagons))
+    for block in blocks(len(octagons)):
+        gids = octagons.gids[block]
+        unedited = octagon_corners_world(geometry.select(gids), radii[gids])
+        moves = np.linalg.norm(octagons.corners_world[block] - unedited, axis=2)
+        result[block] = moves.mean(axis=1, where=octagons.present[block])
+    return result
 
 
 def _recover(
     old: FlatGaussians,
-    old_corners: Float[np.ndarray, "m 8 3"],
     octagons: Octagons,
     radii: Float[np.ndarray, " m"],
     file_rounding: float,
     options: EditOptions,
     report: EditReport,
 ) -> _Recovered:
-    present, corners = octagons.present, octagons.corners_world
-    moves = np.where(present[:, :, None], corners - old_corners, 0.0)
-    rounding = coordinate_rounding(old_corners).astype(np.float64) + 2 * file_rounding
-    complete = present.all(axis=1)
-    unmoved = present.any(axis=1) & (np.abs(moves).max(axis=(1, 2)) <= rounding)
-    fit = fit_octagons(old, moves, present, radii)
-    means, legs = fit.means_world, fit.legs_world
-    enough = present.sum(axis=1) >= LEAST_CORNERS
-    if options.method == "three-point":
-        means, legs, enough = _three_point(corners, present, radii, old)
-    new_rounding = np.abs(means).max(axis=1) * 2 * np.finfo(np.float32).eps + 2 * file_rounding
-    sound = has_area(legs, new_rounding / np.maximum(radii, 1e-3)) & (radii > 0)
-    crumpled = enough & ~unmoved & (~sound | fit.folded | (fit.residuals > options.max_residual))
-    readable = unmoved | (enough & sound & ~crumpled)
-    signs, flipped, mirrored = _facing(old, means, legs, readable & ~unmoved, octagons)
+    count = len(octagons)
+    means, legs, residuals = np.empty((count, 3)), np.empty((count, 3, 2)), np.empty(count)
+    unmoved, readable, crumpled = (np.empty(count, dtype=bool) for _ in range(3))
+    for block in blocks(count):
+        part, radius = old.select(block), radii[block]
+        corners, present = octagons.corners_world[block], octagons.present[block]
+        unedited = octagon_corners_world(part, radius)
+        moves = np.where(present[:, :, None], corners - unedited, 0.0)
+        rounding = coordinate_rounding(unedited).astype(np.float64) + 2 * file_rounding
+        stayed = present.any(axis=1) & (np.abs(moves).max(axis=(1, 2)) <= rounding)
+        fit = fit_octagons(part, moves, present, radius)
+        new_means, new_legs = fit.means_world, fit.legs_world
+        enough = present.sum(axis=1) >= LEAST_CORNERS
+        if options.method == "three-point":
+            new_means, new_legs, enough = _three_point(corners, present, radius, part)
+        new_rounding = np.abs(new_means).max(axis=1) * 2 * np.finfo(np.float32).eps + 2 * file_rounding
+        sound = has_area(new_legs, new_rounding / np.maximum(radius, 1e-3)) & (radius > 0)
+        bad = enough & ~stayed & (~sound | fit.folded | (fit.residuals > options.max_residual))
+        means[block], legs[block], residuals[block] = new_means, new_legs, fit.residuals
+        unmoved[block], crumpled[block] = stayed, bad
+        readable[block] = stayed | (enough & sound & ~bad)
+    complete = octagons.present.all(axis=1)
+    judged = readable & ~unmoved
+    signs, flipped, mirrored = _facing(old, means, legs, judged, octagons)
     if options.damaged == "repair":
         signs = np.where(flipped, -signs, signs)
-    judged = readable & ~unmoved
     report.unmoved = int((unmoved & ~octagons.is_copy).sum())
     report.moved = int((judged & ~octagons.is_copy).sum())
     report.incomplete = int((~complete).sum())
     report.crumpled = int(crumpled.sum())
     report.flipped, report.mirrored = int(flipped.sum()), int(mirrored.sum())
     if judged.any():
-        residuals = fit.residuals[judged]
-        report.strained = int((residuals > STRAINED).sum())
-        report.residual_median, report.residual_p95 = np.quantile(residuals, [0.5, 0.95]).tolist()
-        report.residual_max = float(residuals.max())
+        known = residuals[judged]
+        report.strained = int((known > STRAINED).sum())
+        report.residual_median, report.residual_p95 = np.quantile(known, [0.5, 0.95]).tolist()
+        report.residual_max = float(known.max())
     return _Recovered(means, legs, signs, unmoved, readable, ~complete | crumpled | flipped)
 
 
@@ -248,7 +260,6 @@ def _facing(
     signs = np.ones(len(old))
     flipped = np.zeros(len(old), dtype=bool)
     mirrored = np.zeros(len(old), dtype=bool)
-    normals = rotation_matrices(old.quats_wxyz.astype(np.float64))[:, :, 0]
     copied = octagons.gids[octagons.is_copy]
     groups = [~octagons.is_copy]
     if len(np.unique(copied)) == len(copied):
@@ -260,11 +271,13 @@ def _facing(
         if not len(wanted):
             continue
         turns = neighbour_turns(old.means_world[members].astype(np.float64), means[members], wanted)
-        rows = members[wanted]
-        new_normals = np.cross(legs[rows, :, 0], legs[rows, :, 1])
-        new_normals /= np.maximum(np.linalg.norm(new_normals, axis=-1, keepdims=True), 1e-300)
-        flipped[rows], mirrored[rows] = flipped_against(turns, normals[rows], new_normals)
-        signs[rows] = np.where(mirrored[rows], -1.0, 1.0)
+        for block in blocks(len(wanted)):
+            rows = members[wanted[block]]
+            normals = rotation_matrices(old.quats_wxyz[rows].astype(np.float64))[:, :, 0]
+            new_normals = np.cross(legs[rows, :, 0], legs[rows, :, 1])
+            new_normals /= np.maximum(np.linalg.norm(new_normals, axis=-1, keepdims=True), 1e-300)
+            flipped[rows], mirrored[rows] = flipped_against(turns[block], normals, new_normals)
+            signs[rows] = np.where(mirrored[rows], -1.0, 1.0)
     return signs, flipped, mirrored
 
 
@@ -294,67 +307,40 @@ def _assemble(
     # Rows: octagons, then the Gaussians that never had one.
     rest = np.flatnonzero(never)
     pool = originals[recovered.readable[originals]]
-    points = np.concatenate([old.means_world[unreadable], gaussians.means_world[rest]]).astype(np.float64)
-    base = concatenate([old.select(unreadable), gaussians.select(rest)])
+    base = concatenate([old.select(unreadable), without_harmonics(gaussians).select(rest)])
+
+    def derivatives_of(known: Int64[np.ndarray, " k"]) -> Float64[np.ndarray, "k 3 3"]:
+        rows = pool[known]
+        return solid_derivatives(old.select(rows), recovered.legs[rows], recovered.signs[rows])
+
     moved = carry(
-        points,
+        base.means_world.astype(np.float64),
         old.means_world[pool].astype(np.float64),
         recovered.means[pool],
-        solid_derivatives(old.select(pool), recovered.legs[pool], recovered.signs[pool]),
+        derivatives_of,
         recovered.unmoved[pool],
         gaussians.means_world[deleted].astype(np.float64),
     )
-    carried_legs = moved.derivatives @ legs_world(base)
-    signs = np.where(np.linalg.det(moved.derivatives) < 0, -1.0, 1.0)
-    carried_part = apply_legs(base, moved.means_world, carried_legs, signs, moved.unmoved)
-    own = recovered.readable & kept
-    own_part = apply_legs(
-        old.select(own),
-        recovered.means[own],
-        recovered.legs[own],
-        recovered.signs[own],
-        recovered.unmoved[own],
-    )
+    own = np.flatnonzero(recovered.readable & kept)
     orphaned = moved.orphaned.copy()
     orphaned[: len(unreadable)] = False
     report.orphaned = int(orphaned.sum())
     report.carried = int((~orphaned[len(unreadable) :]).sum())
     report.dropped = int((~kept).sum())
     report.copies = int((octagons.is_copy & kept).sum())
-    everything = concatenate([own_part, carried_part])
     places = np.concatenate([gids[own], gids[unreadable], rest])
     is_copy = np.concatenate(
         [octagons.is_copy[own], octagons.is_copy[unreadable], np.zeros(len(rest), dtype=bool)]
     )
-    left = np.concatenate([np.ones(int(own.sum()), dtype=bool), ~orphaned])
+    left = np.concatenate([np.ones(len(own), dtype=bool), ~orphaned])
     order = np.lexsort((places, is_copy))
-    return everything.select(order[left[order]])
-
-
-def apply_legs(
-    old: FlatGaussians,
-    means_world: Float64[np.ndarray, "n 3"],
-    legs: Float64[np.ndarray, "n 3 2"],
-    normal_signs: Float64[np.ndarray, " n"],
-    unmoved: Bool[np.ndarray, " n"],
-    turn: Float64[np.ndarray, "3 3"] | None = None,
-) -> FlatGaussians:
-    """Gaussians with new centres and legs, and harmonics turned along; ``unmoved`` ones keep every bit.
-
-    The harmonics turn as the surface does, or all by ``turn`` where the whole map is known. A Gaussian whose
-    new legs have no area at all keeps its old frame, scales and colour.
-    """
-    result = old.copy()
-    flat = ~has_area(legs, np.zeros(len(old)))
-    result.means_world[~unmoved] = means_world[~unmoved].astype(np.float32)
-    rows = np.flatnonzero(~unmoved & ~flat)
-    part = old.select(rows)
-    quats, log_scales = frames_from_skewed_legs(legs[rows], normal_signs[rows])
-    result.quats_wxyz[rows] = quats.astype(np.float32)
-    result.log_scales[rows] = log_scales.astype(np.float32)
-    if turn is None:
-        turns = surface_turns(part, legs[rows], normal_signs[rows])
-    else:
-        turns = np.broadcast_to(turn, (len(rows), 3, 3))
-    result.sh[rows] = rotate_sh(part.sh, turns)
+    order = order[left[order]]
+    # New parameters in the order of the result, then the result itself, changed where something moved.
+    means = np.concatenate([recovered.means[own], moved.means_world])[order]
+    legs = np.concatenate([recovered.legs[own], moved.derivatives @ legs_world(base)])[order]
+    carried_signs = np.where(np.linalg.det(moved.derivatives) < 0, -1.0, 1.0)
+    signs = np.concatenate([recovered.signs[own], carried_signs])[order]
+    unmoved = np.concatenate([recovered.unmoved[own], moved.unmoved])[order]
+    result = gaussians.select(places[order])
+    apply_legs_to(result, np.flatnonzero(~unmoved), means, legs, signs)
     return result

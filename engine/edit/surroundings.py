@@ -1,10 +1,13 @@
 """What a Gaussian's neighbours did: to judge octagons that flipped, and to move those without corners."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
+
+from engine.edit.apply import blocks
 
 NEIGHBOURS = 12
 LEAST_AGREEMENT = 0.8
@@ -44,9 +47,14 @@ def neighbour_turns(
     count = min(NEIGHBOURS, len(old_means))
     if count < 4 or len(asked) == 0:
         return np.zeros((len(asked), 3, 3))
-    _, near = KDTree(old_means).query(old_means[asked], k=count)
+    tree = KDTree(old_means)
     everything = _orthogonal_fits(old_means[None], new_means[None], 1.0)
-    return _orthogonal_fits(old_means[near], new_means[near], -1.0 if _mirrors(everything)[0] else 1.0)
+    planar_sign = -1.0 if _mirrors(everything)[0] else 1.0
+    turns = np.empty((len(asked), 3, 3))
+    for block in blocks(len(asked)):
+        _, near = tree.query(old_means[asked[block]], k=count, workers=-1)
+        turns[block] = _orthogonal_fits(old_means[near], new_means[near], planar_sign)
+    return turns
 
 
 def _orthogonal_fits(
@@ -93,7 +101,7 @@ def carry(
     points: Float64[np.ndarray, "u 3"],
     old_means: Float64[np.ndarray, "n 3"],
     new_means: Float64[np.ndarray, "n 3"],
-    derivatives: Float64[np.ndarray, "n 3 3"],
+    derivatives_of: Callable[[Int64[np.ndarray, " k"]], Float64[np.ndarray, "k 3 3"]],
     unmoved: Bool[np.ndarray, " n"],
     deleted_means: Float64[np.ndarray, "d 3"],
 ) -> Carried:
@@ -103,7 +111,7 @@ def carry(
         points: old centres of those without readable corners.
         old_means: old centres of those with.
         new_means: their new centres.
-        derivatives: their maps' derivatives.
+        derivatives_of: the derivatives of some of their maps.
         unmoved: which of them stayed exactly.
         deleted_means: old centres of Gaussians that were deleted.
     """
@@ -112,20 +120,27 @@ def carry(
         eye = np.broadcast_to(np.eye(3), (len(points), 3, 3)).copy()
         none = np.zeros(len(points), dtype=bool)
         return Carried(points.copy(), eye, ~none, none)
-    distances, near = KDTree(old_means).query(points, k=count)
-    distances, near = distances.reshape(len(points), count), near.reshape(len(points), count)
-    weights = _weights(distances)
-    offsets = points[:, None] - old_means[near]
-    moved = new_means[near] + np.einsum("nkij,nkj->nki", derivatives[near], offsets)
-    orphaned = np.zeros(len(points), dtype=bool)
-    if len(deleted_means):
-        orphaned = KDTree(deleted_means).query(points)[0] < distances[:, 0]
-    return Carried(
-        np.einsum("nk,nki->ni", weights, moved),
-        np.einsum("nk,nkij->nij", weights, derivatives[near]),
-        unmoved[near].all(axis=1),
-        orphaned,
+    tree = KDTree(old_means)
+    gone = KDTree(deleted_means) if len(deleted_means) else None
+    carried = Carried(
+        np.empty((len(points), 3)),
+        np.empty((len(points), 3, 3)),
+        np.zeros(len(points), dtype=bool),
+        np.zeros(len(points), dtype=bool),
     )
+    for block in blocks(len(points)):
+        part = points[block]
+        distances, near = (found.reshape(len(part), count) for found in tree.query(part, k=count, workers=-1))
+        known, place = np.unique(near, return_inverse=True)
+        derivatives = derivatives_of(known)[place.reshape(near.shape)]
+        weights = _weights(distances)
+        moved = new_means[near] + np.einsum("nkij,nkj->nki", derivatives, part[:, None] - old_means[near])
+        carried.means_world[block] = np.einsum("nk,nki->ni", weights, moved)
+        carried.derivatives[block] = np.einsum("nk,nkij->nij", weights, derivatives)
+        carried.unmoved[block] = unmoved[near].all(axis=1)
+        if gone is not None:
+            carried.orphaned[block] = gone.query(part, workers=-1)[0] < distances[:, 0]
+    return carried
 
 
 def _weights(distances: Float[np.ndarray, "u k"]) -> Float[np.ndarray, "u k"]:

@@ -63,8 +63,8 @@ class FlatGaussians:
         """Colour of the constant harmonic alone, 1/2 + C0 sh[0], clipped below at 0; display values."""
         return np.maximum(0.5 + np.float32(SH_C0) * self.sh[:, 0], 0.0).astype(np.float32)
 
-    def select(self, index: np.ndarray) -> "FlatGaussians":
-        """The Gaussians at ``index`` (integers or a mask), copied."""
+    def select(self, index: np.ndarray | slice) -> "FlatGaussians":
+        """The Gaussians at ``index`` (integers, a mask or a slice), copied."""
         return FlatGaussians(
             **{field.name: getattr(self, field.name)[index].copy() for field in fields(self)}
         )

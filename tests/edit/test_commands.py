@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from edit_scenes import assert_same, cube
 
+from engine.edit.affine import transform
 from engine.edit.mesh import read_mesh
 from engine.export.registry import export_scene
 from engine.gaussians.model import FlatGaussians
@@ -119,7 +120,7 @@ def test_deform(octasplat, scene: Path, tmp_path: Path, method: str) -> None:
 def test_deform_refuses_other_meshes_and_proxies_far_away(octasplat, scene: Path, tmp_path: Path) -> None:
     vertices, triangles = cube(2)
     write_obj(tmp_path / "rest.obj", vertices, triangles)
-    write_obj(tmp_path / "other.obj", vertices, triangles[:, ::-1])
+    write_obj(tmp_path / "other.obj", vertices, (triangles + 1) % len(vertices))
     write_obj(tmp_path / "far.obj", vertices + 50, triangles)
     write_obj(tmp_path / "open.obj", vertices, triangles[1:])
     for proxy, deformed, method, message in (
@@ -178,3 +179,20 @@ def test_mistakes(octasplat, scene: Path, monkeypatch, arguments, code: int, mes
     result = octasplat(*arguments)
     assert result.exit_code == code and message in result.stderr, result.output
     assert not Path("out.ply").exists()
+
+
+@pytest.mark.parametrize("turned_over", [False, True])
+def test_deform_by_a_mirrored_proxy(octasplat, scene: Path, tmp_path: Path, turned_over: bool) -> None:
+    vertices, triangles = cube(2)
+    write_obj(tmp_path / "rest.obj", vertices, triangles)
+    faces = triangles[:, ::-1] if turned_over else triangles  # as Blender exports an object of scale -1
+    write_obj(tmp_path / "mirrored.obj", vertices * [-1, 1, 1], faces)
+    result = octasplat(
+        "deform", scene, "--proxy", tmp_path / "rest.obj", "--deformed", tmp_path / "mirrored.obj",
+        "--reach", "inf", "-o", tmp_path / "out.ply", "--report", tmp_path / "report.json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "150 mirrored with the proxy" in result.stdout
+    moved, exact = read(tmp_path / "out.ply"), transform(read(scene), np.diag([-1.0, 1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(moved.means_world, exact.means_world, atol=1e-6)
+    np.testing.assert_allclose(moved.sh, exact.sh, atol=1e-4)

@@ -17,6 +17,7 @@ from edit_scenes import (
 )
 
 from engine.edit.deform import deform, deform_to, deformation_corners
+from engine.edit.harmonics import sh_basis
 from engine.edit.proxy import MeanValueBinding, Proxy, bind
 from engine.errors import SceneFileError
 from engine.gaussians.model import FlatGaussians
@@ -35,8 +36,9 @@ def follow(
     g: FlatGaussians, proxy: Proxy, move: Callable[[np.ndarray], np.ndarray], **options
 ) -> FlatGaussians:
     corners = deformation_corners(g)
-    moved = bind(proxy, corners, **options).deform(move(proxy.vertices_world))
-    return deform_to(g, corners, moved)[0]
+    binding = bind(proxy, corners, **options)
+    vertices = move(proxy.vertices_world)
+    return deform_to(g, corners, binding.deform(vertices), binding.mirrored(vertices))[0]
 
 
 @pytest.mark.parametrize("method", ["nearest", "mvc"])
@@ -186,3 +188,82 @@ def test_points_that_fall_together_keep_their_gaussians_finite(make_scene: Make)
     np.testing.assert_array_equal(result.means_world, np.full((20, 3), 3, np.float32))
     with pytest.raises(ValueError, match="not finite"):
         deform(g, lambda corners: corners * np.nan)
+
+
+def colours_seen(g: FlatGaussians, directions: np.ndarray) -> np.ndarray:
+    """Of each Gaussian along each of the ray directions, world frame."""
+    return np.einsum("sk,nkc->nsc", sh_basis(directions, g.sh_degree), g.sh.astype(np.float64))
+
+
+def ball(cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """A closed surface that is no mirror image of itself."""
+    vertices, triangles = cube(cells)
+    round_ones = 1.2 * vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    return round_ones + 0.2 * round_ones[:, [1, 2, 0]] ** 2, triangles
+
+
+def bowl(cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """An open surface that is far from a plane."""
+    vertices, triangles = grid(cells)
+    vertices[:, 2] = 0.5 * (vertices[:, :2] ** 2).sum(axis=1)
+    return vertices, triangles
+
+
+REFLECTION = np.eye(3) - 2 * np.outer([0.6, 0.0, 0.8], [0.6, 0.0, 0.8])
+MIRRORS = {
+    "reflection": REFLECTION,
+    "reflection, turn and scale": 0.7 * random_turn(4) @ np.diag([1.0, -1.0, 1.0]),
+    "inversion": -np.eye(3),
+}
+
+
+@pytest.mark.parametrize("linear", MIRRORS.values(), ids=MIRRORS.keys())
+@pytest.mark.parametrize(("method", "proxy"), [("mvc", ball(3)), ("nearest", ball(4)), ("nearest", bowl(8))])
+def test_a_mirrored_proxy_mirrors_the_scene(make_scene: Make, linear, method: str, proxy) -> None:
+    g = make_scene(200, spread=0.4)
+    result = follow(g, Proxy(*proxy), lambda p: p @ linear.T + [1, 2, 3], method=method, reach_world=np.inf)
+    scale = np.abs(np.linalg.det(linear)) ** (1 / 3)
+    np.testing.assert_allclose(result.means_world, g.means_world @ linear.T + [1, 2, 3], atol=2e-6)
+    assert covariance_errors(result, linear @ covariances(g) @ linear.T).max() < 1e-4
+    # The normal is the image of the old one, up to its sign, and the frame is a rotation.
+    np.testing.assert_allclose(np.linalg.det(result.rotations), 1.0, atol=1e-5)
+    normals = np.einsum("ij,nj->ni", linear / scale, g.rotations[:, :, 0])
+    np.testing.assert_allclose(np.sum(normals * result.rotations[:, :, 0], axis=1), 1.0, atol=1e-5)
+    # Seen along the mirrored ray, each Gaussian has the colour that it had.
+    directions = np.random.default_rng(2).standard_normal((20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = colours_seen(result, directions @ (linear / scale).T)
+    np.testing.assert_allclose(seen, colours_seen(g, directions), atol=2e-4)
+
+
+def test_a_mirrored_cage_reports_what_it_mirrored(make_scene: Make) -> None:
+    g = make_scene(200, spread=2.0)
+    corners = deformation_corners(g)
+    binding = bind(Proxy(*cube(3)), corners, "mvc")
+    vertices = cube(3)[0] * [-1, 1, 1]
+    result, report = deform_to(g, corners, binding.deform(vertices), binding.mirrored(vertices))
+    inside = np.abs(g.means_world).max(axis=1) < 1.2
+    assert report.mirrored == report.moved == inside.sum()
+    assert_same(result.select(~inside), g.select(~inside))
+
+
+def test_what_only_looks_mirrored_is_not(make_scene: Make) -> None:
+    pushed_through = bowl(8)[0] * [1, 1, -1] + 0.1 * np.sin(3 * bowl(8)[0])[:, [1, 0, 2]]
+    turned_over = grid(8)[0] * [-1, 1, 1]
+    corners = deformation_corners(make_scene(20))
+    for (vertices, triangles), moved in ((bowl(8), pushed_through), (grid(8), turned_over)):
+        assert not bind(Proxy(vertices, triangles), corners).mirrored(moved).any()
+    told = bind(Proxy(*grid(8), told_mirrored=True), corners, reach_world=np.inf)
+    assert told.mirrored(turned_over).all()
+    np.testing.assert_allclose(told.deform(turned_over), corners * [-1, 1, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["nearest", "mvc"])
+def test_what_is_not_kept_between_frames_is_the_same(make_scene: Make, monkeypatch, method: str) -> None:
+    corners = deformation_corners(make_scene(300, spread=1.5))
+    moved = twist(0.5)[0](cube(3)[0])
+    kept = bind(Proxy(*cube(3)), corners, method, 0.3).deform(moved)
+    monkeypatch.setattr("engine.edit.proxy.STORED_BYTES", 0)
+    again = bind(Proxy(*cube(3)), corners, method, 0.3)
+    np.testing.assert_array_equal(again.deform(moved), kept)
+    np.testing.assert_array_equal(again.deform(moved), kept)

@@ -52,6 +52,13 @@ from workers.options import quiet_option
     "Blender saves as OBJ or GLB beside a scene imported as PLY.",
 )
 @click.option(
+    "--mirrored",
+    type=click.Choice(["auto", "yes", "no"]),
+    default="auto",
+    show_default=True,
+    help="Whether the deformed mesh was mirrored; auto looks at it, which a flat mesh cannot show.",
+)
+@click.option(
     "--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write all counts there."
 )
 @quiet_option
@@ -63,6 +70,7 @@ def deform(
     method: str,
     reach: float | None,
     axes: str,
+    mirrored: str,
     report: Path | None,
     quiet: bool,
 ) -> None:
@@ -79,6 +87,7 @@ def deform(
             method=method,
             reach=reach,
             axes=axes,
+            mirrored={"auto": None, "yes": True, "no": False}[mirrored],
             report_path=report,
             quiet=quiet,
         )
