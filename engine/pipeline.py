@@ -254,7 +254,10 @@ def _train(
 ) -> FlatGaussians:
     folder = output / CHECKPOINTS
     fingerprint = _fingerprint(dataset, config)
-    state = _resume(folder, fingerprint, tell) or fresh_state(initial_gaussians(dataset, config), config.seed)
+    state = _resume(folder, fingerprint, tell)
+    if state is None:
+        first = initial_gaussians(dataset, config, threads=use_threads(threads))
+        state = fresh_state(first, config.seed)
     trainer = Trainer(
         dataset,
         config,
@@ -281,7 +284,7 @@ def _resume(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None
     return None
 
 
-def initial_gaussians(dataset: Dataset, config: TrainConfig) -> FlatGaussians:
+def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> FlatGaussians:
     """The first Gaussians: on the sparse points, or on random rays where there are too few of them."""
     rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
     points = dataset.points
@@ -290,7 +293,7 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig) -> FlatGaussians:
         limit = min(config.initial_points, config.max_gaussians)
         xyz, rgb = points.xyz_world, points.rgb_srgb
         if config.lift_pixels and len(xyz) < limit:
-            more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng)
+            more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng, threads=threads)
             xyz, rgb = np.concatenate([xyz, more_xyz]), np.concatenate([rgb, more_rgb])
         return from_points(
             xyz,

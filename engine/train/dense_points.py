@@ -7,6 +7,7 @@ matches what they show (plane sweep on a few planes). What agrees becomes a poin
 the next round.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,11 +53,12 @@ class _Patches:
 
 
 def dense_points(
-    dataset: Dataset, count: int, rng: np.random.Generator
+    dataset: Dataset, count: int, rng: np.random.Generator, *, threads: int = 1
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """About ``count`` points or fewer, and their display colours, beside those of the sparse model.
 
-    The sparse model must have points. Masked and transparent pixels give none.
+    The sparse model must have points. Masked and transparent pixels give none. ``threads`` work on the views
+    side by side, which changes no point.
     """
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
@@ -65,14 +67,20 @@ def dense_points(
         # Pixels that no guess fits are lost: draw some more.
         wanted = round(1.6 * (count - sum(map(len, points))) / (ROUNDS - round_number))
         per_view = rng.multinomial(max(0, wanted), _areas(dataset))
-        found, seen = [], []
-        for index, samples in zip(dataset.train_indices, per_view, strict=True):
-            xyz, rgb = _lift(dataset, int(index), int(samples), known, neighbours[int(index)], rng)
-            found.append(xyz)
-            seen.append(rgb)
-        kept = _elected(dataset, np.concatenate(found), np.concatenate(seen))
-        points.append(np.concatenate(found)[kept])
-        colours.append(np.concatenate(seen)[kept])
+        generators = rng.spawn(len(per_view))  # one a view, so that their order does not matter
+        jobs = list(zip(dataset.train_indices.tolist(), per_view.tolist(), generators, strict=True))
+
+        def lift(
+            job: tuple[int, int, np.random.Generator], known: np.ndarray = known
+        ) -> tuple[np.ndarray, ...]:
+            index, samples, generator = job
+            return _lift(dataset, index, samples, known, neighbours[index], generator)
+
+        with ThreadPoolExecutor(threads) as pool:
+            found, seen = map(np.concatenate, zip(*pool.map(lift, jobs), strict=True))
+            kept = _elected(dataset, found, seen, pool)
+        points.append(found[kept])
+        colours.append(seen[kept])
         known = np.concatenate([known, points[-1]])
     xyz, rgb = np.concatenate(points), np.concatenate(colours)
     if len(xyz) > count:
@@ -184,19 +192,27 @@ def _cost(
 
 
 def _elected(
-    dataset: Dataset, xyz_world: Float32[np.ndarray, "n 3"], rgb_srgb: Float32[np.ndarray, "n 3"]
+    dataset: Dataset,
+    xyz_world: Float32[np.ndarray, "n 3"],
+    rgb_srgb: Float32[np.ndarray, "n 3"],
+    pool: ThreadPoolExecutor,
 ) -> Bool[np.ndarray, " n"]:
     """Whether enough of the views that look towards each point show its colour there."""
-    agree, looking = np.zeros(len(xyz_world)), np.zeros(len(xyz_world))
+    agree, looking = np.zeros(len(xyz_world), np.int64), np.zeros(len(xyz_world), np.int64)
     train = dataset.train_indices
-    for index in train[np.unique(np.linspace(0, len(train) - 1, JURY).astype(np.int64))]:
-        where_px, depth = _project(dataset, int(index), xyz_world.astype(np.float64))
-        inside = np.flatnonzero(_inside(dataset, int(index), where_px) & (depth > 0))
+
+    def vote(index: int) -> tuple[np.ndarray, np.ndarray]:
+        where_px, depth = _project(dataset, index, xyz_world.astype(np.float64))
+        inside = np.flatnonzero(_inside(dataset, index, where_px) & (depth > 0))
         pixel = np.floor(where_px[inside]).astype(np.int64)
         rgb, _, _ = dataset.pixels(np.full(len(inside), index), pixel[:, 1], pixel[:, 0])
+        return inside, np.abs(rgb - rgb_srgb[inside]).mean(axis=1) < AGREES
+
+    jury = train[np.unique(np.linspace(0, len(train) - 1, JURY).astype(np.int64))].tolist()
+    for inside, agrees in pool.map(vote, jury):
         looking[inside] += 1
-        agree[inside] += np.abs(rgb - rgb_srgb[inside]).mean(axis=1) < AGREES
-    return agree >= MAJORITY * np.maximum(looking, 1)
+        agree[inside] += agrees
+    return np.asarray(agree >= MAJORITY * np.maximum(looking, 1))
 
 
 def _project(

@@ -67,3 +67,10 @@ def test_same_seed_same_points(dataset: Dataset) -> None:
 def test_none_wanted_none_found(dataset: Dataset) -> None:
     xyz, rgb = dense_points(dataset, 0, np.random.default_rng(0))
     assert xyz.shape == rgb.shape == (0, 3)
+
+
+def test_threads_change_nothing(dataset: Dataset) -> None:
+    one, three = (dense_points(dataset, 800, np.random.default_rng(3), threads=n) for n in (1, 3))
+    assert len(one[0]) > 300
+    for a, b in zip(one, three, strict=True):
+        assert np.array_equal(a, b)
