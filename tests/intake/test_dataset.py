@@ -140,7 +140,7 @@ def test_models_that_lie(local_storage: LocalStorage, case: str) -> None:
     faults = faults_of(local_storage, {**photographs(), **make().files()})
     assert code in {fault.code for fault in faults}
     assert any(fault.code == code and (file is None or fault.file == file) for fault in faults)
-    assert time.perf_counter() - began < 20
+    assert time.perf_counter() - began < 60
 
 
 def test_all_faults_are_listed_with_pointers(local_storage: LocalStorage) -> None:
@@ -211,7 +211,7 @@ def test_a_child_that_hangs_is_stopped(local_storage: LocalStorage) -> None:
     }
     began = time.perf_counter()
     faults = faults_of(local_storage, {**photographs(), **slow}, seconds=1)
-    assert time.perf_counter() - began < 10
+    assert time.perf_counter() - began < 40
     assert faults[0].code in ("model-timeout", "model-too-few-views", "model-damaged")
 
 

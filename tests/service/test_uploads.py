@@ -312,7 +312,7 @@ def start_server(conninfo: str, tmp_path: Path, short_root: Path) -> Iterator[Ca
         socket = short_root / f"{os.getpid()}-{len(processes)}.sock"
         process = subprocess.Popen([sys.executable, "-c", SERVER, str(socket)], env=environment, cwd=ROOT)
         processes.append(process)
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 120
         while not answers(socket):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.05)

@@ -6,6 +6,7 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import psycopg
 import pytest
 from worker_bench import Bench, alive, child_pids, wait_for_end
@@ -232,6 +233,17 @@ def test_priority_and_queues(bench: Bench) -> None:
     assert bench.job(elsewhere).state == "queued"
     bench.worker(queues="gpu", name="gpu")
     assert bench.over(elsewhere).worker == "gpu"
+
+
+def test_flood_of_log_lines_is_cut(bench: Bench) -> None:
+    worker = bench.worker()
+    bench.up("w")
+    before = psutil.Process(worker.pid).memory_info().rss
+    job_id = bench.submit(options={"steps": 2, "log_lines": 500_000})
+    assert bench.over(job_id).state == "succeeded"
+    lines = bench.log(job_id).splitlines()
+    assert len(lines) <= 20_001 and any("the rest is left out" in line for line in lines)
+    assert psutil.Process(worker.pid).memory_info().rss - before < 40 << 20
 
 
 def test_child_knows_no_secrets(bench: Bench) -> None:

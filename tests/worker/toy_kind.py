@@ -25,6 +25,7 @@ class ToyOptions(BaseModel):
     fault: bool = False
     silent_at: int | None = None
     hog_bytes: int = 0
+    log_lines: int = 0
     hold_at: int | None = None
     """Goes on beyond this step once the file ``gate`` is there."""
     gate: str = ""
@@ -64,6 +65,8 @@ def run(task: Task) -> None:
     hog = bytearray(options.hog_bytes)
     hog[::4096] = b"x" * len(hog[::4096])
     print(f"the toy begins at {step}", flush=True)  # noqa: T201 - as a library might
+    for number in range(options.log_lines):
+        print(f"line {number} of a library that cannot stop talking")  # noqa: T201
     task.listener(StageStarted("train", options.steps))
     while step < options.steps:
         time.sleep(options.seconds)
