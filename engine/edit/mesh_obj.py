@@ -13,7 +13,7 @@ from engine.edit.mesh import Mesh
 from engine.edit.mesh_ply import stated_q
 from engine.errors import SceneFileError
 
-BLOCK_BYTES = 1 << 26
+BLOCK_BYTES = 1 << 22
 NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space
 MAX_HEADER_LINES = 64
 DIGIT_LINES = 2000

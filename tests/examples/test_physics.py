@@ -140,9 +140,42 @@ def bent(points: np.ndarray, angle: float) -> np.ndarray:
     return np.stack([reach * np.sin(turn), points[:, 1], 1 / angle - reach * np.cos(turn)], axis=1)
 
 
+def test_what_stands_on_a_cloth_follows_it(skin):
+    drape = load("drape")
+    vertices, triangles = drape.round_grid(np.array([0.0, 0.0, -0.01]), 1.3, 20)
+    radii = np.linalg.norm(vertices[:, :2], axis=1)
+    assert 1.2 < radii.max() <= 1.3 * 1.1 and set(np.unique(triangles)) == set(range(len(vertices)))
+    standing = drape.stands_on(skin, np.zeros(3), 0.7, 0.05, 0.5)
+    offsets = np.linalg.norm(skin.means_world[:, :2], axis=1)
+    np.testing.assert_array_equal(standing, (offsets <= 0.7) & (skin.means_world[:, 2] <= 0.5))
+    rider = drape.ClothRider(skin, vertices, triangles)
+    turn = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+    moved = rider.at(vertices @ turn.T + [0, 0, 2])
+    np.testing.assert_allclose(moved.means_world, skin.means_world @ turn.T + [0, 0, 2], atol=1e-5)
+
+
+def test_mujoco_lets_a_cloth_sag(tmp_path):
+    if importlib.util.find_spec("mujoco") is None:
+        pytest.skip("mujoco is not installed; pip install -c constraints.txt -e '.[examples]'")
+    vertices, triangles = load("drape").round_grid(np.array([0.0, 0.0, 0.6]), 1.0, 12)
+    frames = load("mujoco_drop").simulate_cloth(
+        vertices, triangles, FOLDER / "pedestal.xml", seconds=1.0, fps=10, young=1e6
+    )
+    assert frames.shape == (10, len(vertices), 3)
+    np.testing.assert_array_equal(frames[0], vertices)
+    middle = np.linalg.norm(vertices[:, :2], axis=1) < 0.2
+    rim = np.linalg.norm(vertices[:, :2], axis=1) > 0.9
+    assert frames[-1, middle, 2].min() > -0.1  # it lies on the ball, whose top is at -0.07
+    assert frames[-1, rim, 2].mean() < -0.2
+    lengths = [
+        np.linalg.norm(f[triangles[:, 0]] - f[triangles[:, 1]], axis=1) for f in (frames[0], frames[-1])
+    ]
+    assert np.median(lengths[1] / lengths[0]) == pytest.approx(1.0, abs=0.1)  # bent, not stretched
+
+
 def test_mujoco_drops_it(box, tmp_path):
     if importlib.util.find_spec("mujoco") is None:
-        pytest.skip("mujoco is not installed; pip install 'mujoco>=4.0'")
+        pytest.skip("mujoco is not installed; pip install -c constraints.txt -e '.[examples]'")
     lattice = load("soft_body").lattice_around(box, 0.5)
     world = tmp_path / "world.xml"
     world.write_text(
