@@ -3,11 +3,19 @@
 This package knows nothing of Gaussians. :class:`Dataset` is what training and evaluation read.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from engine.scene.cameras import Camera
-from engine.scene.dataset import Dataset
-from engine.scene.load import load_scene
 from engine.scene.model import SceneModel, SparsePoints, View, scene_extent
 from engine.scene.split import split_views, write_held_out
+
+if TYPE_CHECKING:
+    from engine.scene.dataset import Dataset
+    from engine.scene.load import load_scene
+
+# Compilers and image libraries come with these; whoever only checks a COLMAP model has neither.
+_HEAVY = {"Dataset": "engine.scene.dataset", "load_scene": "engine.scene.load"}
 
 __all__ = [
     "Camera",
@@ -20,3 +28,9 @@ __all__ = [
     "split_views",
     "write_held_out",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HEAVY:
+        return getattr(import_module(_HEAVY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

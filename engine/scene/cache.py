@@ -20,7 +20,8 @@ from jaxtyping import Int64
 
 from engine.errors import DatasetError, OutputError
 from engine.files import replacing, write_json
-from engine.scene.images import ImageInfo, read_mask, read_photo
+from engine.scene.image_info import ImageInfo
+from engine.scene.images import read_mask, read_photo
 from engine.scene.mapped import MappedArray
 from engine.scene.model import SceneModel, View
 

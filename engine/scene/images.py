@@ -1,6 +1,5 @@
 """Reading photographs and masks, whatever their format, as display values at a working size."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,28 +8,10 @@ import OpenImageIO as oiio
 from jaxtyping import Float32, UInt8
 
 from engine.errors import DatasetError
+from engine.scene.image_info import ImageInfo
 from engine.threads import one_torch_thread
 
 Pixels = np.ndarray[Any, np.dtype[Any]]
-
-
-@dataclass(frozen=True)
-class ImageInfo:
-    """What the header of an image file tells.
-
-    Attributes:
-        width_px: width as stored; an EXIF orientation is not applied, as in COLMAP.
-        height_px: height as stored.
-        bits: 8, or 16 for all deeper formats, floating point included.
-        has_alpha: whether there is an alpha channel.
-        orientation: EXIF orientation, 1 if there is none.
-    """
-
-    width_px: int
-    height_px: int
-    bits: int
-    has_alpha: bool
-    orientation: int
 
 
 def read_image_info(path: Path) -> ImageInfo:

@@ -7,7 +7,8 @@ from pathlib import Path
 from engine.errors import ConfigError, DatasetError
 from engine.scene.cameras import Camera
 from engine.scene.colmap import ColmapModel, PosedImage, read_colmap_model
-from engine.scene.images import ImageInfo, read_image_info
+from engine.scene.image_info import ImageInfo
+from engine.scene.images import read_image_info
 from engine.scene.model import SceneModel, View
 
 MIN_VIEWS = 3

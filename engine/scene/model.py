@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from engine.scene.cameras import Camera
-from engine.scene.images import ImageInfo
+from engine.scene.image_info import ImageInfo
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,8 +70,8 @@ def hosts(count: int) -> Iterator[list[Host]]:
 
 
 @contextlib.contextmanager
-def door(socket_path: str) -> Iterator[int]:
-    """A port at :data:`GATEWAY` that leads to a Unix socket."""
+def door(socket_path: str, address: str = GATEWAY) -> Iterator[int]:
+    """A port at that address that leads to a Unix socket."""
     loop = asyncio.new_event_loop()
     tasks: set[asyncio.Task[None]] = set()
     writers: list[asyncio.StreamWriter] = []
@@ -103,7 +103,7 @@ def door(socket_path: str) -> Iterator[int]:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    server = loop.run_until_complete(asyncio.start_server(let_in, GATEWAY, 0))
+    server = loop.run_until_complete(asyncio.start_server(let_in, address, 0))
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()
     try:

@@ -1,5 +1,10 @@
-"""Fixtures of the database."""
+"""Fixtures of the database; the helpers of the tests of chaos are known here too."""
+
+import sys
+from pathlib import Path
 
 from postgres_for_tests import conninfo, postgres, short_root, template
+
+sys.path.append(str(Path(__file__).parents[1] / "chaos"))
 
 __all__ = ["conninfo", "postgres", "short_root", "template"]

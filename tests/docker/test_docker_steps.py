@@ -79,12 +79,14 @@ def test_front_end_and_maintenance_run_without_torch(image: Path, conninfo: str,
             assert (dataset["state"], dataset["has_poses"], dataset["photographs"]) == ("committed", True, 8)
             assert client.get("/v1/options/reconstruct")["options"]["properties"]
             assert "<html" in client.request("GET", "/").text
-            deadline = time.monotonic() + 60
+            deadline = time.monotonic() + 120
             while not client.get("/v1/queues")["workers"]:
                 assert time.monotonic() < deadline and maintenance.poll() is None, log.read_text()
                 time.sleep(0.1)
     finally:
         maintenance.terminate()
         api.terminate()
-        codes = maintenance.wait(30), api.wait(30)
+        codes = maintenance.wait(60), api.wait(60)
+        if api.stdout is not None:
+            api.stdout.close()
     assert codes[0] == 0, log.read_text()

@@ -124,7 +124,7 @@ def browse(tmp_path_factory: pytest.TempPathFactory) -> Browse:
     node = shutil.which("node")
     assert node is not None
 
-    def run(name: str, url: str, *, seconds: float = 240, **job: Any) -> dict[str, Any]:
+    def run(name: str, url: str, *, seconds: float = 400, **job: Any) -> dict[str, Any]:
         shots = Path(os.environ.get("OCTASPLAT_SCREENSHOTS", tmp_path_factory.getbasetemp() / "shots"))
         shots.mkdir(parents=True, exist_ok=True)
         given = {

@@ -267,8 +267,10 @@ const steps = {
                 await touch.send("Input.dispatchTouchEvent", { type: "touchStart", touchPoints: point(0) });
                 for (let dx = 10; dx <= 90; dx += 10) await touch.send("Input.dispatchTouchEvent", { type: "touchMove", touchPoints: point(dx) });
                 await touch.send("Input.dispatchTouchEvent", { type: "touchEnd", touchPoints: [] });
-                await page.waitForTimeout(900);
-                found.touchTurns = box !== null && (await canvas.screenshot()).toString("base64") !== before;
+                for (let k = 0; k < 30 && !found.touchTurns; k++) {
+                    await page.waitForTimeout(200);
+                    found.touchTurns = box !== null && (await canvas.screenshot()).toString("base64") !== before;
+                }
             }
             await page.context().close();
         }

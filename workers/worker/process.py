@@ -34,7 +34,8 @@ from workers.storage.opening import open_storage
 from workers.storage.room import Room
 from workers.webhooks.outbox import forget_old
 from workers.webhooks.sending import send_due
-from workers.worker.supervisor import DATABASE_ERRORS, LostDatabase, Supervisor, Surroundings
+from workers.worker.contact import DATABASE_ERRORS
+from workers.worker.supervisor import LostDatabase, Supervisor, Surroundings
 from workers.worker.workspace import sweep_workspaces
 
 logger = logging.getLogger(__name__)
