@@ -99,9 +99,7 @@ def test_the_images_work_together(front_end: Image, worker: Image, database: str
         assert codes == [0, 0, 0], front_end.log() + worker.log()
     finally:
         for process in processes:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+            Image.kill(process)
         store.stop()
     owner = (worker.root / "data").stat()
     assert (owner.st_uid, oct(owner.st_mode & 0o777)) == (10001, "0o711")

@@ -10,8 +10,7 @@ import time
 import urllib.error
 import urllib.request
 import uuid
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,39 +24,11 @@ from browser import PLAYWRIGHT, chromium
 from npm_packages import npm_folder
 from postgres_for_tests import postgres, short_root, template
 from replay import Replay
+from web_bench import ROOT, Browse, Service, StartService
 
 from workers.queue.embedded_postgres import EmbeddedPostgres
 
 __all__ = ["postgres", "short_root", "template"]
-ROOT = Path(__file__).parents[2]
-
-
-@dataclass(frozen=True)
-class Service:
-    """A service that runs.
-
-    Attributes:
-        url: where.
-        store: its folder of contents.
-        worker: plays a worker's part.
-    """
-
-    url: str
-    store: Path
-    worker: Replay
-
-    def ask(self, method: str, path: str, body: object = None, **headers: str) -> Any:
-        """The JSON that the API answers."""
-        data = body if isinstance(body, bytes) else None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.url + path, data=data, method=method, headers=headers)
-        if body is not None and not isinstance(body, bytes):
-            request.add_header("Content-Type", "application/json")
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            text = answer.read()
-        return json.loads(text) if text else None
-
-
-StartService = Callable[..., Service]
 
 
 @pytest.fixture(scope="module")
@@ -112,9 +83,6 @@ def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> It
 def service(start_service: StartService) -> Service:
     """A front end without tokens."""
     return start_service()
-
-
-Browse = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(scope="module")

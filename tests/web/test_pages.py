@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import ROOT, Browse, Service, StartService
+from web_bench import ROOT, Browse, Service, StartService
 
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.train.config import preset

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from conftest import ROOT
+from web_bench import ROOT
 
 from service.app import create_app
 from service.settings import ServiceSettings
