@@ -41,6 +41,7 @@ _DOING = {
     "depth": "Rendering depth",
     "fusing": "Fusing depth",
     "meshing": "Meshing",
+    "unwrapping": "Unwrapping",
     "colouring": "Colouring",
 }
 # What a finished stage did, and what its steps are; "" where nobody would want them counted.
@@ -60,6 +61,7 @@ _DONE = {
     "depth": ("Rendered", "depth map"),
     "fusing": ("Fused the depth maps", ""),
     "meshing": ("Made the mesh", ""),
+    "unwrapping": ("Cut the mesh open for the texture", ""),
     "colouring": ("Coloured", "point"),
 }
 

@@ -2,7 +2,7 @@
 
 The kernel is exp(-|p|^2 / 2) in the local xy plane and nothing off it, so the normal becomes the local z
 axis; the scale along it has no meaning and is the flat 1e-5. The data are turned to y up. Needs the package
-usd-core (``pip install octasplat[usd]``).
+usd-core (the extra ``usd``).
 """
 
 import tempfile
@@ -66,7 +66,7 @@ def _usd(path: Path) -> dict[str, ModuleType]:
         from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
     except ImportError as error:
         raise SceneFileError(
-            f"{path}: needs the package usd-core; install it with pip install 'octasplat[usd]'."
+            f"{path}: needs the package usd-core; install it with pip install 'usd-core>=26.5'."
         ) from error
     if not hasattr(UsdVol, "ParticleField"):
         raise SceneFileError(f"{path}: this usd-core has no ParticleField; install usd-core 26.5 or later.")

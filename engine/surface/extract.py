@@ -66,7 +66,8 @@ def extract_surface(
         cameras: where depth and colours are rendered from.
         options: all settings.
         scratch: folder for a temporary file of 8 bytes for every pixel of the depth maps.
-        listener: hears the stages ``depth``, ``fusing``, ``meshing`` and ``colouring``.
+        listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``unwrapping`` (with a texture) and
+            ``colouring``.
         should_stop: asked now and then.
 
     Raises:
@@ -111,13 +112,16 @@ def extract_surface(
         progress(4, 4)
     edges = edge_report(mesh.faces)
     tolerance = TOLERANCE_VOXELS * region.voxel_world
+    layout = None
+    if options.texture_side is not None:
+        with stage("unwrapping", 0):
+            layout = lay_out(mesh, options.texture_side)
     with stage("colouring", 0) as progress:
-        if options.texture_side is None:
+        if layout is None or options.texture_side is None:
             normals = mesh.vertex_normals()
             rgb, seen = bake_colours(mesh.vertices_world, normals, mesh, cameras, tracer, tolerance, progress)
             mesh = replace(mesh, rgb_srgb=_spread(mesh.vertices_world, rgb, seen))
         else:
-            layout = lay_out(mesh, options.texture_side)
             rgb, seen = bake_colours(
                 layout.points_world, layout.normals_world, mesh, cameras, tracer, tolerance, progress
             )

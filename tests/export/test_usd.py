@@ -9,7 +9,9 @@ from engine.errors import SceneFileError
 from engine.export.registry import export_scene
 from engine.gaussians.model import FlatGaussians
 
-usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed (pip install octasplat[usd])")
+usd = pytest.importorskip(
+    "pxr.Usd", reason="usd-core is not installed (pip install -c constraints.txt -e '.[usd]')"
+)
 Make = Callable[..., FlatGaussians]
 HALF_TURN = np.diag([1.0, -1.0, -1.0])
 
@@ -72,6 +74,6 @@ def test_without_usd_core_it_says_what_to_install(
     make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
-    with pytest.raises(SceneFileError, match=r"a\.usdz: needs the package usd-core; .*octasplat\[usd\]"):
+    with pytest.raises(SceneFileError, match=r"a\.usdz: needs the package usd-core; .*pip install 'usd-core"):
         export_scene(make_scene(3), tmp_path / "a.usdz")
     assert list(tmp_path.iterdir()) == []

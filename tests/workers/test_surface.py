@@ -30,6 +30,7 @@ def test_everything_at_once(run, octasplat, tmp_path):
     assert result.exit_code == 0, result.output
     mesh = trimesh.load(tmp_path / "new" / "a.obj", force="mesh", process=False)
     assert 100 < len(mesh.faces) <= 500
+    assert "Cut the mesh open for the texture in " in result.output
     assert mesh.visual.material.image.size == (128, 128)
     assert (np.abs(mesh.vertices) < 1.1).all()
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.mtl", "a.obj", "a.png"]
