@@ -1,6 +1,7 @@
 // Curves of the training on uPlot.
 
 import uPlot from "./vendor/uplot.js";
+import { thousands } from "./numbers.js";
 
 const CHARTS = [
     { key: "psnr", title: "PSNR", unit: "dB", digits: 2 },
@@ -84,7 +85,7 @@ export class Charts {
     say(output, chart, index) {
         const at = index ?? this.training.iterations.length - 1;
         const value = this.training.values[chart.key][at];
-        output.textContent = value == null ? "" : `${value.toLocaleString("en", { maximumFractionDigits: chart.digits })} at ${this.training.iterations[at].toLocaleString("en")}`;
+        output.textContent = value == null ? "" : `${thousands(value, chart.digits)} at ${thousands(this.training.iterations[at])}`;
     }
 
     resize() {

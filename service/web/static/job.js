@@ -2,6 +2,7 @@
 
 import { Charts, Training } from "./charts.js";
 import { comparison } from "./compare.js";
+import { thousands } from "./numbers.js";
 import "./table.js";
 import "./options.js";
 
@@ -35,7 +36,7 @@ function showPreview({ step, view }) {
         box.append(comparison(address, "Preview", photograph, "Photograph", view), Object.assign(document.createElement("p"), { className: "soft small caption" }));
         box.hidden = false;
     }
-    box.querySelector(".caption").textContent = `${view} at step ${step.toLocaleString("en")}`;
+    box.querySelector(".caption").textContent = `${view} at step ${thousands(step)}`;
 }
 
 function showProgress(event) {
@@ -48,9 +49,9 @@ function showProgress(event) {
     const left = event.seconds_left == null ? "" : ` · ${duration(event.seconds_left)} left`;
     const name = text.querySelector("b");
     if (event.stage && name) name.textContent = event.stage;
-    if (name) text.replaceChildren(name, ` ${step.toLocaleString("en")}/${total.toLocaleString("en")}${left}`);
+    if (name) text.replaceChildren(name, ` ${thousands(step)}/${thousands(total)}${left}`);
     if (event.psnr != null) document.getElementById("live-psnr")?.replaceChildren(event.psnr.toFixed(2), Object.assign(document.createElement("small"), { textContent: " dB" }));
-    if (event.gaussians != null) document.getElementById("live-gaussians")?.replaceChildren(event.gaussians.toLocaleString("en").replaceAll(",", "\u202f"));
+    if (event.gaussians != null) document.getElementById("live-gaussians")?.replaceChildren(thousands(event.gaussians));
 }
 
 function duration(seconds) {

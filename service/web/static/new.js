@@ -3,6 +3,7 @@
 import { followPreset, queueJob, readOptions } from "./options.js";
 import { chosenFiles, droppedFiles, sceneOf } from "./scene_files.js";
 import { Upload } from "./upload.js";
+import { thousands } from "./numbers.js";
 
 const form = document.getElementById("new-job");
 const find = (id) => document.getElementById(id);
@@ -55,7 +56,7 @@ function show() {
     const notes = find("chosen-notes");
     notes.replaceChildren();
     if (scene) {
-        const what = scene.archive ? `${scene.archive.name}` : `${scene.photographs.toLocaleString("en")} photographs${scene.posed ? " and a COLMAP model" : ""}`;
+        const what = scene.archive ? `${scene.archive.name}` : `${thousands(scene.photographs)} photographs${scene.posed ? " and a COLMAP model" : ""}`;
         find("chosen-text").textContent = `${scene.title && !scene.archive ? `${scene.title}: ` : ""}${what}, ${size(scene.bytes)}`;
         const add = (text) => notes.append(Object.assign(document.createElement("li"), { textContent: text }));
         if (scene.posed === false) add("There is no COLMAP model, so the poses are found first; that takes a while.");

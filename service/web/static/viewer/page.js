@@ -3,6 +3,7 @@
 import { OrbitControls, PerspectiveCamera, Vector3 } from "../vendor/three.js";
 import { Walking } from "./walking.js";
 import { CHI2_2_99, Sorting, SplatRenderer } from "./splats.js";
+import { thousands } from "../numbers.js";
 
 const AUTOMATIC_BYTES = 80e6;
 const MAX_PIXEL_RATIO = 2;
@@ -106,7 +107,7 @@ class Viewer {
         tools.addEventListener("click", ({ target }) => target.dataset.do && this.do(target.dataset.do));
         tools.querySelector("[data-do=previous]").parentElement.hidden = !this.frame.views.length;
         tools.querySelector("[data-do=full]").hidden = !document.fullscreenEnabled;
-        tools.querySelector(".count").textContent = `${scene.count.toLocaleString("en")} Gaussians`;
+        tools.querySelector(".count").textContent = `${thousands(scene.count)} Gaussians`;
         this.splats.setBackground(...BACKGROUNDS[this.background]);
         new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
         this.resize();

@@ -1,0 +1,5 @@
+// Numbers as the pages write them: narrow spaces between thousands, as service/web/wording.py does.
+
+export function thousands(value, digits = 0) {
+    return value.toLocaleString("en", { maximumFractionDigits: digits }).replaceAll(",", "\u202f");
+}
