@@ -24,7 +24,7 @@ LEAST_QUATERNION = 1e-6
 UNIT_TOLERANCE = 1e-9
 """Lengths of quaternions this near to 1 need no correction."""
 TOLD_TOLERANCE = 1e-3
-"""Lengths of quaternions this near to 1 are unit ones that a text file rounded, which is not worth telling."""
+"""Lengths of quaternions this near to 1 are of unit ones that a text file rounded: not worth telling."""
 
 
 @dataclass(frozen=True, eq=False)
