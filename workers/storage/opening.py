@@ -33,7 +33,7 @@ def open_storage(address: str | Path, *, floor_bytes: int = DEFAULT_FLOOR_BYTES)
     try:
         from workers.storage.s3 import S3Storage
     except ModuleNotFoundError:
-        raise ConfigError("A store in S3 needs boto3; install it with: pip install 'octasplat[s3]'") from None
+        raise ConfigError("A store in S3 needs boto3; install it with: pip install boto3") from None
     prefix = parts.path.strip("/")
     endpoint = parse_qs(parts.query).get("endpoint_url", [None])[0]
     return S3Storage(parts.netloc, f"{prefix}/" if prefix else "", endpoint_url=endpoint)
