@@ -96,7 +96,8 @@ def test_the_images_work_together(front_end: Image, worker: Image, database: str
                 path.name for path in download_results(api, job["id"], tmp_path / "result")
             }
         codes = [Image.stop(process) for process in processes]
-        assert codes == [0, 0, 0], front_end.log() + worker.log()
+        # uvicorn ends by the signal that asked it to, once it is done.
+        assert codes[0] in (0, 143) and codes[1:] == [0, 0], (codes, front_end.log() + worker.log())
     finally:
         for process in processes:
             Image.kill(process)
