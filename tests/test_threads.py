@@ -1,7 +1,6 @@
 """Threads that libraries take: as many as were asked for, everywhere."""
 
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -67,7 +66,9 @@ def test_a_run_on_one_thread_uses_one(tmp_path: Path) -> None:
         sys.executable, "-m", "workers", "reconstruct", str(scene), "-o", str(tmp_path / "out"), "--quiet",
         "--threads", "1", "--max-side", "48", "--iterations", "100", "--rays", "4096",
     ]  # fmt: skip
-    began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "4"})
-    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert after.ru_utime - before.ru_utime < 1.1 * wall
+    began = time.perf_counter()
+    program = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "4"})
+    _, status, used = os.wait4(program.pid, 0)
+    program.returncode = os.waitstatus_to_exitcode(status)
+    assert program.returncode == 0
+    assert used.ru_utime < 1.25 * (time.perf_counter() - began)

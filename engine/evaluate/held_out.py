@@ -92,6 +92,9 @@ def _rendered(dataset: Dataset, tracer: CpuTracer, background: str) -> Iterator[
 
 def _measured(views: Iterator[RenderedView], workers: int) -> Iterator[tuple[RenderedView, MeasuredView]]:
     """Measure a few views side by side, in order; numpy and FLIP leave the interpreter free meanwhile."""
+    if workers == 1:
+        yield from ((view, measure_view(view)) for view in views)
+        return
     waiting: list[tuple[RenderedView, Future[MeasuredView]]] = []
     with ThreadPoolExecutor(workers) as pool:
         for view in views:
