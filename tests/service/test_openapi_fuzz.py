@@ -105,6 +105,10 @@ def furnish(conninfo: str, tmp_path: Path) -> Path:
     return place
 
 
+AST_IN_THREADS = "AST constructor recursion depth mismatch"
+"""CPython 3.11 now and then says so where two threads parse; schemathesis does, and must begin again."""
+
+
 def test_no_request_breaks_the_service(front_end: FrontEnd, conninfo: str, tmp_path: Path) -> None:
     environment = {
         **os.environ,
@@ -120,9 +124,12 @@ def test_no_request_breaks_the_service(front_end: FrontEnd, conninfo: str, tmp_p
         "--suppress-health-check", "all", "--warnings", "off", "--workers", "2",
         "--continue-on-failure", "--no-color",
     ]  # fmt: skip
-    done = subprocess.run(
-        command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False
-    )
+    for _attempt in range(3):
+        done = subprocess.run(
+            command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False
+        )
+        if AST_IN_THREADS not in done.stdout:
+            break
     assert done.returncode == 0, done.stdout[-20_000:] + done.stderr[-2000:]
     log = front_end.log.read_text()
     assert "Traceback" not in log, log[-5000:]
