@@ -6,6 +6,7 @@ import signal
 import tempfile
 import uuid
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psycopg
@@ -45,9 +46,9 @@ def template(postgres: EmbeddedPostgres) -> str:
     return "octasplat"
 
 
-@pytest.fixture
-def conninfo(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
-    """A database of the test's own, with all tables."""
+@contextmanager
+def copied_database(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
+    """A new database made from ``template``, dropped at the end."""
     name = f"test_{uuid.uuid4().hex[:12]}"
     admin = make_conninfo(postgres.conninfo(), dbname="postgres")
     with psycopg.connect(admin, autocommit=True) as connection:
@@ -55,6 +56,13 @@ def conninfo(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
     yield make_conninfo(postgres.conninfo(), dbname=name)
     with psycopg.connect(admin, autocommit=True) as connection:
         connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
+
+
+@pytest.fixture
+def conninfo(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
+    """A database of the test's own, with all tables."""
+    with copied_database(postgres, template) as copied:
+        yield copied
 
 
 os.environ.pop("DATABASE_URL", None)

@@ -39,6 +39,24 @@ def quiet_option(command: F) -> F:
     return click.option("--quiet", "-q", is_flag=True, help="Show warnings and errors only.")(command)
 
 
+def scenes_output_option(command: F) -> F:
+    """``--output`` of what writes one scene, or a sequence of them."""
+    return click.option(
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path),
+        required=True,
+        help="The scene to write; for a sequence a pattern such as out/%04d.ply, or a folder.",
+    )(command)
+
+
+def report_option(command: F) -> F:
+    """``--report``."""
+    return click.option(
+        "--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write all counts there."
+    )(command)
+
+
 def background_option(help_text: str) -> Callable[[F], F]:
     """``--background black|white``."""
     return click.option("--background", type=click.Choice(["black", "white"]), default=None, help=help_text)

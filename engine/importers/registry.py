@@ -3,17 +3,14 @@
 What a file begins with decides, then its name, so that a file under a wrong name is read all the same.
 """
 
-import fnmatch
-import importlib
-import pkgutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 from engine.errors import SceneFileError
 from engine.events import Listener, StageFinished, StageStarted, ignore
+from engine.formats import FormatTable
 from engine.gaussians.flattening import GaussianCloud, ImportReport, flatten
 from engine.gaussians.model import FlatGaussians
 
@@ -44,21 +41,17 @@ class Importer:
     recognises: Callable[[bytes], bool] = lambda _head: False
 
 
-_IMPORTERS: dict[str, Importer] = {}
+_TABLE: FormatTable[Importer] = FormatTable(__name__.rpartition(".")[0], "import")
 
 
 def register(importer: Importer) -> Importer:
     """Add a format; its name must be new."""
-    if importer.name in _IMPORTERS:
-        raise ValueError(f"an importer named '{importer.name}' is registered already")
-    _IMPORTERS[importer.name] = importer
-    return importer
+    return _TABLE.register(importer)
 
 
 def importers() -> tuple[Importer, ...]:
     """All formats, by name."""
-    _discover()
-    return tuple(_IMPORTERS[name] for name in sorted(_IMPORTERS))
+    return _TABLE.all()
 
 
 def importer_for(path: Path, format: str | None = None) -> Importer:
@@ -67,27 +60,13 @@ def importer_for(path: Path, format: str | None = None) -> Importer:
     Raises:
         SceneFileError: the file cannot be opened, or no format has that name, those bytes or that file name.
     """
-    known = importers()
     if format is not None:
-        by_name = {importer.name: importer for importer in known}
-        if format not in by_name:
-            names = ", ".join(by_name)
-            raise SceneFileError(f"{path}: there is no import format '{format}'; choose one of {names}.")
-        return by_name[format]
+        return _TABLE.named(format, path)
     head = _head(path)
-    recognised = [importer for importer in known if importer.recognises(head)]
-    if recognised:
-        return recognised[0]
-    matches = [
-        (sum(character not in "*?" for character in pattern), importer)
-        for importer in known
-        for pattern in importer.patterns
-        if fnmatch.fnmatchcase(path.name.lower(), pattern)
-    ]
-    if not matches:
-        choices = "; ".join(f"{importer.name} ({', '.join(importer.patterns)})" for importer in known)
-        raise SceneFileError(f"{path}: is no scene of a known format; the formats are {choices}.")
-    return max(matches, key=lambda match: match[0])[1]
+    for importer in importers():
+        if importer.recognises(head):
+            return importer
+    return _TABLE.by_file_name(path, "is no scene of a known format")
 
 
 def read_scene(
@@ -132,11 +111,3 @@ def _head(path: Path) -> bytes:
             return handle.read(HEAD_BYTES)
     except OSError as error:
         raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
-
-
-@cache
-def _discover() -> None:
-    """Import every module of this package once; those that hold a format register it."""
-    package = __name__.rpartition(".")[0]
-    for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
-        importlib.import_module(f"{package}.{module.name}")

@@ -67,7 +67,7 @@ class CpuTracer:
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
         """Take over ``gaussians`` (kept by reference) and build the hierarchy around them."""
-        self._use_threads()
+        use_threads(self.threads)
         count = len(gaussians)
         if len(self._records) != count:
             self._records = aligned_empty((count, RECORD_WORDS))
@@ -83,7 +83,7 @@ class CpuTracer:
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
         """Read changed parameters without rebuilding; see the protocol."""
         assert self._gaussians is not None, "build first"
-        self._use_threads()
+        use_threads(self.threads)
         if ids is None:
             ids = np.arange(len(self._gaussians), dtype=np.int32)
         refresh_records(self._records, ids, *_parameters(self._gaussians), self.settings.q)
@@ -98,7 +98,7 @@ class CpuTracer:
     ) -> TraceResult:
         """Follow rays; see the protocol. Directions must have unit length."""
         assert self._gaussians is not None, "build first"
-        self._use_threads()
+        use_threads(self.threads)
         count = len(origins_world)
         assert count < MAX_RAYS_PER_TRACE
         origins, directions = contiguous(origins_world), contiguous(directions_world)
@@ -122,13 +122,10 @@ class CpuTracer:
         """Gradients of the raw parameters; see the protocol. ``hits`` must be of the last recording trace."""
         gaussians = self._gaussians
         assert gaussians is not None and self._recorded is hits, "hits of an older trace"
-        self._use_threads()
+        use_threads(self.threads)
         if isinstance(hits, PacketHits):
             return self._packets.backward(hits, gradients, self._records, gaussians, self._features)
         return self._singles.backward(hits, gradients, self._records, gaussians, self._features)
-
-    def _use_threads(self) -> None:
-        use_threads(self.threads)
 
 
 def _parameters(gaussians: FlatGaussians) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

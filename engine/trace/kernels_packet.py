@@ -25,8 +25,8 @@ from engine.trace.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
 
 STACK = 1024
 # --- rows of a block of eight candidates, float64; u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0 ---
-N_X, A_X, B_X, N_0, INNER, ALPHA_0, T_ROW, U_ROW, V_ROW, OUTSIDE = 0, 3, 6, 9, 10, 11, 12, 13, 14, 15
-ROWS = 16
+N_X, A_X, B_X, N_0, INNER, ALPHA_0, T_ROW, U_ROW, V_ROW = 0, 3, 6, 9, 10, 11, 12, 13, 14
+ROWS = 15
 ROW_BYTES, NODE_BYTES, BLOCK_BYTES = ROWS * WIDTH * 8, BOX_ROWS * WIDTH * 4, LEAF_ROWS * WIDTH * 4
 AHEAD = 8
 """Candidates between asking for a record and reading it."""

@@ -70,6 +70,25 @@ def order_ties(pending, head, tail, ids):
         pending[j] = key
 
 
+@njit(error_model="numpy")
+def candidate_arrays(room):
+    """Room for so many candidates, a multiple of eight: as they were found, in order, and of one ray."""
+    return (
+        np.empty(room, np.int32),  # found
+        np.empty(room, np.uint64),  # keys
+        np.empty(room, np.int32),  # ids
+        np.empty(room + 1, np.float32),  # near
+        np.empty(room, np.float32),  # bounds
+        np.empty(room, np.int32),  # cells
+        np.empty(room, np.uint64),  # masks
+        np.empty(room // WIDTH, np.uint64),  # block_rays
+        np.empty((room // WIDTH, ROWS, WIDTH), np.float64),  # rows
+        np.empty(room, np.int32),  # slot_of
+        np.empty(room + WIDTH, np.int32),  # met
+        np.empty(room + WIDTH, np.uint64),  # pending
+    )
+
+
 @njit(fastmath={"contract"}, error_model="numpy")
 def trace_from_counter(
     origins, directions, packets, nodes, level_starts, blocks, order, records, sh, features, eps1, eps2,
@@ -99,18 +118,9 @@ def trace_from_counter(
     ranked = np.empty(RANKED, np.uint64)
     ranks = np.empty(RANKED + WIDTH, np.int64)
     room = 512
-    found = np.empty(room, np.int32)
-    keys = np.empty(room, np.uint64)
-    ids = np.empty(room, np.int32)
-    near = np.empty(room + 1, np.float32)
-    bounds = np.empty(room, np.float32)
-    cells = np.empty(room, np.int32)
-    masks = np.empty(room, np.uint64)
-    block_rays = np.empty(room // WIDTH, np.uint64)
-    rows = np.empty((room // WIDTH, ROWS, WIDTH), np.float64)
-    slot_of = np.empty(room, np.int32)
-    met = np.empty(room + WIDTH, np.int32)
-    pending = np.empty(room + WIDTH, np.uint64)
+    (
+        found, keys, ids, near, bounds, cells, masks, block_rays, rows, slot_of, met, pending,
+    ) = candidate_arrays(room)  # fmt: skip
     while True:
         packet = next_from_counter(counter.ctypes.data)
         if packet >= packet_count:
@@ -128,18 +138,9 @@ def trace_from_counter(
         )  # fmt: skip
         if count > room:
             room = (count * 5 // 4 + WIDTH - 1) // WIDTH * WIDTH
-            found = np.empty(room, np.int32)
-            keys = np.empty(room, np.uint64)
-            ids = np.empty(room, np.int32)
-            near = np.empty(room + 1, np.float32)
-            bounds = np.empty(room, np.float32)
-            cells = np.empty(room, np.int32)
-            masks = np.empty(room, np.uint64)
-            block_rays = np.empty(room // WIDTH, np.uint64)
-            rows = np.empty((room // WIDTH, ROWS, WIDTH), np.float64)
-            slot_of = np.empty(room, np.int32)
-            met = np.empty(room + WIDTH, np.int32)
-            pending = np.empty(room + WIDTH, np.uint64)
+            (
+                found, keys, ids, near, bounds, cells, masks, block_rays, rows, slot_of, met, pending,
+            ) = candidate_arrays(room)  # fmt: skip
             count = gather_candidates(
                 nodes, level_starts, blocks, len(order), planes, frame, below, ox, oy, oz, stack, bins,
                 distances, found, keys, bounds, cells, masks,

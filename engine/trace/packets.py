@@ -15,6 +15,7 @@ from engine.trace.packet_tree import PacketTree
 from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, TraceResult, TraceSettings
 
 MAX_RAYS = 64
+"""Rays of a packet: their set is the bits of one word."""
 SUM_CHUNKS = 16
 LEAST_COSINE = 0.98
 """A packet's rays look this much the way its first ray looks, so that its pyramid is narrow."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import psycopg
 import pytest
-from psycopg.conninfo import make_conninfo
+from postgres_for_tests import copied_database
 
 from workers.queue.embedded_postgres import EmbeddedPostgres
 from workers.queue.errors import DatabaseError
@@ -14,14 +14,9 @@ from workers.queue.migrate import all_steps, migrate, missing_steps, queue_steps
 
 
 @pytest.fixture
-def empty(postgres: EmbeddedPostgres, request: pytest.FixtureRequest) -> Iterator[str]:
-    name = f"empty_{abs(hash(request.node.name)) % 10**9}"
-    admin = make_conninfo(postgres.conninfo(), dbname="postgres")
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"CREATE DATABASE {name}".encode())
-    yield make_conninfo(postgres.conninfo(), dbname=name)
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f"DROP DATABASE {name} WITH (FORCE)".encode())
+def empty(postgres: EmbeddedPostgres) -> Iterator[str]:
+    with copied_database(postgres, "template0") as copied:
+        yield copied
 
 
 def shape(conninfo: str) -> set[tuple[str, ...]]:

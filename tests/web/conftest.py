@@ -9,20 +9,17 @@ import sys
 import time
 import urllib.error
 import urllib.request
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import psycopg
 import pytest
-from psycopg.conninfo import make_conninfo
 
 sys.path.append(str(Path(__file__).parents[1]))
 sys.path.append(str(Path(__file__).parents[1] / "tools"))
 from browser import PLAYWRIGHT, chromium
 from npm_packages import npm_folder
-from postgres_for_tests import postgres, short_root, template
+from postgres_for_tests import copied_database, postgres, short_root, template
 from replay import Replay
 from web_bench import ROOT, Browse, Service, StartService
 
@@ -34,13 +31,8 @@ __all__ = ["postgres", "short_root", "template"]
 @pytest.fixture(scope="module")
 def database(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
     """A database for the tests of one module."""
-    name = f"web_{uuid.uuid4().hex[:12]}"
-    admin = make_conninfo(postgres.conninfo(), dbname="postgres")
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f'CREATE DATABASE "{name}" TEMPLATE "{template}"'.encode())
-    yield make_conninfo(postgres.conninfo(), dbname=name)
-    with psycopg.connect(admin, autocommit=True) as connection:
-        connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
+    with copied_database(postgres, template) as copied:
+        yield copied
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workers.options import quiet_option
+from workers.options import quiet_option, report_option, scenes_output_option
 
 
 @click.command(short_help="A scene that follows a deformed cage or coarse mesh.")
@@ -22,13 +22,7 @@ from workers.options import quiet_option
     metavar="MESH",
     help="The same mesh deformed, or a quoted pattern such as 'frames/*.obj' for a sequence.",
 )
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    required=True,
-    help="The scene to write; for a sequence a pattern such as out/%04d.ply, or a folder.",
-)
+@scenes_output_option
 @click.option(
     "--method",
     type=click.Choice(["nearest", "mvc"]),
@@ -58,9 +52,7 @@ from workers.options import quiet_option
     show_default=True,
     help="Whether the deformed mesh was mirrored; auto looks at it, which a flat mesh cannot show.",
 )
-@click.option(
-    "--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write all counts there."
-)
+@report_option
 @quiet_option
 def deform(
     source: Path,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workers.options import quiet_option
+from workers.options import quiet_option, report_option, scenes_output_option
 
 
 @click.command(short_help="A mesh edited elsewhere back to Gaussians.")
@@ -17,13 +17,7 @@ from workers.options import quiet_option
     metavar="MESH",
     help="The edited mesh (.ply, .obj or .glb), or a quoted pattern such as 'frames/*.ply' for a sequence.",
 )
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    required=True,
-    help="The scene to write; for a sequence a pattern such as out/%04d.ply, or a folder.",
-)
+@scenes_output_option
 @click.option(
     "--method",
     type=click.Choice(["least-squares", "three-point"]),
@@ -56,9 +50,7 @@ from workers.options import quiet_option
     help="Octagons further from an affine image than this many standard deviations are crumpled.  "
     "[default: 1]",
 )
-@click.option(
-    "--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write all counts there."
-)
+@report_option
 @quiet_option
 def edit(
     source: Path,
