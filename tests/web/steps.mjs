@@ -233,9 +233,10 @@ const steps = {
         for (let k = 0; k < 30 && !(await page.evaluate(() => document.activeElement.matches("#view-shown input"))); k++) await page.keyboard.press("Shift+Tab");
         await page.keyboard.press("Home");
         found.cut = await page.evaluate(() => document.activeElement.parentElement.style.getPropertyValue("--cut"));
+        // Listened for well before the key: a chooser that opens while its interception is being set up is lost.
+        const chooser = new Promise((resolve) => page.once("filechooser", resolve));
         await page.goto(`${job.url}/new`);
         await tabTo(() => document.activeElement.matches("label.button"));
-        const chooser = page.waitForEvent("filechooser");
         await page.keyboard.press("Enter");
         found.chooser = (await chooser).isMultiple();
         await tabTo(() => document.activeElement.id === "start", 200);
