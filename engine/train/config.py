@@ -22,15 +22,18 @@ class _Frozen(BaseModel):
 class LearningRates(_Frozen):
     """Sizes of the Adam steps, falling exponentially over the run.
 
-    Means are of the extent and fall to ``mean_final``; all others fall to the fraction ``decay``.
+    The mean's falls to ``mean_final``; all others fall to the fraction ``decay``.
     """
 
-    mean: float = Field(1e-3, gt=0)
-    mean_final: float = Field(1e-5, gt=0)
-    quat: float = Field(8e-3, ge=0)
-    log_scale: float = Field(2e-2, ge=0)
-    opacity: float = Field(0.1, ge=0)
-    colour: float = Field(2.5e-3, ge=0, description="of the display colour; harmonics get it over C0")
+    mean: float = Field(0.14, gt=0)
+    mean_final: float = Field(1.4e-3, gt=0)
+    mean_of: Literal["size", "extent"] = Field(
+        "size", description="unit of the two: the Gaussian's own size, or the scene's extent"
+    )
+    quat: float = Field(0.03, ge=0)
+    log_scale: float = Field(0.04, ge=0)
+    opacity: float = Field(0.2, ge=0)
+    colour: float = Field(1e-2, ge=0, description="of the display colour; harmonics get it over C0")
     sh_rest_ratio: float = Field(0.05, ge=0, description="of the constant harmonic's step")
     decay: float = Field(0.1, gt=0, le=1)
 
@@ -85,10 +88,10 @@ class PaperConfig(_Frozen):
 class TrainConfig(_Frozen):
     """One training run, fully resolved; the defaults are the ``standard`` preset."""
 
-    iterations: int = Field(4000, ge=1)
-    rays: int = Field(32_768, ge=64, description="rays of one iteration")
+    iterations: int = Field(5000, ge=1)
+    rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
-    window_side: int = Field(32, ge=1, description="pixels over which a window's rays are spread")
+    window_side: int = Field(64, ge=1, description="pixels over which a window's rays are spread")
     patch_fraction: float = Field(
         0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM"
     )
@@ -96,7 +99,7 @@ class TrainConfig(_Frozen):
     fit_iterations: int = Field(100, ge=0, description="paper 4.2: fitting before anything is added")
     sh_degree: int = Field(2, ge=0, le=3)
     sh_every: int = Field(400, ge=1, description="iterations between raising the degree")
-    max_gaussians: int = Field(100_000, ge=1)
+    max_gaussians: int = Field(200_000, ge=1)
     initial_points: int = Field(100_000, ge=1, description="most points to begin from")
     lift_pixels: bool = Field(
         True, description="where the sparse model has fewer points, lift pixels of the photographs"
@@ -126,7 +129,6 @@ def preset(name: str) -> TrainConfig:
     if name == "fast":
         return TrainConfig(
             iterations=1000,
-            rays=16_384,
             sh_degree=1,
             sh_every=300,
             max_gaussians=40_000,
@@ -145,7 +147,14 @@ def preset(name: str) -> TrainConfig:
             lift_pixels=False,
             initial_opacity=0.1,
             rates=LearningRates(
-                mean=5e-4, mean_final=3e-6, quat=0.01, log_scale=5e-3, opacity=0.05, colour=1.4e-3, decay=0.1
+                mean=5e-4,
+                mean_final=3e-6,
+                mean_of="extent",
+                quat=0.01,
+                log_scale=5e-3,
+                opacity=0.05,
+                colour=1.4e-3,
+                decay=0.1,
             ),
             loss=LossWeights(l1=0.0, l2=0.8, ssim=0.1),
             trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),

@@ -22,11 +22,14 @@ def adam_step(
     ids, steps, first, second,
     means, quats, log_scales, logits, sh,
     g_means, g_quats, g_log_scales, g_logits, g_sh,
-    rate_mean, rate_quat, rate_log_scale, rate_opacity, rate_sh0, rate_sh_rest,
+    rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rate_sh0, rate_sh_rest,
     opacity_weight, scale_weight, min_log_scale, max_log_scale,
     beta1, beta2, epsilon, mean_steps,
 ):  # fmt: skip
     """One step for the Gaussians ``ids``; each has its own step count for the bias correction.
+
+    ``rate_mean`` is in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric
+    mean of its two scales.
 
     ``opacity_weight`` and ``scale_weight`` add the gradients of their regularisers. ``mean_steps`` receives
     each mean's step, world units.
@@ -38,22 +41,15 @@ def adam_step(
         c1 = 1.0 / (1.0 - beta1 ** steps[i])
         c2 = 1.0 / (1.0 - beta2 ** steps[i])
         column = 0
+        rate = rate_mean
+        if mean_by_size:
+            rate *= math.exp(0.5 * (np.float64(log_scales[i, 0]) + np.float64(log_scales[i, 1])))
         for axis in range(3):
             old = np.float64(means[i, axis])
             new = _update(
-                old,
-                np.float64(g_means[k, axis]),
-                first,
-                second,
-                i,
-                column,
-                rate_mean,
-                c1,
-                c2,
-                beta1,
-                beta2,
-                epsilon,
-            )
+                old, np.float64(g_means[k, axis]),
+                first, second, i, column, rate, c1, c2, beta1, beta2, epsilon,
+            )  # fmt: skip
             means[i, axis] = new
             mean_steps[k, axis] = new - old
             column += 1

@@ -87,13 +87,14 @@ class Adam:
         hit = max(1, len(gradients.ids))
         decay = rates.decay**progress
         colour = rates.colour / SH_C0 * decay
+        mean_unit = extent if rates.mean_of == "extent" else 1.0
         adam_step(
             gradients.ids, self.steps, self.first, self.second,
             gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales,
             gaussians.opacity_logits, gaussians.sh,
             gradients.means_world, gradients.quats_wxyz, gradients.log_scales,
             gradients.opacity_logits, gradients.sh,
-            extent * rates.mean * (rates.mean_final / rates.mean) ** progress,
+            mean_unit * rates.mean * (rates.mean_final / rates.mean) ** progress, rates.mean_of == "size",
             rates.quat * decay, rates.log_scale * decay, rates.opacity * decay,
             colour, colour * rates.sh_rest_ratio,
             loss.opacity / hit, loss.scale / (2 * hit * extent),

@@ -1,5 +1,7 @@
 """Adam: that of torch where every Gaussian is hit, and hands off the others."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
@@ -38,8 +40,8 @@ def gradients(of: FlatGaussians, ids: np.ndarray, rng: np.random.Generator) -> G
 def test_like_torch_when_all_are_hit() -> None:
     rng = np.random.default_rng(1)
     ours, extent = gaussians(50), 2.0
-    rates = LearningRates(mean=1e-3, mean_final=1e-3, quat=2e-3, log_scale=3e-3, opacity=4e-2, colour=5e-3,
-                          sh_rest_ratio=0.1, decay=1.0)  # fmt: skip
+    rates = LearningRates(mean=1e-3, mean_final=1e-3, mean_of="extent", quat=2e-3, log_scale=3e-3,
+                          opacity=4e-2, colour=5e-3, sh_rest_ratio=0.1, decay=1.0)  # fmt: skip
     colour = rates.colour / SH_C0
     leaves = {name: torch.tensor(getattr(ours, name), dtype=torch.float64) for name in NAMES}
     leaves["sh0"], leaves["sh_rest"] = leaves["sh"][:, :1].clone(), leaves.pop("sh")[:, 1:].clone()
@@ -104,24 +106,27 @@ def test_first_step_is_the_rate_whatever_the_gradient() -> None:
         ours, gradients(ours, np.array([9]), np.random.default_rng(0)), rates, NO_LOSS, progress=0, extent=3
     )
     step = np.abs(ours.means_world[9] - before.means_world[9])
-    np.testing.assert_allclose(step, 3 * rates.mean, rtol=1e-2)
+    size = np.exp(before.log_scales[9].mean())
+    np.testing.assert_allclose(step, size * rates.mean, rtol=1e-2)
 
 
-def test_rate_of_the_means_falls_exponentially() -> None:
-    rates = LearningRates()
+@pytest.mark.parametrize("unit", ["size", "extent"])
+def test_rate_of_the_means_falls_exponentially(unit: Literal["size", "extent"]) -> None:
+    rates = LearningRates(mean_of=unit)
     for progress in (0.0, 0.5, 1.0):
         ours = gaussians(5)
         adam = Adam.fresh(ours)
+        lengths = np.exp(ours.log_scales.mean(axis=1)) if unit == "size" else np.full(5, 2.0)
         moved = adam.step(
             ours,
             gradients(ours, np.arange(5), np.random.default_rng(0)),
             rates,
             NO_LOSS,
             progress=progress,
-            extent=1,
+            extent=2,
         )
-        expected = rates.mean * (rates.mean_final / rates.mean) ** progress
-        np.testing.assert_allclose(np.abs(moved), expected, rtol=1e-5)
+        expected = lengths * rates.mean * (rates.mean_final / rates.mean) ** progress
+        np.testing.assert_allclose(np.abs(moved), np.tile(expected[:, None], 3), rtol=1e-5)
 
 
 @pytest.mark.parametrize("term", ["opacity", "scale"])

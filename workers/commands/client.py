@@ -54,7 +54,7 @@ def connected(server: str | None) -> Iterator["Api"]:
 @click.option("--iterations", type=int, metavar="N", help="Iterations of the training.")
 @click.option(
     "--set", "assignments", multiple=True, metavar="NAME=VALUE",
-    help="Any setting, e.g. test_every=10 or train.rates.mean=2e-4; may be repeated.",
+    help="Any setting, e.g. test_every=10 or train.rates.quat=0.02; may be repeated.",
 )  # fmt: skip
 @click.option("--label", help="What to call the job.")
 @click.option("--queue", default="cpu", show_default=True, help="Which workers.")
@@ -187,7 +187,7 @@ def _options(given: dict[str, Any]) -> dict[str, Any]:
     for assignment in given["assignments"]:
         name, equals, text = assignment.partition("=")
         if not equals:
-            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. train.rates.mean=2e-4.")
+            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. train.rates.quat=0.02.")
         try:
             value = json.loads(text)
         except ValueError:
