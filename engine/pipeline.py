@@ -38,7 +38,7 @@ from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
 from engine.threads import use_threads
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
-from engine.train.config import TrainConfig
+from engine.train.config import TrainConfig, most_gaussians
 from engine.train.dense_points import dense_points
 from engine.train.initialise import from_points, from_rays
 from engine.train.trainer import Trainer, fresh_state, trace_settings
@@ -288,9 +288,9 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1
     """The first Gaussians: on the sparse points, or on random rays where there are too few of them."""
     rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
     points = dataset.points
+    limit = min(config.initial_points, most_gaussians(config, dataset.train_pixel_count))
     if len(points.xyz_world) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
-        limit = min(config.initial_points, config.max_gaussians)
         xyz, rgb = points.xyz_world, points.rgb_srgb
         if config.lift_pixels and len(xyz) < limit:
             more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng, threads=threads)
@@ -304,7 +304,7 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1
             opacity=config.initial_opacity,
             rng=rng,
         )
-    view, y, x = dataset.sample_pixels(rng, min(config.initial_points, config.max_gaussians))
+    view, y, x = dataset.sample_pixels(rng, limit)
     origins, directions = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     seen = (weight > 0) & (alpha > 0)

@@ -64,6 +64,11 @@ class PixelSampler:
         """Shortest side of any view."""
         return int(self._sizes.min())
 
+    @property
+    def longest_side_px(self) -> int:
+        """Longest side of any view."""
+        return int(self._sizes.max())
+
     def pixels(
         self, rng: np.random.Generator, count: int
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
@@ -86,7 +91,7 @@ class PixelSampler:
         which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
         width, height = self._sizes[which].T
         cells = math.isqrt(rays)
-        cell = max(1, side // cells)
+        cell = max(1, round(side / cells))
         rows, columns = np.divmod(np.arange(rays), cells)
         left = rng.integers(-(cell * cells // 2), width - cell * cells // 2)
         top = rng.integers(-(cell * cells // 2), height - cell * cells // 2)

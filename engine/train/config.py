@@ -91,7 +91,11 @@ class TrainConfig(_Frozen):
     iterations: int = Field(5000, ge=1)
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
-    window_side: int = Field(64, ge=1, description="pixels over which a window's rays are spread")
+    window_side: int = Field(
+        0,
+        ge=0,
+        description="pixels that a window spans; 0: a fifteenth of the views' longest side",
+    )
     patch_fraction: float = Field(
         0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM"
     )
@@ -99,7 +103,9 @@ class TrainConfig(_Frozen):
     fit_iterations: int = Field(100, ge=0, description="paper 4.2: fitting before anything is added")
     sh_degree: int = Field(2, ge=0, le=3)
     sh_every: int = Field(400, ge=1, description="iterations between raising the degree")
-    max_gaussians: int = Field(200_000, ge=1)
+    max_gaussians: int = Field(
+        0, ge=0, description="0: one for each 50 pixels of the training views, 10,000 to 200,000"
+    )
     initial_points: int = Field(100_000, ge=1, description="most points to begin from")
     lift_pixels: bool = Field(
         True, description="where the sparse model has fewer points, lift pixels of the photographs"
@@ -118,6 +124,19 @@ class TrainConfig(_Frozen):
     checkpoint_every: int = Field(500, ge=1, description="rounded up to a multiple of rebuild_every")
     probe_rays: int = Field(16_384, ge=256, description="fixed training rays that choose the best checkpoint")
     seed: int = Field(0, ge=0)
+
+
+def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
+    """``config.max_gaussians``, or where that is 0 what so many pixels of training views can hold down."""
+    return config.max_gaussians or min(max(training_pixels // 50, 10_000), 200_000)
+
+
+def window_side_px(config: TrainConfig, longest_side_px: int) -> int:
+    """``config.window_side``, or where that is 0 a fifteenth of the longest side of the training views.
+
+    A window is to cover a small angle, so that its rays meet the same Gaussians.
+    """
+    return config.window_side or max(1, round(longest_side_px / 15))
 
 
 def preset(name: str) -> TrainConfig:

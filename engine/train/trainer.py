@@ -18,7 +18,7 @@ from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceGradients, Tracer, TraceSettings
 from engine.train.batches import Batch, Pixels, PixelSampler, draw_batch
 from engine.train.checkpoint import TrainState, load_best, save_best, save_checkpoint
-from engine.train.config import TrainConfig
+from engine.train.config import TrainConfig, most_gaussians, window_side_px
 from engine.train.densify import make_densifier
 from engine.train.losses import pixel_loss, ssim_loss
 from engine.train.optimiser import Adam
@@ -100,7 +100,9 @@ class Trainer:
         sizes_px = np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)
         self._sampler = PixelSampler(dataset.train_indices, sizes_px)
         self._densifier = make_densifier(
-            config.densify, iterations=config.iterations, max_gaussians=config.max_gaussians
+            config.densify,
+            iterations=config.iterations,
+            max_gaussians=most_gaussians(config, self._sampler.pixel_count),
         )
         if state.densifier:
             self._densifier.restore(state.densifier)
@@ -188,7 +190,7 @@ class Trainer:
             state.rng,
             rays=config.rays,
             window_rays=config.window_rays,
-            window_side=config.window_side,
+            window_side=window_side_px(config, self._sampler.longest_side_px),
             patch_fraction=config.patch_fraction if config.loss.ssim > 0 else 0.0,
             side=config.patch_side,
         )
