@@ -53,7 +53,7 @@ _HELPS = {
     "poses": "Where the camera poses come from.",
     "max_side": "Photographs are shrunk to this; empty keeps their size.",
     "train.iterations": "More takes longer and gets sharper.",
-    "train.max_gaussians": "More shows finer detail and makes larger files.",
+    "train.max_gaussians": "More shows finer detail and makes larger files; 0 asks the photographs' pixels.",
     "train.sh_degree": "How much colours may change with the direction of view: 0 not at all.",
 }
 """For settings that most people meet, words that need no other page."""

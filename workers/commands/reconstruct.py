@@ -25,7 +25,9 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet")
 @click.option("--max-side", type=int, metavar="PX", help="Shrink photographs to this longer side.")
 @click.option("--iterations", type=int, metavar="N", help="Iterations of the training.")
 @click.option("--rays", type=int, metavar="N", help="Rays of one iteration.")
-@click.option("--max-gaussians", type=int, metavar="N", help="Most Gaussians.")
+@click.option(
+    "--max-gaussians", type=int, metavar="N", help="Most Gaussians; 0 for one per 50 pixels, up to 200,000."
+)
 @click.option(
     "--sh-degree", type=click.IntRange(0, 3), help="Degree of the spherical harmonics of the colours."
 )
