@@ -99,6 +99,7 @@ class Trainer:
         )
         sizes_px = np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)
         self._sampler = PixelSampler(dataset.train_indices, sizes_px)
+        self._window_side_px = window_side_px(config, self._sampler.longest_side_px)
         self._densifier = make_densifier(
             config.densify,
             iterations=config.iterations,
@@ -190,7 +191,7 @@ class Trainer:
             state.rng,
             rays=config.rays,
             window_rays=config.window_rays,
-            window_side=window_side_px(config, self._sampler.longest_side_px),
+            window_side=self._window_side_px,
             patch_fraction=config.patch_fraction if config.loss.ssim > 0 else 0.0,
             side=config.patch_side,
         )
