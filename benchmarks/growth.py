@@ -131,7 +131,7 @@ def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--largest", type=int, default=1_000_000)
-    parser.add_argument("--iterations", type=int, default=50)
+    parser.add_argument("--iterations", type=int, default=160)
     options = parser.parse_args()
     counts = [n for n in (SMALLEST, 100_000, 1_000_000) if n <= options.largest]
     print("Gaussians   image: fwd  bwd us/ray  hits   window: fwd  bwd us/ray  hits   iteration ms")

@@ -38,7 +38,7 @@ from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
 from engine.threads import use_threads
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
-from engine.train.config import TrainConfig, most_gaussians
+from engine.train.config import TrainConfig, iteration_count, most_gaussians
 from engine.train.dense_points import dense_points
 from engine.train.initialise import from_points, from_rays
 from engine.train.trainer import Trainer, fresh_state, trace_settings
@@ -98,7 +98,10 @@ def reconstruct(
                 raise
             write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
         if not (output / SCENE).exists():
-            with _stage("train", tell, config.train.iterations):
+            pixels = sum(
+                dataset.views[i].width_px * dataset.views[i].height_px for i in dataset.train_indices
+            )
+            with _stage("train", tell, iteration_count(config.train, pixels)):
                 gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
                 write_gaussian_ply(gaussians, output / SCENE)
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():

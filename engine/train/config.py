@@ -88,7 +88,11 @@ class PaperConfig(_Frozen):
 class TrainConfig(_Frozen):
     """One training run, fully resolved; the defaults are the ``standard`` preset."""
 
-    iterations: int = Field(5000, ge=1)
+    iterations: int = Field(
+        0,
+        ge=0,
+        description="0: three rays for each pixel of the training views, in thousands, 5,000 to 12,000",
+    )
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
     window_side: int = Field(
@@ -119,11 +123,21 @@ class TrainConfig(_Frozen):
     trace: TraceSettings = TraceSettings(t_min=0.0)
     near: float = Field(0.01, ge=0, description="nearest distance at which a Gaussian is seen, of the extent")
     densify: McmcConfig | PaperConfig = Field(McmcConfig(), discriminator="kind")
-    rebuild_every: int = Field(25, ge=1, description="iterations between rebuilds of the hierarchy")
+    rebuild_every: int = Field(
+        25, ge=1, description="iterations between rebuilds of the hierarchy of up to 500,000 Gaussians"
+    )
     box_padding: float = Field(0.1, ge=0)
     checkpoint_every: int = Field(500, ge=1, description="rounded up to a multiple of rebuild_every")
     probe_rays: int = Field(16_384, ge=256, description="fixed training rays that choose the best checkpoint")
     seed: int = Field(0, ge=0)
+
+
+def iteration_count(config: TrainConfig, training_pixels: int) -> int:
+    """``config.iterations``, or where that is 0 three rays for each pixel, in whole thousands.
+
+    Large scenes learn as long as there is something to see; small ones are done after 5,000.
+    """
+    return config.iterations or min(max(round(3 * training_pixels / config.rays / 1000), 5), 12) * 1000
 
 
 def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
@@ -137,6 +151,14 @@ def window_side_px(config: TrainConfig, longest_side_px: int) -> int:
     A window is to cover a small angle, so that its rays meet the same Gaussians.
     """
     return config.window_side or max(1, round(longest_side_px / 15))
+
+
+def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
+    """Iterations between rebuilds of the hierarchy: ``rebuild_every``, as much again for each half million.
+
+    A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
+    """
+    return config.rebuild_every * (1 + gaussians // 500_000)
 
 
 def preset(name: str) -> TrainConfig:

@@ -18,7 +18,13 @@ from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceGradients, Tracer, TraceSettings
 from engine.train.batches import Batch, Pixels, PixelSampler, draw_batch
 from engine.train.checkpoint import TrainState, load_best, save_best, save_checkpoint
-from engine.train.config import TrainConfig, most_gaussians, window_side_px
+from engine.train.config import (
+    TrainConfig,
+    iteration_count,
+    most_gaussians,
+    rebuild_interval,
+    window_side_px,
+)
 from engine.train.densify import make_densifier
 from engine.train.losses import pixel_loss, ssim_loss
 from engine.train.optimiser import Adam
@@ -100,10 +106,10 @@ class Trainer:
         sizes_px = np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)
         self._sampler = PixelSampler(dataset.train_indices, sizes_px)
         self._window_side_px = window_side_px(config, self._sampler.longest_side_px)
+        pixels = self._sampler.pixel_count
+        self.iterations = iteration_count(config, pixels)
         self._densifier = make_densifier(
-            config.densify,
-            iterations=config.iterations,
-            max_gaussians=most_gaussians(config, self._sampler.pixel_count),
+            config.densify, iterations=self.iterations, max_gaussians=most_gaussians(config, pixels)
         )
         if state.densifier:
             self._densifier.restore(state.densifier)
@@ -124,17 +130,17 @@ class Trainer:
             Cancelled: stopped as asked; a checkpoint is on disk.
         """
         state, config = self.state, self._config
-        total = config.iterations
+        total = self.iterations
         rebuild = True
         began = time.perf_counter()
         started_at, started_seconds = state.iteration, state.seconds
         while True:
-            if state.iteration % config.rebuild_every == 0 or state.iteration == total:
+            scheduled = state.iteration % self._every == 0 or state.iteration == total
+            if scheduled or state.iteration % rebuild_interval(config, len(state.gaussians)) == 0:
                 self._raise_degree()
                 self._tracer.build(state.gaussians)
                 rebuild = False
                 stop = self._should_stop() and state.iteration < total
-                scheduled = state.iteration % self._every == 0 or state.iteration == total
                 if stop or scheduled:
                     state.seconds += time.perf_counter() - began
                     if state.iteration > started_at or state.iteration == 0:
@@ -218,7 +224,7 @@ class Trainer:
                 rgb_srgb=gradient, transmittance=gradient @ background, ray_errors=pixel.ray_errors
             ),
         )
-        progress = state.iteration / config.iterations
+        progress = state.iteration / self.iterations
         moved = state.adam.step(
             state.gaussians, gradients, config.rates, config.loss, progress=progress, extent=self._extent
         )

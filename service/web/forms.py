@@ -52,7 +52,7 @@ _HELPS = {
     "preset": "fast is a first look, standard is better, paper has the published settings and is slow.",
     "poses": "Where the camera poses come from.",
     "max_side": "Photographs are shrunk to this; empty keeps their size.",
-    "train.iterations": "More takes longer and gets sharper.",
+    "train.iterations": "More takes longer and gets sharper; 0 asks the photographs' pixels.",
     "train.max_gaussians": "More shows finer detail and makes larger files; 0 asks the photographs' pixels.",
     "train.sh_degree": "How much colours may change with the direction of view: 0 not at all.",
 }

@@ -2,7 +2,14 @@
 
 import pytest
 
-from engine.train.config import TrainConfig, most_gaussians, preset, window_side_px
+from engine.train.config import (
+    TrainConfig,
+    iteration_count,
+    most_gaussians,
+    preset,
+    rebuild_interval,
+    window_side_px,
+)
 
 
 @pytest.mark.parametrize(
@@ -18,3 +25,24 @@ def test_most_gaussians_follow_the_pixels(pixels: int, count: int) -> None:
 def test_windows_follow_the_size_of_the_views(longest_px: int, side_px: int) -> None:
     assert window_side_px(TrainConfig(), longest_px) == side_px
     assert window_side_px(TrainConfig(window_side=20), longest_px) == 20
+
+
+@pytest.mark.parametrize(
+    ("pixels", "count"),
+    [(1_000, 5000), (22_000_000, 5000), (30_100_000, 6000), (46_900_000, 9000), (10**9, 12_000)],
+)
+def test_large_scenes_train_longer(pixels: int, count: int) -> None:
+    assert iteration_count(TrainConfig(), pixels) == count
+    assert iteration_count(TrainConfig(iterations=7), pixels) == 7
+    assert iteration_count(preset("fast"), pixels) == 1000
+    assert iteration_count(preset("paper"), pixels) == 10_000
+
+
+def test_more_rays_an_iteration_want_fewer_iterations() -> None:
+    assert iteration_count(TrainConfig(rays=32_768), 100_000_000) == 9000
+
+
+@pytest.mark.parametrize(("gaussians", "iterations"), [(499_999, 25), (500_000, 50), (1_000_000, 75)])
+def test_large_hierarchies_are_rebuilt_less_often(gaussians: int, iterations: int) -> None:
+    assert rebuild_interval(TrainConfig(), gaussians) == iterations
+    assert rebuild_interval(TrainConfig(rebuild_every=10), gaussians) == 10 * iterations // 25

@@ -1,0 +1,221 @@
+"""Ways to give flat Gaussians to Embree, and colours of half the size, on the same rays.
+
+    python benchmarks/embree_geometry.py [scene.ply]
+
+The tracer gives Embree one box a Gaussian and tests the octagon in a callback. Here the same callback is
+reached through one instance a Gaussian of a single unit box, and the hierarchy is refitted to moved Gaussians
+instead of built anew. Then packets read their harmonics as 16-bit numbers instead of float32, as storage of
+half the size would have them. Forward passes of 65,536 rays, two threads, in turn; medians are printed.
+"""
+
+import argparse
+import ctypes
+import gc
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numba import carray, cfunc, njit, types
+from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
+
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.octagon import octagon_radii
+from engine.gaussians.order import morton_order
+from engine.importers import read_scene
+from engine.trace.arrays import aligned_empty
+from engine.trace.embree_library import Handle
+from engine.trace.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon
+from engine.trace.kernels_native import int32_pointer
+from engine.trace.kernels_records import write_boxes, write_records
+from engine.trace.packets import PacketTracer, find_packets
+from engine.trace.single_rays import SingleRayTracer
+
+THREADS, REPEATS = 2, 7
+INSTANCE, REFIT, FLOAT3X4_COLUMN_MAJOR = 121, 3, 0x9234
+SH_STEP = 1 / 4096
+THICKNESS = 1e-6
+
+meet = njit(intersect_octagon._pyfunc, fastmath={"contract"})
+
+
+@cfunc(types.void(types.CPointer(types.uint64)), fastmath={"contract"})
+def intersect_instance(arguments):
+    """The octagon's callback, with the instance's number in place of the primitive's."""
+    words = carray(arguments, 6)
+    words[2] = np.uint64(carray(int32_pointer(words[3]), CONTEXT_WORDS)[0])
+    meet(arguments)
+
+
+@dataclass
+class Boxes:
+    """The scene as the tracer takes it."""
+
+    gaussians: FlatGaussians
+    records: np.ndarray
+    boxes: np.ndarray
+
+
+def prepare(gaussians: FlatGaussians) -> Boxes:
+    """Records and boxes of the Gaussians."""
+    parameters = (
+        gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales, gaussians.opacity_logits,
+    )  # fmt: skip
+    records = aligned_empty((len(gaussians), RECORD_WORDS))
+    boxes = np.empty((len(gaussians), 6), np.float32)
+    write_records(records, *parameters, SETTINGS.q)
+    write_boxes(boxes, *parameters, SETTINGS.q, 0.0)
+    return Boxes(gaussians, records, boxes)
+
+
+class Instances(SingleRayTracer):
+    """Single rays through one instance a Gaussian of the box around a unit octagon."""
+
+    def build_instances(self, gaussians: FlatGaussians) -> None:
+        """Build both levels."""
+        self._unit = np.array([[-1, -1, -1, 1, 1, 1]], np.float32)
+        self.build(self._unit)
+        assert self._scene is not None
+        lib, device = self._device._lib, self._device
+        lib.rtcSetGeometryInstancedScene.argtypes = [Handle, Handle]
+        lib.rtcSetGeometryTransform.argtypes = [Handle, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
+        lib.rtcGetGeometry.restype, lib.rtcGetGeometry.argtypes = Handle, [Handle, ctypes.c_uint]
+        inner = lib.rtcGetGeometry(self._scene.handle, 0)
+        lib.rtcSetGeometryIntersectFunction(inner, intersect_instance.address)
+        lib.rtcCommitGeometry(inner)
+        lib.rtcCommitScene(self._scene.handle)
+        radius = octagon_radii(gaussians.opacities, SETTINGS.q)[:, None]
+        axes = gaussians.rotations.astype(np.float64)  # columns: normal, u, v
+        half = np.concatenate([np.full((len(gaussians), 1), THICKNESS), radius * gaussians.scales], axis=1)
+        columns = (axes * half[:, None, :]).transpose(0, 2, 1)
+        transforms = np.concatenate([columns, gaussians.means_world[:, None, :]], axis=1)
+        transforms = np.ascontiguousarray(transforms, np.float32)
+        top = lib.rtcNewScene(device.handle)
+        lib.rtcSetSceneBuildQuality(top, 1)
+        for row in range(len(gaussians)):
+            geometry = lib.rtcNewGeometry(device.handle, INSTANCE)
+            lib.rtcSetGeometryInstancedScene(geometry, self._scene.handle)
+            address = transforms.ctypes.data + row * transforms.strides[0]
+            lib.rtcSetGeometryTransform(geometry, 0, FLOAT3X4_COLUMN_MAJOR, address)
+            lib.rtcCommitGeometry(geometry)
+            lib.rtcAttachGeometry(top, geometry)
+            lib.rtcReleaseGeometry(geometry)
+        lib.rtcCommitScene(top)
+        device.check("building the instances")
+        self._bottom, self._scene.handle = self._scene.handle, top
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Wall time of one call."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def medians(works: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """Median milliseconds of each, taken in turn after one warm-up."""
+    for work in works.values():
+        work()
+    taken = {name: [] for name in works}
+    for _ in range(REPEATS):
+        for name, work in works.items():
+            taken[name].append(1e3 * seconds(work))
+    return {name: float(np.median(values)) for name, values in taken.items()}
+
+
+def resident_mb() -> float:
+    """Memory of this process now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
+    """Boxes against instances; a new hierarchy against a refitted one."""
+    count = len(scene.gaussians)
+    none = np.empty((count, 0), np.float32)
+    boxes = SingleRayTracer(SETTINGS, threads=THREADS, build_quality=1)
+    instances = Instances(SETTINGS, threads=THREADS, build_quality=1)
+    gc.collect()
+    before = resident_mb()
+    build_boxes = 1e3 * seconds(lambda: boxes.build(scene.boxes))
+    between = resident_mb()
+    build_instances = 1e3 * seconds(lambda: instances.build_instances(scene.gaussians))
+    after = resident_mb()
+
+    def trace(tracer: SingleRayTracer) -> Callable[[], object]:
+        return lambda: tracer.trace(origins, directions, scene.records, scene.gaussians, none, record=False)
+
+    same = boxes.trace(origins, directions, scene.records, scene.gaussians, none, record=False)
+    other = instances.trace(origins, directions, scene.records, scene.gaussians, none, record=False)
+    apart = float(np.abs(same.rgb_srgb - other.rgb_srgb).max())
+    print(f"{count} Gaussians, {same.hit_counts.mean():.1f} hits a ray; pictures apart by {apart:.1e}")
+    took = medians({"boxes": trace(boxes), "instances": trace(instances)})
+    for name, build, memory in (
+        ("boxes", build_boxes, between - before),
+        ("instances", build_instances, after - between),
+    ):
+        print(f"  {name:10s} forward {took[name]:7.1f} ms  build {build:7.1f} ms  {memory:6.1f} MB")
+
+    lib, handle = boxes._device._lib, boxes._scene.handle
+    inner = lib.rtcGetGeometry(handle, 0)
+    lib.rtcSetGeometryBuildQuality(inner, REFIT)
+
+    def refit() -> None:
+        lib.rtcCommitGeometry(inner)
+        lib.rtcCommitScene(handle)
+
+    rng = np.random.default_rng(0)
+    size = np.exp(scene.gaussians.log_scales).mean()
+    anew = SingleRayTracer(SETTINGS, threads=THREADS, build_quality=1)
+    for moved in (0.1, 0.5, 2.0):
+        scene.gaussians.means_world += moved * size * rng.normal(size=(count, 3)).astype(np.float32)
+        fresh = prepare(scene.gaussians)
+        scene.boxes[:], scene.records[:] = fresh.boxes, fresh.records
+        refitted, rebuilt = 1e3 * seconds(refit), 1e3 * seconds(partial(anew.build, scene.boxes))
+        took = medians({"refitted": trace(boxes), "rebuilt": trace(anew)})
+        print(
+            f"  moved by {moved} of their size: refit {refitted:.1f} ms, forward {took['refitted']:.1f} ms;"
+            f" rebuilt {rebuilt:.1f} ms, forward {took['rebuilt']:.1f} ms"
+        )
+
+
+def storage(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
+    """Packets whose harmonics are float32 or 16-bit integers; the kernels take both."""
+    g = scene.gaussians
+    rng = np.random.default_rng(0)
+    sh = (0.1 * rng.normal(size=(len(g), 9, 3))).astype(np.float32)
+    sh[:, 0] = g.sh[:, 0]
+    small = np.round(sh / SH_STEP).astype(np.int16)
+    tracer = PacketTracer(SETTINGS, threads=THREADS)
+    tracer.build(scene.records, 0.0)
+    packets = find_packets(origins, directions)
+    none = np.empty((len(g), 0), np.float32)
+
+    def trace(harmonics: np.ndarray) -> Callable[[], object]:
+        held = FlatGaussians(g.means_world, g.quats_wxyz, g.log_scales, g.opacity_logits, sh)
+        held.sh = harmonics
+        return lambda: tracer.trace(origins, directions, packets, scene.records, held, none, record=False)
+
+    took = medians({"float32": trace(sh), "int16": trace(small)})
+    print(f"  packets, harmonics as float32 {took['float32']:.1f} ms, as 16 bits {took['int16']:.1f} ms")
+
+
+def main() -> None:
+    """Measure a generated cloud of 100,000 and one of 1,000,000, or a scene."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("scene", nargs="?", type=Path)
+    options = parser.parse_args()
+    scenes = [read_scene(options.scene)[0]] if options.scene else [cloud(100_000), cloud(1_000_000)]
+    for gaussians in scenes:
+        ordered = gaussians.select(morton_order(gaussians.means_world))
+        origins, directions = camera_rays(ordered)
+        storage(prepare(ordered), origins, directions)
+        if len(ordered) <= 200_000:
+            geometry(prepare(ordered), origins, directions)
+
+
+if __name__ == "__main__":
+    main()
