@@ -37,6 +37,7 @@ class Batch:
     rgb_srgb: Float32[np.ndarray, "r 3"]
     alpha: Float32[np.ndarray, " r"]
     weight: Float32[np.ndarray, " r"]
+    view: Int64[np.ndarray, " r"]
     patches: int
     side: int
 
@@ -152,4 +153,4 @@ def draw_batch(
         view, y, x = (np.concatenate(pair) for pair in zip((view, y, x), extra, strict=True))
     origins, directions = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
-    return Batch(origins, directions, rgb, alpha, weight, patches, side)
+    return Batch(origins, directions, rgb, alpha, weight, view, patches, side)

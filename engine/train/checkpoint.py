@@ -12,6 +12,7 @@ import numpy as np
 from engine.errors import CheckpointError, DamagedCheckpoint
 from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
+from engine.train.exposure import Exposures
 from engine.train.optimiser import Adam
 
 FORMAT = 1
@@ -38,6 +39,7 @@ class TrainState:
         running_mse: smoothed squared error of the training rays.
         best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
         best_iteration: when that was.
+        exposures: those of the views, where they are learnt.
     """
 
     iteration: int
@@ -49,6 +51,7 @@ class TrainState:
     running_mse: float = 0.0
     best_psnr: float = -np.inf
     best_iteration: int = 0
+    exposures: Exposures | None = None
 
 
 def checkpoint_path(folder: Path, iteration: int) -> Path:
@@ -83,6 +86,8 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     arrays = {f"gaussians.{f.name}": getattr(state.gaussians, f.name) for f in fields(FlatGaussians)}
     arrays |= {f"adam.{f.name}": getattr(state.adam, f.name) for f in fields(Adam)}
     arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
+    if state.exposures is not None:
+        arrays |= {f"exposures.{f.name}": getattr(state.exposures, f.name) for f in fields(Exposures)}
     meta["arrays"] = sorted(arrays)
     with replacing(path) as temporary:
         np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
@@ -105,7 +110,8 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         meta = json.loads(str(arrays.pop("meta")))
         if sorted(arrays) != meta.get("arrays", sorted(arrays)):
             raise ValueError("arrays are missing")
-        groups: dict[str, dict[str, np.ndarray]] = {"gaussians": {}, "adam": {}, "densifier": {}}
+        names = ("gaussians", "adam", "densifier", "exposures")
+        groups: dict[str, dict[str, np.ndarray]] = {name: {} for name in names}
         for name, array in arrays.items():
             group, _, key = name.partition(".")
             groups[group][key] = array
@@ -130,6 +136,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         running_mse=meta["running_mse"],
         best_psnr=-np.inf if meta["best_psnr"] is None else meta["best_psnr"],
         best_iteration=meta["best_iteration"],
+        exposures=Exposures(**groups["exposures"]) if groups["exposures"] else None,
     )
 
 

@@ -35,6 +35,7 @@ class LearningRates(_Frozen):
     opacity: float = Field(0.2, ge=0)
     colour: float = Field(1e-2, ge=0, description="of the display colour; harmonics get it over C0")
     sh_rest_ratio: float = Field(0.05, ge=0, description="of the constant harmonic's step")
+    exposure: float = Field(2e-3, ge=0, description="of the views' log gains and offsets, where learnt")
     decay: float = Field(0.1, gt=0, le=1)
 
 
@@ -117,6 +118,9 @@ class TrainConfig(_Frozen):
     initial_opacity: float = Field(0.5, gt=0, lt=1)
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="behind everything; auto is random for photographs with alpha, else black"
+    )
+    exposure: bool = Field(
+        False, description="learn a gain and an offset for each channel of each training view"
     )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()

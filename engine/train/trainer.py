@@ -26,6 +26,7 @@ from engine.train.config import (
     window_side_px,
 )
 from engine.train.densify import make_densifier
+from engine.train.exposure import Exposures
 from engine.train.losses import pixel_loss, ssim_loss
 from engine.train.optimiser import Adam
 
@@ -111,6 +112,8 @@ class Trainer:
         self._densifier = make_densifier(
             config.densify, iterations=self.iterations, max_gaussians=most_gaussians(config, pixels)
         )
+        if config.exposure and state.exposures is None:
+            state.exposures = Exposures.neutral(len(dataset.views))
         if state.densifier:
             self._densifier.restore(state.densifier)
         self._every = -(-config.checkpoint_every // config.rebuild_every) * config.rebuild_every
@@ -205,7 +208,10 @@ class Trainer:
         seen = self._tracer.trace(batch.origins_world, batch.directions_world, record=True)
         assert seen.hits is not None
         self._hits_per_ray = float(seen.hit_counts.mean())
-        render = seen.rgb_srgb + seen.transmittance[:, None] * background
+        rgb, alpha, exposures = seen.rgb_srgb, seen.alpha, state.exposures
+        if exposures is not None:
+            rgb = exposures.develop(batch.view, rgb, alpha)
+        render = rgb + seen.transmittance[:, None] * background
         target = _composite(batch, background)
         pixel = pixel_loss(render, target, batch.weight, l1=config.loss.l1, l2=config.loss.l2)
         loss, gradient = pixel.value, pixel.gradient
@@ -218,13 +224,17 @@ class Trainer:
                 f"The loss became {loss} at iteration {state.iteration + 1}; lower the learning rates "
                 "(--set rates.mean=...) or look for damaged photographs. The last checkpoint is kept."
             )
+        progress = state.iteration / self.iterations
+        by_rgb, by_transmittance = gradient, gradient @ background
+        if exposures is not None:
+            by_rgb, by_alpha = exposures.undevelop(batch.view, gradient)
+            by_transmittance = by_transmittance - by_alpha
+            rate = config.rates.exposure * config.rates.decay**progress
+            exposures.step(batch.view, seen.rgb_srgb, alpha, gradient, rate=rate)
         gradients = self._tracer.backward(
             seen.hits,
-            TraceGradients(
-                rgb_srgb=gradient, transmittance=gradient @ background, ray_errors=pixel.ray_errors
-            ),
+            TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance, ray_errors=pixel.ray_errors),
         )
-        progress = state.iteration / self.iterations
         moved = state.adam.step(
             state.gaussians, gradients, config.rates, config.loss, progress=progress, extent=self._extent
         )
