@@ -24,6 +24,8 @@ PIXELS_PER_DEGREE = 67.0
 DEFINITIONS: dict[str, str] = {
     "psnr": "dB; 10 log10(1 / mean squared error over all valid pixels and channels), averaged over views",
     "psnr_foreground": "dB; PSNR over the valid pixels whose reference alpha is above 0.5",
+    "psnr_colour_corrected": "dB; PSNR after the gain and offset of each channel that bring the render "
+    "closest to the photograph: what is left when its exposure does not count",
     "ssim": "as in 3D Gaussian Splatting: Gaussian window 11, sigma 1.5, zero padding, C1 1e-4, C2 9e-4, "
     "mean over all pixels and channels",
     "ssim_valid": "the same formula over the windows that lie wholly inside the image (Wang et al. 2004)",
@@ -87,6 +89,28 @@ def psnr(
             return float("nan")
         error = float((squared * weight).sum()) / total
     return float("inf") if error == 0 else float(-10.0 * np.log10(error))
+
+
+def colour_corrected(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"],
+) -> Float32[np.ndarray, "h w 3"]:
+    """The render under the gain and offset of each channel that come closest to the reference.
+
+    Weighted least squares, then cut to [0, 1]; without a pixel that counts, the render as it is.
+    """
+    w = weight.reshape(-1, 1).astype(np.float64)
+    total = w.sum()
+    if total <= 0:
+        return render
+    x, y = render.reshape(-1, 3).astype(np.float64), reference.reshape(-1, 3).astype(np.float64)
+    x_mean, y_mean = (w * x).sum(axis=0) / total, (w * y).sum(axis=0) / total
+    spread = (w * (x - x_mean) ** 2).sum(axis=0)
+    together = (w * (x - x_mean) * (y - y_mean)).sum(axis=0)
+    gain = np.divide(together, spread, out=np.zeros(3), where=spread > 0)
+    corrected = np.clip((x - x_mean) * gain + y_mean, 0.0, 1.0)
+    return corrected.reshape(render.shape).astype(np.float32)
 
 
 def ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float:

@@ -30,12 +30,19 @@ class Column:
 
 COLUMNS = (
     Column("psnr", "PSNR", 2, True),
+    Column("psnr_colour_corrected", "PSNR cc", 2, True),
     Column("psnr_foreground", "PSNR fg", 2, True),
     Column("ssim", "SSIM", 4, True),
     Column("ssim_valid", "SSIM valid", 4, True),
     Column("ms_ssim", "MS-SSIM", 4, True),
     Column("flip", "FLIP", 4, False),
 )
+
+_NOTES = {
+    "psnr_colour_corrected": "exposure left out",
+    "ssim": "as in 3DGS, zero padding",
+    "flip": "lower is better",
+}
 
 
 def write_report(
@@ -119,7 +126,7 @@ def _tiles(
     tiles = []
     for column in COLUMNS:
         if column.key in mean and column.key != "ssim_valid":
-            note = {"ssim": "as in 3DGS, zero padding", "flip": "lower is better"}.get(column.key, "")
+            note = _NOTES.get(column.key, "")
             if column.key == "psnr" and isinstance(interval, list | tuple):
                 low, high = (_shown(bound, 2) for bound in interval)
                 note = f"95 % interval {low} – {high}"

@@ -11,6 +11,7 @@ from jaxtyping import Float32
 from engine.errors import DatasetError
 from engine.evaluate.metrics import (
     DEFINITIONS,
+    colour_corrected,
     filled_outside,
     flip,
     ms_ssim,
@@ -53,6 +54,7 @@ class ViewMetrics:
     width: int
     height: int
     psnr: float
+    psnr_colour_corrected: float
     ssim: float
     ssim_valid: float | None
     ms_ssim: float | None
@@ -135,6 +137,7 @@ def measure_view(view: RenderedView) -> MeasuredView:
         width=width,
         height=height,
         psnr=psnr(render, reference, view.weight),
+        psnr_colour_corrected=psnr(colour_corrected(render, reference, view.weight), reference, view.weight),
         ssim=padded,
         ssim_valid=None if math.isnan(valid) else valid,
         ms_ssim=ms_ssim(filled, reference),
@@ -161,7 +164,7 @@ def summarise(views: Iterable[ViewMetrics]) -> Metrics:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise DatasetError(f"Two measured views are named {twice}; names must differ.")
-    keys = ["psnr", "ssim", "ssim_valid", "ms_ssim", "flip"]
+    keys = ["psnr", "psnr_colour_corrected", "ssim", "ssim_valid", "ms_ssim", "flip"]
     if any(row.psnr_foreground is not None for row in rows):
         keys.append("psnr_foreground")
     mean = {key: _mean([getattr(row, key) for row in rows]) for key in keys}

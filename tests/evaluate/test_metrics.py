@@ -49,6 +49,33 @@ def test_psnr_agrees_with_scikit_image():
     assert metrics.psnr(render, reference) == pytest.approx(expected, abs=1e-9)
 
 
+def test_colour_correction_undoes_gain_and_offset_where_pixels_count():
+    _, reference = pair(30, 41)
+    gain, offset = np.array([0.8, 0.9, 0.7]), np.array([0.05, -0.02, 0.1])
+    render = (reference * gain + offset).astype(np.float32)
+    weight = np.ones((30, 41), np.float32)
+    weight[:, :10] = 0
+    render[:, :10] = 0.9
+    corrected = metrics.colour_corrected(render, reference, weight)
+    np.testing.assert_allclose(corrected[:, 10:], reference[:, 10:], atol=1e-6)
+    assert metrics.psnr(corrected, reference, weight) > 100
+
+
+def test_colour_correction_agrees_with_numpys_least_squares():
+    render, reference = pair(30, 41)
+    corrected = metrics.colour_corrected(render, reference, np.ones((30, 41), np.float32))
+    for channel in range(3):
+        x, y = render[..., channel].ravel().astype(float), reference[..., channel].ravel()
+        expected = np.clip(np.polyval(np.polyfit(x, y, 1), x), 0, 1)
+        np.testing.assert_allclose(corrected[..., channel].ravel(), expected, atol=1e-5)
+
+
+def test_colour_correction_of_one_tone_or_of_nothing():
+    grey, target = np.full((4, 5, 3), 0.5, np.float32), np.full((4, 5, 3), 0.25, np.float32)
+    np.testing.assert_allclose(metrics.colour_corrected(grey, target, np.ones((4, 5), np.float32)), target)
+    assert (metrics.colour_corrected(grey, target, np.zeros((4, 5), np.float32)) == grey).all()
+
+
 @pytest.mark.parametrize("size", [(40, 51), (11, 11), (7, 30)])
 def test_ssim_agrees_with_a_padded_convolution(size):
     render, reference = pair(*size)

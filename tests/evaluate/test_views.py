@@ -21,6 +21,8 @@ def test_metrics_are_those_of_the_images_rounded_to_8_bits():
     row, flip_map = measure_view(one)
     render, reference = (metrics.rounded_to_8_bits(image) for image in (one.render, one.reference))
     assert row.psnr == metrics.psnr(render, reference)
+    corrected = metrics.colour_corrected(render, reference, one.weight)
+    assert row.psnr_colour_corrected == metrics.psnr(corrected, reference)
     assert row.ssim == metrics.ssim(render, reference)
     assert row.ssim_valid == metrics.ssim_valid(render, reference)
     assert row.ms_ssim is None
@@ -88,7 +90,7 @@ def test_the_json_has_its_documented_layout():
     }
     content = summarise(rows).as_dict(run)
     assert json.loads(json.dumps(content, allow_nan=False)) == content
-    keys = {"psnr", "ssim", "ssim_valid", "ms_ssim", "flip", "psnr_foreground"}
+    keys = {"psnr", "psnr_colour_corrected", "ssim", "ssim_valid", "ms_ssim", "flip", "psnr_foreground"}
     assert set(content) == {"mean", "mean_psnr_ci95", "views", "definitions", *run}
     assert set(content["mean"]) == keys
     assert list(content["views"]) == ["a.jpg", "sub/b.jpg"]
