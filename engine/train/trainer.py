@@ -78,6 +78,10 @@ class Trainer:
         threads: for everything; 0 means all cores.
         should_stop: asked after each iteration; True ends the run at the next safe iteration.
         tracer: anything that follows the protocol; by default Embree.
+
+    Attributes:
+        state: where the training stands.
+        iterations: how many there will be in all.
     """
 
     def __init__(

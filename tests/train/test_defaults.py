@@ -1,6 +1,9 @@
 """What settings of 0 stand for: sizes taken from the photographs."""
 
+from pathlib import Path
+
 import pytest
+from flat_world import FlatWorld, small_config
 
 from engine.train.config import (
     TrainConfig,
@@ -10,6 +13,7 @@ from engine.train.config import (
     rebuild_interval,
     window_side_px,
 )
+from engine.train.trainer import Trainer, fresh_state
 
 
 @pytest.mark.parametrize(
@@ -36,6 +40,16 @@ def test_large_scenes_train_longer(pixels: int, count: int) -> None:
     assert iteration_count(TrainConfig(iterations=7), pixels) == 7
     assert iteration_count(preset("fast"), pixels) == 1000
     assert iteration_count(preset("paper"), pixels) == 10_000
+
+
+@pytest.mark.parametrize(("wanted", "count"), [(0, 5000), (80, 80)])
+def test_the_trainer_knows_its_iterations(tmp_path: Path, wanted: int, count: int) -> None:
+    world, config = FlatWorld(), small_config(iterations=wanted)
+    state = fresh_state(world.start(), config.seed)
+    trainer = Trainer(
+        world, config, state, folder=tmp_path, fingerprint="test", listener=lambda _event: None, threads=1
+    )
+    assert trainer.iterations == count
 
 
 def test_more_rays_an_iteration_want_fewer_iterations() -> None:
