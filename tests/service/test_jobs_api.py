@@ -69,7 +69,7 @@ def test_job_is_accepted_with_every_setting(talk: Callable[..., None]) -> None:
     [
         ({"kind": "nonsense"}, 422, "kind", "#/kind"),
         ({"options": {"preset": "best"}}, 422, "options", "#/options/preset"),
-        ({"options": {"train": {"iterations": 0}}}, 422, "options", "#/options/train/iterations"),
+        ({"options": {"train": {"iterations": -1}}}, 422, "options", "#/options/train/iterations"),
         ({"options": {"train": 5}}, 422, "options", "#/options/train"),
         ({"options": {"speed": 1}}, 422, "options", "#/options/speed"),
         ({"options": {"exports": ["../../x.ply"]}}, 422, "options", "#/options/exports/0"),

@@ -1,5 +1,6 @@
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -48,6 +49,10 @@ def octasplat() -> Octasplat:
 @pytest.fixture(scope="session")
 def start_octasplat() -> Callable[..., subprocess.Popen[str]]:
     """Starts the command line as a program."""
+
+    # Where a shell started the tests in the background, programs would inherit that Ctrl-C is ignored.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def start(*arguments: object) -> subprocess.Popen[str]:
         return subprocess.Popen(

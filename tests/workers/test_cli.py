@@ -87,7 +87,7 @@ def test_output_with_other_files(octasplat, run, tmp_path):
         (["--set", "colour=7"], "colour"),
         (["--set", "rates.mean"], "name=value"),
         (["--set", "rates.mean=-1"], "mean"),
-        (["--iterations", "0"], "iterations"),
+        (["--iterations", "-1"], "iterations"),
     ],
 )
 def test_settings_out_of_range_or_unknown(octasplat, scene, tmp_path, arguments, word):

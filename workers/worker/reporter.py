@@ -54,6 +54,7 @@ class Reporter:
         self._preview: dict[str, Any] | None = None
         self._kept: Checkpoint | None = None
         self._wake = asyncio.Event()
+        self._flushing = asyncio.Lock()
         self._tasks = [asyncio.create_task(self._flush_forever()), asyncio.create_task(self._keep_forever())]
 
     def expect(self, stages: Sequence[str]) -> None:
@@ -109,8 +110,9 @@ class Reporter:
 
     async def finish(self) -> None:
         """Write everything that is left, the last checkpoint included."""
-        for task in self._tasks:
-            task.cancel()
+        async with self._flushing:  # a flush that is under way would lose what it has taken
+            for task in self._tasks:
+                task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         with contextlib.suppress(*_IGNORED):
             await self._flush()
@@ -146,7 +148,8 @@ class Reporter:
         while True:
             await asyncio.sleep(FLUSH_SECONDS)
             try:
-                await self._flush()
+                async with self._flushing:
+                    await self._flush()
             except Fenced:
                 return
             except _IGNORED as error:
