@@ -38,6 +38,7 @@ COLUMNS = (
     Column("flip", "FLIP", 4, False),
 )
 
+EXPOSURE_MATTERS_DB = 0.3
 _NOTES = {
     "psnr_colour_corrected": "exposure left out",
     "ssim": "as in 3DGS, zero padding",
@@ -94,13 +95,13 @@ def _content(
     """The values that the template shows."""
     mean = _mapping(metrics.get("mean"))
     views = {name: _mapping(row) for name, row in _mapping(metrics.get("views")).items()}
-    columns = [column for column in COLUMNS if column.key in mean]
+    columns = _columns(mean)
     worst_first = sorted(views, key=lambda name: (_number(views[name].get("psnr"), math.inf), name))
     embedded = embedded_names(worst_first, images)
     interval = metrics.get("mean_psnr_ci95")
     return {
         "title": title,
-        "tiles": _tiles(mean, interval, metrics),
+        "tiles": _tiles(mean, columns, interval, metrics),
         "facts": _facts(metrics, len(views)),
         "stages": _stages(events),
         "charts": training_charts(events),
@@ -119,13 +120,22 @@ def _content(
     }
 
 
+def _columns(mean: Mapping[str, object]) -> list[Column]:
+    """The metrics that were measured; that without the exposure only where exposure makes a difference."""
+    columns = [column for column in COLUMNS if column.key in mean]
+    plain, corrected = (_number(mean.get(key), math.nan) for key in ("psnr", "psnr_colour_corrected"))
+    if corrected - plain >= EXPOSURE_MATTERS_DB:
+        return columns
+    return [column for column in columns if column.key != "psnr_colour_corrected"]
+
+
 def _tiles(
-    mean: Mapping[str, object], interval: object, metrics: Mapping[str, object]
+    mean: Mapping[str, object], columns: Sequence[Column], interval: object, metrics: Mapping[str, object]
 ) -> list[dict[str, str]]:
     """The main figures at the head of the page."""
     tiles = []
-    for column in COLUMNS:
-        if column.key in mean and column.key != "ssim_valid":
+    for column in columns:
+        if column.key != "ssim_valid":
             note = _NOTES.get(column.key, "")
             if column.key == "psnr" and isinstance(interval, list | tuple):
                 low, high = (_shown(bound, 2) for bound in interval)

@@ -196,6 +196,15 @@ def test_a_run_without_events_images_and_settings_still_has_a_report(report):
     assert page.rows == page.figures == page.all("svg") == []
 
 
+@pytest.mark.parametrize(("corrected", "shown"), [(25.2, False), (25.6, True)])
+def test_psnr_without_the_exposure_is_shown_where_it_differs(report, corrected, shown):
+    metrics = metrics_of({"a.jpg": 25.125})
+    metrics["mean"]["psnr_colour_corrected"] = corrected
+    metrics["views"]["a.jpg"]["psnr_colour_corrected"] = corrected
+    page = report(metrics=metrics)
+    assert ("PSNR cc" in page.text) == (f"{corrected:.2f}" in page.text) == shown
+
+
 def test_curves_are_drawn_over_iterations_and_time(report):
     page = report()
     assert len(page.all("svg")) == 6
