@@ -98,10 +98,7 @@ def reconstruct(
                 raise
             write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
         if not (output / SCENE).exists():
-            pixels = sum(
-                dataset.views[i].width_px * dataset.views[i].height_px for i in dataset.train_indices
-            )
-            with _stage("train", tell, iteration_count(config.train, pixels)):
+            with _stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)):
                 gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
                 write_gaussian_ply(gaussians, output / SCENE)
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():

@@ -100,17 +100,17 @@ def colour_corrected(
 
     Weighted least squares, then cut to [0, 1]; without a pixel that counts, the render as it is.
     """
-    w = weight.reshape(-1, 1).astype(np.float64)
-    total = w.sum()
-    if total <= 0:
-        return render
-    x, y = render.reshape(-1, 3).astype(np.float64), reference.reshape(-1, 3).astype(np.float64)
-    x_mean, y_mean = (w * x).sum(axis=0) / total, (w * y).sum(axis=0) / total
-    spread = (w * (x - x_mean) ** 2).sum(axis=0)
-    together = (w * (x - x_mean) * (y - y_mean)).sum(axis=0)
-    gain = np.divide(together, spread, out=np.zeros(3), where=spread > 0)
-    corrected = np.clip((x - x_mean) * gain + y_mean, 0.0, 1.0)
-    return corrected.reshape(render.shape).astype(np.float32)
+    corrected = render.copy()
+    if weight.sum(dtype=np.float64) <= 0:
+        return corrected
+    for channel in range(3):
+        x, y = render[..., channel].astype(np.float64), reference[..., channel].astype(np.float64)
+        x_mean, y_mean = np.average(x, weights=weight), np.average(y, weights=weight)
+        x -= x_mean
+        variance = np.average(x * x, weights=weight)
+        gain = np.average(x * (y - y_mean), weights=weight) / variance if variance > 0 else 0.0
+        corrected[..., channel] = np.clip(gain * x + y_mean, 0.0, 1.0)
+    return corrected
 
 
 def ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float:

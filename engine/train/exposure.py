@@ -37,13 +37,13 @@ class Exposures:
         self, view: Int64[np.ndarray, " r"], rgb: Float32[np.ndarray, "r 3"], alpha: Float32[np.ndarray, " r"]
     ) -> Float32[np.ndarray, "r 3"]:
         """Colours premultiplied by ``alpha`` as the photographs ``view`` would show them."""
-        return np.exp(self.log_gains[view]) * rgb + self.offsets[view] * alpha[:, None]
+        return np.exp(self.log_gains)[view] * rgb + self.offsets[view] * alpha[:, None]
 
     def undevelop(
         self, view: Int64[np.ndarray, " r"], gradient: Float32[np.ndarray, "r 3"]
     ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"]]:
         """Gradients by ``rgb`` and by ``alpha`` of :meth:`develop` from that by what it returned."""
-        return gradient * np.exp(self.log_gains[view]), (gradient * self.offsets[view]).sum(axis=1)
+        return gradient * np.exp(self.log_gains)[view], (gradient * self.offsets[view]).sum(axis=1)
 
     def step(
         self,
@@ -64,7 +64,7 @@ class Exposures:
             rate: size of a step.
         """
         used, place = np.unique(view, return_inverse=True)
-        gained = gradient * np.exp(self.log_gains[view]) * rgb
+        gained = gradient * np.exp(self.log_gains)[view] * rgb
         terms = np.concatenate([gained, gradient * alpha[:, None]], axis=1)
         sums = np.stack([np.bincount(place, terms[:, c], len(used)) for c in range(6)], axis=1)
         self.steps[used] += 1

@@ -212,9 +212,9 @@ class Trainer:
         seen = self._tracer.trace(batch.origins_world, batch.directions_world, record=True)
         assert seen.hits is not None
         self._hits_per_ray = float(seen.hit_counts.mean())
-        rgb, alpha, exposures = seen.rgb_srgb, seen.alpha, state.exposures
+        rgb, exposures = seen.rgb_srgb, state.exposures
         if exposures is not None:
-            rgb = exposures.develop(batch.view, rgb, alpha)
+            rgb = exposures.develop(batch.view, rgb, seen.alpha)
         render = rgb + seen.transmittance[:, None] * background
         target = _composite(batch, background)
         pixel = pixel_loss(render, target, batch.weight, l1=config.loss.l1, l2=config.loss.l2)
@@ -234,7 +234,7 @@ class Trainer:
             by_rgb, by_alpha = exposures.undevelop(batch.view, gradient)
             by_transmittance = by_transmittance - by_alpha
             rate = config.rates.exposure * config.rates.decay**progress
-            exposures.step(batch.view, seen.rgb_srgb, alpha, gradient, rate=rate)
+            exposures.step(batch.view, seen.rgb_srgb, seen.alpha, gradient, rate=rate)
         gradients = self._tracer.backward(
             seen.hits,
             TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance, ray_errors=pixel.ray_errors),

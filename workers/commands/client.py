@@ -51,7 +51,9 @@ def connected(server: str | None) -> Iterator["Api"]:
     help="Take the poses of the COLMAP model, find them, or find them if there is no model.",
 )
 @click.option("--max-side", type=int, metavar="PX", help="Shrink photographs to this longer side.")
-@click.option("--iterations", type=int, metavar="N", help="Iterations of the training.")
+@click.option(
+    "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
+)
 @click.option(
     "--set", "assignments", multiple=True, metavar="NAME=VALUE",
     help="Any setting, e.g. test_every=10 or train.rates.quat=0.02; may be repeated.",

@@ -23,7 +23,9 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet")
     "--preset", type=click.Choice(PRESETS), help="Where the settings come from.  [default: standard]"
 )
 @click.option("--max-side", type=int, metavar="PX", help="Shrink photographs to this longer side.")
-@click.option("--iterations", type=int, metavar="N", help="Iterations of the training.")
+@click.option(
+    "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
+)
 @click.option("--rays", type=int, metavar="N", help="Rays of one iteration.")
 @click.option(
     "--max-gaussians", type=int, metavar="N", help="Most Gaussians; 0 for one per 50 pixels, up to 200,000."
