@@ -35,9 +35,9 @@ from engine.pipeline import reconstruct
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from workers.client.api import Api, ServiceError, Unreachable
 from workers.client.upload import scene_files, upload_scene
-from workers.kinds.options import resolve_reconstruction
-from workers.storage.opening import open_storage
-from workers.storage.trees import read_manifest
+from workers.store.opening import open_storage
+from workers.store.trees import read_manifest
+from workers.work.kinds.options import resolve_reconstruction
 
 IN_FLIGHT = 20
 OVER = ("succeeded", "failed", "canceled")

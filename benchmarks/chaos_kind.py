@@ -13,9 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from engine.errors import Cancelled
 from engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
-from workers.kinds import JobKind, register
-from workers.kinds.table import validated
-from workers.worker.task import Task
+from workers.work.kinds import JobKind, register
+from workers.work.kinds.table import validated
+from workers.work.task import Task
 
 EVERY = 5
 RESULT_BLOCKS = 20_000

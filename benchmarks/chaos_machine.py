@@ -124,7 +124,7 @@ class Machine:
 
     def jobs(self) -> list[psutil.Process]:
         """The children of the worker."""
-        return self.below("workers.worker.child")
+        return self.below("workers.work.child")
 
     def worker(self) -> list[psutil.Process]:
         """The worker that takes jobs."""

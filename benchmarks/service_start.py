@@ -21,7 +21,7 @@ import httpx
 import psutil
 
 from benchmarks.chaos_machine import ROOT, free_port
-from workers.queue.embedded_postgres import EmbeddedPostgres
+from workers.postgres.embedded import EmbeddedPostgres
 
 
 def ready_after(began: float, port: int, process: "subprocess.Popen[bytes]", seconds: float = 120) -> float:

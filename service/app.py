@@ -16,11 +16,11 @@ from service.routes import artifacts, datasets, jobs, journal, metrics, system, 
 from service.settings import ServiceSettings
 from service.state import Service
 from service.web import mount_pages
-from workers.queue.database import open_pool
-from workers.queue.migrate import migrate
 from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.queue.tokens import add_token, any_token
-from workers.storage.opening import open_storage
+from workers.records.database import open_pool
+from workers.records.migrate import migrate
+from workers.records.tokens import add_token, any_token
+from workers.store.opening import open_storage
 
 DESCRIPTION = """Photographs in, scenes of flat Gaussians and their octagon meshes out.
 

@@ -9,7 +9,7 @@ from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBea
 
 from service.problems import Problem
 from service.state import Service, ServiceDep
-from workers.queue.tokens import any_token, find_token
+from workers.records.tokens import any_token, find_token
 
 Scope = Literal["read", "write", "admin"]
 LOCAL_OWNER = "local"

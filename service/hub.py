@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import psycopg
 
-from workers.queue.journal import CHANNEL
+from workers.records.journal import CHANNEL
 
 logger = logging.getLogger(__name__)
 _RECONNECT_SECONDS = 1.0

@@ -10,7 +10,7 @@ from fastapi import Header
 
 from service.auth import Principal
 from service.problems import Problem
-from workers.queue.database import Connection
+from workers.records.database import Connection
 
 IdempotencyKey = Annotated[
     str | None,

@@ -16,8 +16,8 @@ from starlette.exceptions import HTTPException
 from engine.errors import OctasplatError
 from service.intake.faults import IntakeRefused
 from workers.queue.jobs import Conflict
-from workers.queue.quotas import QuotaExceeded
-from workers.storage.errors import (
+from workers.records.quotas import QuotaExceeded
+from workers.store.errors import (
     BlobMissing,
     DigestMismatch,
     StorageError,

@@ -7,7 +7,16 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.webhook_views import JobWebhook
-from workers.queue.rows import Artifact, Dataset, DatasetFile, DatasetState, Job, JobEvent, JobState, LogLine
+from workers.records.rows import (
+    Artifact,
+    Dataset,
+    DatasetFile,
+    DatasetState,
+    Job,
+    JobEvent,
+    JobState,
+    LogLine,
+)
 
 _ID = "01a1fcac-4f59-764b-97e6-1be68502c58f"
 _TIME = "2026-11-21T05:55:13.369313Z"

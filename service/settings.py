@@ -6,7 +6,7 @@ from pydantic import Field, SecretStr
 
 from engine.errors import ConfigError
 from service.intake.receive import UploadLimits
-from workers.queue.quotas import Quota
+from workers.records.quotas import Quota
 from workers.settings import PREFIX, WorkerSettings
 
 DEFAULT_PORT = 8642

@@ -9,9 +9,9 @@ from fastapi import Depends, Request
 from service.hub import EventHub
 from service.metrics import Metrics
 from service.settings import ServiceSettings
-from workers.queue.database import Pool
 from workers.queue.port import Slips
-from workers.storage.protocol import Storage
+from workers.records.database import Pool
+from workers.store.protocol import Storage
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 from service.problems import Problem
 from service.state import Service
-from workers.webhooks.addresses import AddressRefused, check_url
+from workers.upkeep.webhooks.addresses import AddressRefused, check_url
 
 
 def check_address(service: Service, url: str, pointer: str = "#/url") -> None:

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from workers.webhooks.addresses import MAX_URL
-from workers.webhooks.rows import ENDS, Delivery, DeliveryState, Endpoint, EventName
-from workers.webhooks.signing import check_secret
+from workers.upkeep.webhooks.addresses import MAX_URL
+from workers.upkeep.webhooks.rows import ENDS, Delivery, DeliveryState, Endpoint, EventName
+from workers.upkeep.webhooks.signing import check_secret
 
 _ID = "01a1fcac-4f59-764b-97e6-1be68502c58f"
 _TIME = "2026-11-21T05:55:13.369313Z"

@@ -13,8 +13,8 @@ import psycopg
 import pytest
 from psycopg.conninfo import make_conninfo
 
-from workers.queue.embedded_postgres import EmbeddedPostgres
-from workers.queue.migrate import migrate
+from workers.postgres.embedded import EmbeddedPostgres
+from workers.records.migrate import migrate
 
 
 @pytest.fixture(scope="session")

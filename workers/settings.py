@@ -9,8 +9,8 @@ from pydantic import AliasChoices, Field, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from engine.errors import ConfigError
-from workers.queue.embedded_postgres import EmbeddedPostgres
-from workers.queue.retention import Retention
+from workers.postgres.embedded import EmbeddedPostgres
+from workers.upkeep.retention import Retention
 
 PREFIX = "OCTASPLAT_"
 
@@ -83,7 +83,7 @@ class WorkerSettings(BaseSettings):
 
     @property
     def storage_address(self) -> str:
-        """What :func:`workers.storage.opening.open_storage` takes."""
+        """What :func:`workers.store.opening.open_storage` takes."""
         return self.storage or str(self.data.absolute() / "store")
 
     @property

@@ -14,8 +14,8 @@ from typing import BinaryIO
 from service.intake.faults import Fault, IntakeRefused
 from service.intake.layout import Part, common_folder, is_clutter, part_of
 from service.intake.zip_records import DEFLATED, IS_ENCRYPTED, IS_STRONG, STORED, Record, read_records, refuse
-from workers.storage.names import NameRefused, NameSet, check_name, shown_name
-from workers.storage.protocol import Blob, BlobWriter
+from workers.store.names import NameRefused, NameSet, check_name, shown_name
+from workers.store.protocol import Blob, BlobWriter
 
 _PIECE_BYTES = 1 << 20
 _NESTED_SUFFIXES = (

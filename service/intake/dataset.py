@@ -9,9 +9,9 @@ from service.intake.images import ImageHeader, ImageLimits, read_image_header
 from service.intake.layout import Part, model_files, part_of
 from service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
 from service.intake.model_child import ModelAnswer
-from workers.storage.names import NameRefused, NameSet, check_name, shown_name
-from workers.storage.protocol import Storage
-from workers.storage.trees import TreeFile
+from workers.store.names import NameRefused, NameSet, check_name, shown_name
+from workers.store.protocol import Storage
+from workers.store.trees import TreeFile
 
 _MAX_FAULTS = 100
 DEFAULT_IMAGE_LIMITS = ImageLimits()

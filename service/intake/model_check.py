@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 from service.intake.faults import Fault
 from service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
-from workers.storage.protocol import Storage
-from workers.storage.trees import TreeFile, fetch_tree
+from workers.store.protocol import Storage
+from workers.store.trees import TreeFile, fetch_tree
 
 MIN_VIEWS = 3
 """Fewer photographs do not make a scene; as in the engine."""

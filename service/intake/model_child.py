@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from service.intake.faults import Fault
-from workers.storage.names import NameRefused, check_name, shown_name
+from workers.store.names import NameRefused, check_name, shown_name
 
 if TYPE_CHECKING:
     from engine.scene.colmap import ColmapModel

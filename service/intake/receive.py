@@ -14,9 +14,9 @@ from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unp
 from service.intake.dataset import DatasetLimits, check_file_content, check_file_name
 from service.intake.faults import Fault, IntakeRefused
 from service.intake.images import ImageHeader
-from workers.storage.counting import CountingWriter
-from workers.storage.os_errors import told
-from workers.storage.protocol import Blob, BlobWriter, Storage
+from workers.store.counting import CountingWriter
+from workers.store.os_errors import told
+from workers.store.protocol import Blob, BlobWriter, Storage
 
 PIECE_BYTES = 1 << 20
 _CHECK_EVERY_BYTES = 64 << 20

@@ -28,13 +28,13 @@ from service.schemas import (
     NewDataset,
 )
 from service.state import Service, ServiceDep
-from workers.queue import datasets as rows
-from workers.queue.database import Connection
 from workers.queue.jobs import Conflict
-from workers.queue.quotas import QuotaExceeded, bytes_left, check_bytes, check_new_dataset
-from workers.queue.rows import Dataset, DatasetFile
-from workers.storage.errors import TooLarge
-from workers.worker.media_types import media_type
+from workers.records import datasets as rows
+from workers.records.database import Connection
+from workers.records.quotas import QuotaExceeded, bytes_left, check_bytes, check_new_dataset
+from workers.records.rows import Dataset, DatasetFile
+from workers.store.errors import TooLarge
+from workers.work.media_types import media_type
 
 T = TypeVar("T")
 

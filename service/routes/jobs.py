@@ -16,13 +16,13 @@ from service.routes import problems
 from service.schemas import JobChange, JobPage, JobView, NewJob, RetryRequest
 from service.state import Service, ServiceDep
 from service.webhook_addresses import check_address
-from workers.kinds import JobKind, kind_named
 from workers.queue import jobs as rows
-from workers.queue.database import Connection
-from workers.queue.datasets import get_dataset
-from workers.queue.quotas import check_new_job
-from workers.queue.rows import Job, JobState
-from workers.webhooks.rows import add_endpoint
+from workers.records.database import Connection
+from workers.records.datasets import get_dataset
+from workers.records.quotas import check_new_job
+from workers.records.rows import Job, JobState
+from workers.upkeep.webhooks.rows import add_endpoint
+from workers.work.kinds import JobKind, kind_named
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

@@ -16,10 +16,10 @@ from service.routes import problems
 from service.routes.jobs import read_job
 from service.schemas import EventPage, EventView, LogLineView, LogPage
 from service.state import Service, ServiceDep
-from workers.queue.database import Connection
 from workers.queue.jobs import get_job
-from workers.queue.journal import events_after, log_after
-from workers.queue.rows import JobEvent
+from workers.records.database import Connection
+from workers.records.journal import events_after, log_after
+from workers.records.rows import JobEvent
 
 router = APIRouter(prefix="/v1/jobs", tags=["progress"])
 

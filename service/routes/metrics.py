@@ -9,8 +9,8 @@ from service.auth import Reader
 from service.routes import problems
 from service.state import ServiceDep
 from workers.queue.numbers import read_numbers
-from workers.storage.errors import StorageError
-from workers.storage.protocol import Storage
+from workers.store.errors import StorageError
+from workers.store.protocol import Storage
 
 router = APIRouter(tags=["health"])
 

@@ -26,12 +26,12 @@ from service.schemas import (
     WorkerView,
 )
 from service.state import Service, ServiceDep
-from workers.kinds import JobKind, job_kinds, kind_named
 from workers.queue.jobs import queue_depths, running_by_queue
-from workers.queue.migrate import missing_steps
-from workers.queue.tokens import add_token, list_tokens, new_secret, revoke_token
-from workers.queue.workers import live_workers
-from workers.storage.errors import StorageError
+from workers.records.migrate import missing_steps
+from workers.records.tokens import add_token, list_tokens, new_secret, revoke_token
+from workers.records.workers import live_workers
+from workers.store.errors import StorageError
+from workers.work.kinds import JobKind, job_kinds, kind_named
 
 router = APIRouter(prefix="/v1", tags=["service"])
 health_router = APIRouter(tags=["health"])

@@ -21,9 +21,9 @@ from service.webhook_views import (
     WebhookPage,
     WebhookView,
 )
-from workers.queue.database import Connection
-from workers.webhooks import rows
-from workers.webhooks.signing import new_secret
+from workers.records.database import Connection
+from workers.upkeep.webhooks import rows
+from workers.upkeep.webhooks.signing import new_secret
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 

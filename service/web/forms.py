@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from engine.export.registry import exporters
 from engine.train.config import preset
-from workers.kinds import JobKind
+from workers.work.kinds import JobKind
 
 Control = Literal["choice", "yes_no", "whole", "number", "text", "list", "files"]
 PRESETS = ("fast", "standard", "paper")

@@ -32,13 +32,13 @@ from service.web.results import (
 )
 from service.web.routing import PageRoute, go_to, is_part
 from service.web.templating import page
-from workers.kinds import job_kinds, kind_named
-from workers.queue.database import Connection
-from workers.queue.datasets import files_of, list_datasets
 from workers.queue.jobs import artifacts_of, get_artifact
-from workers.queue.rows import Artifact, DatasetFile
-from workers.queue.workers import live_workers
-from workers.storage.errors import StorageError
+from workers.records.database import Connection
+from workers.records.datasets import files_of, list_datasets
+from workers.records.rows import Artifact, DatasetFile
+from workers.records.workers import live_workers
+from workers.store.errors import StorageError
+from workers.work.kinds import job_kinds, kind_named
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 

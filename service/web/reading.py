@@ -15,9 +15,9 @@ from service.state import Service
 from service.web.results import METRICS, mean_psnr, read_json
 from service.web.templating import short_id
 from workers.queue import jobs as rows
-from workers.queue.database import Connection
-from workers.queue.datasets import get_dataset
-from workers.queue.rows import Artifact, Dataset, Job, JobEvent, JobState
+from workers.records.database import Connection
+from workers.records.datasets import get_dataset
+from workers.records.rows import Artifact, Dataset, Job, JobEvent, JobState
 
 ACTIVE: tuple[JobState, ...] = ("queued", "running", "canceling")
 SHOWN: dict[str, tuple[JobState, ...]] = {

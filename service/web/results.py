@@ -9,9 +9,9 @@ from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import Any, cast
 
-from workers.queue.rows import Artifact, DatasetFile
-from workers.storage.errors import StorageError
-from workers.storage.protocol import Storage
+from workers.records.rows import Artifact, DatasetFile
+from workers.store.errors import StorageError
+from workers.store.protocol import Storage
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from service.auth import COOKIE
 from service.state import ServiceDep
 from service.web.routing import PageRoute, go_to, local_address
 from service.web.templating import page
-from workers.queue.tokens import find_token
+from workers.records.tokens import find_token
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.heavy
 
 HOLDER = """
 import asyncio, sys, time, uuid
-from workers.queue.database import open_pool
+from workers.records.database import open_pool
 from workers.queue.jobs import get_job
 
 async def hold():

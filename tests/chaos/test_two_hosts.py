@@ -19,7 +19,7 @@ from worker_bench import ROOT, Bench, alive, child_pids
 
 from benchmarks.chaos import journal_faults
 from benchmarks.chaos_kind import ChainOptions, undisturbed
-from workers.storage.opening import open_storage
+from workers.store.opening import open_storage
 
 pytestmark = pytest.mark.heavy
 

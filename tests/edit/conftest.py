@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from engine.gaussians.model import FlatGaussians
-from workers.cli import cli
+from workers.cli.main import cli
 
 BLENDER = "OCTASPLAT_BPY_PYTHON"
 

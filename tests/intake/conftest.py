@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from workers.storage.local import LocalStorage
+from workers.store.local import LocalStorage
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from PIL import Image
 
 from service.intake.dataset import DatasetFile
-from workers.storage.local import LocalStorage
+from workers.store.local import LocalStorage
 
 PINHOLE = 1
 

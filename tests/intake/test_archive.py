@@ -21,8 +21,8 @@ from zip_builder import Member, build, deflated
 
 from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
 from service.intake.faults import IntakeRefused
-from workers.storage.local import LocalStorage
-from workers.storage.protocol import Blob
+from workers.store.local import LocalStorage
+from workers.store.protocol import Blob
 
 PHOTO = b"\xff\xd8\xff\xe0 not much of a photograph " * 40
 MODEL = struct.pack("<Q", 0x088B1F) + bytes(300)  # a count that looks like gzip

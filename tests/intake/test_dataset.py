@@ -16,8 +16,8 @@ from service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, c
 from service.intake.faults import Fault, IntakeRefused
 from service.intake.layout import Part
 from service.intake.model_check import ModelLimits, check_model, child_environment
-from workers.storage.local import LocalStorage
-from workers.storage.trees import TreeFile
+from workers.store.local import LocalStorage
+from workers.store.trees import TreeFile
 
 NAN, INF = float("nan"), float("inf")
 
@@ -230,7 +230,7 @@ def test_nothing_heavy_is_imported() -> None:
     code = (
         "import sys, pkgutil, importlib, service.intake as p\n"
         "for m in pkgutil.iter_modules(p.__path__): importlib.import_module('service.intake.' + m.name)\n"
-        "import workers.storage\n"
+        "import workers.store\n"
         "heavy = {'pycolmap', 'torch', 'numba', 'OpenImageIO', 'boto3', 'scipy'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )

@@ -23,8 +23,8 @@ from service.intake.receive import (
     receive_archive,
     receive_file,
 )
-from workers.storage import DigestMismatch, StorageFull, TooLarge
-from workers.storage.local import LocalStorage
+from workers.store import DigestMismatch, StorageFull, TooLarge
+from workers.store.local import LocalStorage
 
 
 async def body(data: bytes, piece: int = 1000) -> AsyncIterator[bytes]:
@@ -173,7 +173,7 @@ MEMORY = """
 import asyncio, resource, sys
 from pathlib import Path
 from service.intake.receive import receive
-from workers.storage.local import LocalStorage
+from workers.store.local import LocalStorage
 
 async def body(megabytes):
     piece = bytes(65536)

@@ -13,10 +13,10 @@ import psycopg
 import pytest
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from workers.queue.embedded_postgres import EmbeddedPostgres
-from workers.queue.errors import DatabaseError
-from workers.queue.postgres_binaries import PostgresBinaries, find_binaries
-from workers.queue.server_user import server_user
+from workers.postgres.binaries import PostgresBinaries, find_binaries
+from workers.postgres.embedded import EmbeddedPostgres
+from workers.postgres.server_user import server_user
+from workers.records.errors import DatabaseError
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_killed_server_leaves_a_stale_pid_file(server: EmbeddedPostgres) -> None
 
 
 def test_server_outlives_its_parent_and_is_taken_over(server: EmbeddedPostgres) -> None:
-    code = f"from pathlib import Path; from workers.queue.embedded_postgres import EmbeddedPostgres as E; " \
+    code = f"from pathlib import Path; from workers.postgres.embedded import EmbeddedPostgres as E; " \
            f"E(Path({str(server.data)!r})).start()"  # fmt: skip
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
     before = pid_of(server)
@@ -94,7 +94,7 @@ def test_server_outlives_its_parent_and_is_taken_over(server: EmbeddedPostgres) 
 
 
 def test_two_starts_at_once_make_one_database(server: EmbeddedPostgres) -> None:
-    code = f"from pathlib import Path; from workers.queue.embedded_postgres import EmbeddedPostgres as E; " \
+    code = f"from pathlib import Path; from workers.postgres.embedded import EmbeddedPostgres as E; " \
            f"print(E(Path({str(server.data)!r})).start())"  # fmt: skip
     both = [
         subprocess.Popen(
@@ -171,7 +171,7 @@ def test_binaries_out_of_the_servers_reach_are_copied(
             shutil.copytree(folder, private / folder.relative_to(install.parents[1]), symlinks=True)
     private.chmod(0o700)
     moved = PostgresBinaries(private / install.relative_to(install.parents[1]) / "bin", find_binaries().major)
-    monkeypatch.setattr("workers.queue.embedded_postgres.find_binaries", lambda _major=None: moved)
+    monkeypatch.setattr("workers.postgres.embedded.find_binaries", lambda _major=None: moved)
     server = EmbeddedPostgres(short_root / "copied")
     try:
         assert answer(server.start(), "SELECT 1") == "1"

@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 from psycopg.types.json import Jsonb
 
-from workers.commands.fsck import fsck
-from workers.queue.database import open_pool
-from workers.queue.datasets import create_dataset, put_file
-from workers.storage.local import LocalStorage
+from workers.cli.commands.fsck import fsck
+from workers.records.database import open_pool
+from workers.records.datasets import create_dataset, put_file
+from workers.store.local import LocalStorage
 
 
 def put(storage: LocalStorage, data: bytes, age_seconds: float = 0) -> str:

@@ -8,9 +8,9 @@ import psycopg
 import pytest
 from postgres_for_tests import copied_database
 
-from workers.queue.embedded_postgres import EmbeddedPostgres
-from workers.queue.errors import DatabaseError
-from workers.queue.migrate import all_steps, migrate, missing_steps, queue_steps
+from workers.postgres.embedded import EmbeddedPostgres
+from workers.records.errors import DatabaseError
+from workers.records.migrate import all_steps, migrate, missing_steps, queue_steps
 
 
 @pytest.fixture

@@ -9,8 +9,6 @@ import psycopg
 import pytest
 
 from workers.queue.attempts import Attempt, Fenced, Result, claim
-from workers.queue.database import Connection, Pool, open_pool
-from workers.queue.ids import new_id
 from workers.queue.jobs import (
     Conflict,
     NewJob,
@@ -26,7 +24,9 @@ from workers.queue.jobs import (
 from workers.queue.port import Slips
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.queue.rescue import rescue_lost_jobs
-from workers.queue.rows import Job
+from workers.records.database import Connection, Pool, open_pool
+from workers.records.ids import new_id
+from workers.records.rows import Job
 
 NEW = NewJob(owner="me", kind="toy", options={}, queue="cpu")
 SLIPS = ProcrastinateSlips(stale_seconds=5)

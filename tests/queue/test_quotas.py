@@ -8,10 +8,10 @@ import pytest
 from click.testing import CliRunner
 from psycopg.rows import dict_row
 
-from workers.commands.quota import quota as quota_command
-from workers.queue.database import Connection, open_pool
-from workers.queue.datasets import create_dataset, put_file
-from workers.queue.quotas import (
+from workers.cli.commands.quota import quota as quota_command
+from workers.records.database import Connection, open_pool
+from workers.records.datasets import create_dataset, put_file
+from workers.records.quotas import (
     Quota,
     QuotaExceeded,
     Usage,

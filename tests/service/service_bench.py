@@ -13,8 +13,8 @@ from service.app import create_app
 from service.settings import ServiceSettings
 from service.state import Service
 from workers.queue.attempts import Attempt, claim
-from workers.queue.tokens import add_token, new_secret
-from workers.storage.trees import Manifest
+from workers.records.tokens import add_token, new_secret
+from workers.store.trees import Manifest
 
 
 @asynccontextmanager

@@ -61,7 +61,7 @@ ACCEPT = (
     + """
 from engine.export.registry import exporters
 from service.web.forms import options_form
-from workers.kinds import job_kinds, kind_named
+from workers.work.kinds import job_kinds, kind_named
 assert exporters()
 for kind in job_kinds():
     options_form(kind)

@@ -12,7 +12,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from workers.storage.local import LocalStorage
+from workers.store.local import LocalStorage
 
 pytestmark = pytest.mark.heavy
 

@@ -21,7 +21,7 @@ from workers.client.download import download_results
 from workers.client.submission import Submission, submit
 from workers.client.upload import upload_scene
 from workers.client.watch import watch_job
-from workers.kinds.options import resolve_reconstruction
+from workers.work.kinds.options import resolve_reconstruction
 
 pytestmark = pytest.mark.heavy
 
@@ -131,7 +131,7 @@ def test_everything_is_killed_and_the_result_is_the_same(
             return found
 
         until(lambda job: job["checkpoint"] is not None and job["checkpoint"]["step"] >= 25)
-        for victim in machine.children("workers.worker.child"):
+        for victim in machine.children("workers.work.child"):
             victim.kill()
         until(lambda job: job["attempt"] >= 2 or job["state"] == "succeeded")
         for victim in machine.children("--queues cpu"):

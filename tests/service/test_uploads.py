@@ -25,7 +25,7 @@ from zip_builder import Member, build
 
 from service.app import create_app
 from service.settings import ServiceSettings
-from workers.storage.local import LocalStorage
+from workers.store.local import LocalStorage
 
 ROOT = Path(__file__).parents[2]
 

@@ -15,10 +15,10 @@ from service_bench import claimed, committed_dataset, running, with_token
 from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 
 from service.state import Service
-from workers.queue.database import open_pool
-from workers.webhooks.addresses import AddressRefused, check_url
-from workers.webhooks.outbox import WAITS_SECONDS, take_due
-from workers.webhooks.sending import guarded_client, send_due
+from workers.records.database import open_pool
+from workers.upkeep.webhooks.addresses import AddressRefused, check_url
+from workers.upkeep.webhooks.outbox import WAITS_SECONDS, take_due
+from workers.upkeep.webhooks.sending import guarded_client, send_due
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 HERE = ("127.0.0.1",)

@@ -8,9 +8,9 @@ import pytest
 from botocore.config import Config
 from moto.server import ThreadedMotoServer
 
-from workers.storage import Storage
-from workers.storage.local import LocalStorage
-from workers.storage.s3 import S3Storage
+from workers.store import Storage
+from workers.store.local import LocalStorage
+from workers.store.s3 import S3Storage
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from engine.errors import ConfigError
-from workers.storage import StorageFull, StorageUnavailable, open_storage
-from workers.storage.local import LocalStorage
-from workers.storage.s3 import S3Storage
+from workers.store import StorageFull, StorageUnavailable, open_storage
+from workers.store.local import LocalStorage
+from workers.store.s3 import S3Storage
 
 
 def put(storage: LocalStorage, data: bytes) -> str:
@@ -118,7 +118,7 @@ def test_a_damaged_blob_is_noticed_and_mended(local_storage: LocalStorage, tmp_p
 WRITER = """
 import sys
 from pathlib import Path
-from workers.storage.local import LocalStorage
+from workers.store.local import LocalStorage
 storage = LocalStorage(Path(sys.argv[1]), floor_bytes=0)
 number = 0
 while True:

@@ -23,7 +23,7 @@ from postgres_for_tests import copied_database, postgres, short_root, template
 from replay import Replay
 from web_bench import ROOT, Browse, Service, StartService
 
-from workers.queue.embedded_postgres import EmbeddedPostgres
+from workers.postgres.embedded import EmbeddedPostgres
 
 __all__ = ["postgres", "short_root", "template"]
 

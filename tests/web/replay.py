@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from workers.queue.attempts import Attempt, Result, claim
-from workers.queue.database import open_pool
 from workers.queue.jobs import get_job
-from workers.storage.local import LocalStorage
-from workers.worker.media_types import media_type
+from workers.records.database import open_pool
+from workers.store.local import LocalStorage
+from workers.work.media_types import media_type
 
 LEFT_OUT = ("checkpoints", "cache")
 

@@ -4,7 +4,7 @@ import json
 from itertools import chain
 
 from service.web.forms import Field, OptionsForm, options_form
-from workers.kinds import job_kinds, kind_named
+from workers.work.kinds import job_kinds, kind_named
 
 
 def fields_of(form: OptionsForm) -> dict[str, Field]:

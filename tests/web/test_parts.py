@@ -19,11 +19,11 @@ from service.settings import ServiceSettings
 from service.web import wording
 from service.web.results import downloads, measured
 from service.web.routing import local_address
-from workers.queue.database import open_pool
 from workers.queue.jobs import NewJob, create_job
 from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.queue.rows import Artifact, DatasetFile
-from workers.queue.tokens import add_token
+from workers.records.database import open_pool
+from workers.records.rows import Artifact, DatasetFile
+from workers.records.tokens import add_token
 
 HOSTILE = '"><img src=x onerror=alert(1)>'
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from workers.worker import reporter
-from workers.worker.reporter import Reporter
+from workers.work import reporter
+from workers.work.reporter import Reporter
 
 
 class SlowJournal:

@@ -9,9 +9,9 @@ from pydantic import BaseModel, ConfigDict
 
 from engine.errors import Cancelled, DatasetError
 from engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
-from workers.kinds import JobKind, register
-from workers.kinds.table import validated
-from workers.worker.task import Task
+from workers.work.kinds import JobKind, register
+from workers.work.kinds.table import validated
+from workers.work.task import Task
 
 
 class ToyOptions(BaseModel):

@@ -16,11 +16,11 @@ from typing import Any
 import psycopg
 from psycopg.rows import class_row
 
-from workers.queue.database import Connection, open_pool
 from workers.queue.jobs import NewJob, artifacts_of, cancel_job, create_job, retry_job
 from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.queue.rows import Artifact, Job, JobEvent
-from workers.storage.opening import open_storage
+from workers.records.database import Connection, open_pool
+from workers.records.rows import Artifact, Job, JobEvent
+from workers.store.opening import open_storage
 
 ROOT = Path(__file__).parents[2]
 FAST = {

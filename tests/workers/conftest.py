@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.cli import cli
+from workers.cli.main import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (
@@ -56,7 +56,7 @@ def start_octasplat() -> Callable[..., subprocess.Popen[str]]:
 
     def start(*arguments: object) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, "-c", "from workers.cli import main; main()", *map(str, arguments)],
+            [sys.executable, "-c", "from workers.cli.main import main; main()", *map(str, arguments)],
             cwd=ROOT,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
             stdout=subprocess.PIPE,

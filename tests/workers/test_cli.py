@@ -8,7 +8,7 @@ import pytest
 
 import engine
 from engine.export.registry import exporters
-from workers.options import available_threads
+from workers.cli.options import available_threads
 
 COMMANDS = ("reconstruct", "evaluate", "export", "render", "demo")
 HEAVY = ("torch", "numba", "pycolmap", "numpy", "pydantic", "OpenImageIO", "scipy")
@@ -22,7 +22,7 @@ LIGHT = [name for name in COMMANDS if name != "export"]
 def test_help_imports_nothing_heavy(arguments):
     code = f"""
 import sys
-from workers.cli import cli
+from workers.cli.main import cli
 try:
     cli({arguments!r})
 except SystemExit as end:

@@ -6,7 +6,7 @@ import webbrowser
 
 import pytest
 
-import workers.demo_jobs
+import workers.cli.demonstration
 
 SIZE = ("--views", 4, "--width", 32, "--height", 24)
 
@@ -14,7 +14,7 @@ SIZE = ("--views", 4, "--width", 32, "--height", 24)
 @pytest.fixture
 def tiny_demo(monkeypatch):
     settings = ("iterations=3", "rays=64", "initial_points=100", "probe_rays=256", "patch_side=16")
-    monkeypatch.setattr(workers.demo_jobs, "DEMO_ASSIGNMENTS", {"fast": settings})
+    monkeypatch.setattr(workers.cli.demonstration, "DEMO_ASSIGNMENTS", {"fast": settings})
 
 
 def test_scene_only(octasplat, tmp_path):

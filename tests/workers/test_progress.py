@@ -16,8 +16,8 @@ from engine.events import (
     TrainingProgress,
     Warned,
 )
-from workers.progress import Bars, PlainLines, stopping
-from workers.wording import clock, duration, rate
+from workers.cli.progress import Bars, PlainLines, stopping
+from workers.cli.wording import clock, duration, rate
 
 TRAINING = TrainingProgress(
     iteration=310, total_iterations=1500, loss=0.1, psnr=24.13, gaussians=32000, rays_per_second=310_400,

@@ -18,7 +18,7 @@ def run_demo(address: str, output: Path = OUTPUT) -> None:
         address: of the service.
         output: folder for the scene and the result.
     """
-    from workers.demo_jobs import make_scene
+    from workers.cli.demonstration import make_scene
 
     scene = output / "scene"
     make_scene(scene, {}, quiet=False)

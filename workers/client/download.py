@@ -10,7 +10,7 @@ import httpx
 
 from engine.errors import OutputError
 from workers.client.api import TRIES, Api, ServiceError, check_stream
-from workers.storage.names import NameSet
+from workers.store.names import NameSet
 
 
 def download_results(

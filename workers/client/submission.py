@@ -9,11 +9,11 @@ from typing import Any
 import click
 
 from engine.errors import OctasplatError
+from workers.cli.progress import show_progress, staged
 from workers.client.api import Api
 from workers.client.download import download_results
 from workers.client.upload import upload_scene
 from workers.client.watch import watch_job
-from workers.progress import show_progress, staged
 
 
 class JobFailed(OctasplatError):
@@ -100,7 +100,7 @@ def fetch(api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), *, q
 
 def submit_and_wait(api: Api, what: Submission, output: Path, *, quiet: bool = False) -> None:
     """All of it, and a summary at the end."""
-    from workers.wording import run_summary
+    from workers.cli.wording import run_summary
 
     job = submit(api, what, quiet=quiet)
     if not quiet:

@@ -12,11 +12,11 @@ from typing import Any
 
 from psycopg.types.json import Jsonb
 
-from workers.queue.database import Connection, Pool
 from workers.queue.jobs import get_job, queue_again
-from workers.queue.journal import add_event, add_log_lines
 from workers.queue.port import Slips
-from workers.queue.rows import Job
+from workers.records.database import Connection, Pool
+from workers.records.journal import add_event, add_log_lines
+from workers.records.rows import Job
 
 MAX_RESCUES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""

@@ -12,11 +12,11 @@ from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
 from engine.errors import OctasplatError
-from workers.queue.database import Connection
-from workers.queue.ids import new_id
-from workers.queue.journal import add_event
 from workers.queue.port import QueueDepth, Slips
-from workers.queue.rows import Artifact, Job
+from workers.records.database import Connection
+from workers.records.ids import new_id
+from workers.records.journal import add_event
+from workers.records.rows import Artifact, Job
 
 LOCK_SECONDS = 10
 """A transaction that has locked a job and falls silent for so long is undone; its process is gone."""
@@ -28,7 +28,7 @@ class Conflict(OctasplatError):
 
 @dataclass(frozen=True)
 class NewJob:
-    """What a job is made from; see :class:`workers.queue.rows.Job`."""
+    """What a job is made from; see :class:`workers.records.rows.Job`."""
 
     owner: str
     kind: str

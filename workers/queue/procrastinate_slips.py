@@ -8,8 +8,8 @@ import procrastinate
 from procrastinate.manager import JobManager
 from procrastinate.worker import Worker
 
-from workers.queue.database import Connection, Pool
 from workers.queue.port import Deliver
+from workers.records.database import Connection, Pool
 
 TASK = "octasplat.run_job"
 

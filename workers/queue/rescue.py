@@ -5,10 +5,10 @@ import logging
 from psycopg.rows import class_row
 
 from workers.queue.attempts import rescue
-from workers.queue.database import Pool
 from workers.queue.jobs import get_job, queue_again
 from workers.queue.port import Slips
-from workers.queue.rows import Job
+from workers.records.database import Pool
+from workers.records.rows import Job
 
 logger = logging.getLogger(__name__)
 

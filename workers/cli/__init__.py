@@ -1,0 +1,1 @@
+"""The command line: thin commands, and how they show progress, signals and results."""

@@ -1,0 +1,65 @@
+"""``octasplat clean``: a scene without what nobody wants to see."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from workers.cli.options import quiet_option
+
+
+@click.command(short_help="Remove faint Gaussians, oversized ones and floaters.")
+@click.argument("source", metavar="IN", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="The scene to write.")
+@click.option("--dry-run", is_flag=True, help="Only count.")
+@click.option(
+    "--min-opacity",
+    type=click.FloatRange(0, 1, max_open=True),
+    help="Remove fainter ones.  [default: 0.01, below which they cannot be seen]",
+)
+@click.option("--min-scale", type=click.FloatRange(0), help="Remove those of a smaller standard deviation.")
+@click.option(
+    "--max-scale",
+    type=click.FloatRange(0, min_open=True),
+    help="Remove those of a larger standard deviation, in the scene's units.",
+)
+@click.option(
+    "--floaters/--no-floaters", default=True, show_default=True, help="Remove small groups by themselves."
+)
+@click.option(
+    "--min-group", type=click.IntRange(2), help="Smaller groups are floaters.  [default: 20 Gaussians]"
+)
+@click.option(
+    "--link",
+    type=click.FloatRange(0, min_open=True),
+    help="Neighbours belong together up to this many times their summed standard deviations.  [default: 1]",
+)
+@quiet_option
+def clean(source: Path, output: Path | None, dry_run: bool, quiet: bool, **given: Any) -> None:
+    """Remove Gaussians of IN that cannot be seen, are too large, or float by themselves."""
+    if (output is None) != dry_run:
+        raise click.UsageError("Name the result with -o, or say --dry-run.")
+
+    from engine.edit.cleaning import CleanOptions
+    from engine.edit.cleaning import clean as find_clean
+    from engine.errors import ConfigError
+    from workers.cli.editing import checked_options, speaker, targets_for, write_scene
+    from workers.cli.scene_files import open_scene
+    from workers.cli.signals import orderly_termination
+
+    options: CleanOptions = checked_options(CleanOptions, given)
+    targets = targets_for(output, [source], [source]) if output is not None else ()
+    gaussians = open_scene(source, quiet=quiet)
+    with orderly_termination():
+        keep, report = find_clean(gaussians, options)
+        say = click.echo if dry_run else speaker(quiet)
+        say(
+            f"{source}: {len(gaussians):,} Gaussians; {report.faint:,} too faint, "
+            f"{report.small:,} too small, {report.large:,} too large, "
+            f"{report.floating:,} in {report.groups:,} groups of floaters; "
+            f"{report.kept:,} kept."
+        )
+        if not keep.any():
+            raise ConfigError(f"{source}: nothing of it would be left; ask for less.")
+        for target in targets:
+            write_scene(gaussians.select(keep), target, say)

@@ -1,0 +1,229 @@
+"""Commands that talk to a service: submit, jobs, status, logs, cancel, retry, download."""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from engine.errors import ConfigError
+from workers.cli.options import quiet_option
+
+if TYPE_CHECKING:
+    from workers.client.api import Api
+
+F = TypeVar("F", bound=Callable[..., Any])
+STATES = ("queued", "running", "canceling", "succeeded", "failed", "canceled")
+
+
+def server_option(command: F) -> F:
+    """``--server``."""
+    return click.option(
+        "--server",
+        metavar="URL",
+        help="The service.  [default: OCTASPLAT_SERVER, or octasplat serve of this machine]",
+    )(command)
+
+
+@contextmanager
+def connected(server: str | None) -> Iterator["Api"]:
+    """The service that the user means; the token is no option, as others on a machine see those."""
+    from workers.client.api import TOKEN, Api, find_address
+
+    with Api(server or find_address(os.environ), os.environ.get(TOKEN)) as api:
+        yield api
+
+
+@click.command(short_help="Send a scene to the service and queue its reconstruction.")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
+@click.option("--preset", type=click.Choice(["fast", "standard", "paper"]), help="Where settings come from.")
+@click.option(
+    "--poses",
+    type=click.Choice(["given", "auto", "missing"]),
+    default="missing",
+    show_default=True,
+    help="Take the poses of the COLMAP model, find them, or find them if there is no model.",
+)
+@click.option("--max-side", type=int, metavar="PX", help="Shrink photographs to this longer side.")
+@click.option(
+    "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
+)
+@click.option(
+    "--set", "assignments", multiple=True, metavar="NAME=VALUE",
+    help="Any setting, e.g. test_every=10 or train.rates.quat=0.02; may be repeated.",
+)  # fmt: skip
+@click.option("--label", help="What to call the job.")
+@click.option("--queue", default="cpu", show_default=True, help="Which workers.")
+@click.option("--priority", type=click.IntRange(-100, 100), default=0, help="Higher goes first.")
+@server_option
+@quiet_option
+def submit(
+    scene: Path, wait: bool, output: Path | None, server: str | None, quiet: bool, **given: Any
+) -> None:
+    """Send SCENE: a folder with images/ (and sparse/0), one of photographs, a ZIP file or a dataset's id.
+
+    The same command goes on with an upload that broke off.
+    """
+    from workers.client.submission import Submission, submit, submit_and_wait
+
+    what = Submission(scene, _options(given), given["label"], given["queue"], given["priority"])
+    with connected(server) as api:
+        if wait:
+            submit_and_wait(api, what, output or Path(f"{scene.stem or 'scene'}-result"), quiet=quiet)
+            return
+        click.echo(submit(api, what, quiet=quiet)["id"])
+
+
+@click.command(short_help="List jobs.")
+@click.option("--state", multiple=True, type=click.Choice(STATES), help="Only these; may be repeated.")
+@click.option("--limit", type=click.IntRange(1, 200), default=20, show_default=True)
+@server_option
+def jobs(state: tuple[str, ...], limit: int, server: str | None) -> None:
+    """List jobs, the newest first."""
+    with connected(server) as api:
+        query: dict[str, Any] = {"limit": limit, **({"state": list(state)} if state else {})}
+        found = api.get("/v1/jobs", **query)["jobs"]
+    if not found:
+        click.echo("No jobs.")
+    for job in found:
+        click.echo(f"{job['id']}  {job['state']:9}  {job['kind']:11}  {_where(job):22}  {job['label'] or ''}")
+
+
+@click.command(short_help="Show a job, or wait for it.")
+@click.argument("job_id", metavar="JOB")
+@click.option("--wait", is_flag=True, help="Show the progress until it is over.")
+@click.option("--json", "as_json", is_flag=True, help="Everything, as JSON.")
+@server_option
+@quiet_option
+def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bool) -> None:
+    """Show how far JOB is; 'last' is the newest one."""
+    from workers.client.submission import wait_for
+
+    with connected(server) as api:
+        job = _job(api, job_id)
+        if wait:
+            job = wait_for(api, job["id"], quiet=quiet)
+    if as_json:
+        click.echo(json.dumps(job, indent=2))
+        return
+    click.echo(f"{job['kind']} {job['id']}: {job['state']} {_where(job)}".rstrip())
+    if job["error"]:
+        click.echo(job["error"]["message"])
+
+
+@click.command(short_help="Show the log of a job.")
+@click.argument("job_id", metavar="JOB")
+@click.option("-f", "--follow", is_flag=True, help="Go on until the job is over.")
+@server_option
+def logs(job_id: str, follow: bool, server: str | None) -> None:
+    """Show what the program of JOB wrote."""
+    with connected(server) as api:
+        job = _job(api, job_id)
+        after = 0
+        while True:
+            over = job["state"] in ("succeeded", "failed", "canceled")
+            page = api.get(f"/v1/jobs/{job['id']}/logs", after=after)
+            for line in page["lines"]:
+                click.echo(line["text"])
+            after = page["next"]
+            if page["lines"]:
+                continue
+            if over or not follow:
+                return
+            time.sleep(1)
+            job = _job(api, job["id"])
+
+
+@click.command(short_help="Stop a job.")
+@click.argument("job_id", metavar="JOB")
+@server_option
+def cancel(job_id: str, server: str | None) -> None:
+    """Stop JOB; it keeps its checkpoint."""
+    with connected(server) as api:
+        job = api.post(f"/v1/jobs/{_job(api, job_id)['id']}/cancel")
+    click.echo(f"{job['id']}: {job['state']}")
+
+
+@click.command(short_help="Queue a failed or cancelled job again.")
+@click.argument("job_id", metavar="JOB")
+@click.option("--from-start", is_flag=True, help="Not from its checkpoint.")
+@server_option
+def retry(job_id: str, from_start: bool, server: str | None) -> None:
+    """Queue JOB again; it goes on from its checkpoint."""
+    body = {"from": "start" if from_start else "checkpoint"}
+    with connected(server) as api:
+        job = api.post(f"/v1/jobs/{_job(api, job_id)['id']}/retry", body)
+    click.echo(f"{job['id']}: {job['state']}")
+
+
+@click.command(short_help="Save the results of a job.")
+@click.argument("job_id", metavar="JOB")
+@click.argument("names", nargs=-1)
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder.  [default: octasplat-<job>]")
+@server_option
+@quiet_option
+def download(
+    job_id: str, names: tuple[str, ...], output: Path | None, server: str | None, quiet: bool
+) -> None:
+    """Save the results of JOB, or only those called NAMES; goes on where it broke off."""
+    from workers.client.submission import fetch
+
+    with connected(server) as api:
+        job = _job(api, job_id)
+        fetch(api, job["id"], output or Path(f"octasplat-{job['id'][-12:]}"), names, quiet=quiet)
+
+
+def _options(given: dict[str, Any]) -> dict[str, Any]:
+    """The options of the job."""
+    options: dict[str, Any] = {
+        name: given[name] for name in ("preset", "poses", "max_side") if given[name] is not None
+    }
+    if given["iterations"] is not None:
+        options["train"] = {"iterations": given["iterations"]}
+    for assignment in given["assignments"]:
+        name, equals, text = assignment.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. train.rates.quat=0.02.")
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text
+        *path, last = name.strip().split(".")
+        section = options
+        for part in path:
+            section = section.setdefault(part, {})
+            if not isinstance(section, dict):
+                raise ConfigError(f"--set {assignment}: {part} is no section.")
+        section[last] = value
+    return options
+
+
+def _job(api: "Api", job_id: str) -> dict[str, Any]:
+    if job_id != "last":
+        job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
+        return job
+    newest = api.get("/v1/jobs", limit=1)["jobs"]
+    if not newest:
+        raise ConfigError("There are no jobs.")
+    first: dict[str, Any] = newest[0]
+    return first
+
+
+def _where(job: dict[str, Any]) -> str:
+    """How far a job is, in a few words."""
+    if job["state"] == "queued":
+        ahead = job["queue_position"]
+        return f"{ahead} before it" if ahead else ""
+    if job["state"] != "running" or not job["stage"]:
+        return ""
+    count = f" {job['step']}/{job['total_steps']}" if job["total_steps"] else ""
+    return f"{job['stage']}{count}"
+
+
+COMMANDS = (submit, jobs, status, logs, cancel, retry, download)

@@ -1,0 +1,110 @@
+"""``octasplat export``: Gaussians to other formats."""
+
+from pathlib import Path
+
+import click
+
+
+class _ExportCommand(click.Command):
+    """Lists the formats of the registry in its help; it is loaded only then."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the formats, one a row."""
+        from engine.export.registry import exporters
+
+        rows = [
+            (exporter.name, f"{', '.join(exporter.patterns)}: {exporter.description}")
+            for exporter in exporters()
+        ]
+        with formatter.section("Formats"):
+            formatter.write_dl(rows)
+
+
+@click.command(cls=_ExportCommand, short_help="Gaussians to meshes and other formats.")
+@click.argument("source", metavar="IN", type=click.Path(path_type=Path))
+@click.argument("target", metavar="OUT", type=click.Path(path_type=Path))
+@click.option("--format", "format_name", metavar="NAME", help="The format, if OUT's name does not say it.")
+@click.option(
+    "--min-opacity", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Leave fainter ones out."
+)
+@click.option(
+    "--sh-pad",
+    type=click.IntRange(0, 3),
+    help="Gaussian PLY: pad the harmonics with zeros up to this degree.",
+)
+@click.option(
+    "--spz-version",
+    type=click.Choice(["3", "4"]),
+    default="3",
+    show_default=True,
+    help="SPZ: 3, which every viewer reads, or 4.",
+)
+@click.option(
+    "--opaque",
+    is_flag=True,
+    help="GLB: cut alpha at a threshold instead of blending, for programs that cannot sort.",
+)
+@click.option(
+    "--chunks",
+    type=click.IntRange(1, 4096),
+    default=64,
+    show_default=True,
+    help="GLB: most spatial chunks, which programs sort by distance; rounded down to a power of two.",
+)
+@click.option(
+    "--texture",
+    "texture_size",
+    type=click.IntRange(8, 4096),
+    default=128,
+    show_default=True,
+    metavar="PX",
+    help="GLB, OBJ: side of the texture that holds the fall-off.",
+)
+@click.option("--no-ids", is_flag=True, help="GLB: leave out the numbers by which edits find back.")
+@click.option(
+    "--q",
+    type=click.FloatRange(0, 100, min_open=True),
+    help="Meshes: squared radius of the octagons in standard deviations.  [default: 9.21]",
+)
+def export(
+    source: Path,
+    target: Path,
+    format_name: str | None,
+    min_opacity: float,
+    sh_pad: int | None,
+    spz_version: str,
+    opaque: bool,
+    chunks: int,
+    texture_size: int,
+    no_ids: bool,
+    q: float | None,
+) -> None:
+    """Write the Gaussians of IN, the folder of a run or a file of any splat format, to OUT in another format.
+
+    OUT's name says the format, unless --format does; the formats are listed below. Where two take a name, as
+    *.ply and *.mesh.ply do, the longer pattern wins.
+    """
+    from engine.export.options import ExportOptions
+    from engine.export.registry import export_scene, exporter_for
+    from engine.gaussians.octagon import CHI2_2_99
+    from workers.cli.scene_files import open_scene
+    from workers.cli.signals import orderly_termination
+
+    exporter = exporter_for(target, format_name)  # complain before the long work
+    if opaque and exporter.name != "glb":
+        raise click.UsageError(f"--opaque is for GLB; {target} is written as {exporter.name}.")
+    gaussians = open_scene(source)
+    options = ExportOptions(
+        q=CHI2_2_99 if q is None else q,
+        min_opacity=min_opacity,
+        sh_pad_degree=sh_pad,
+        opaque=opaque,
+        chunks=chunks,
+        texture_size=texture_size,
+        ids=not no_ids,
+        spz_version=4 if spz_version == "4" else 3,
+    )
+    with orderly_termination():
+        files = export_scene(gaussians, target, options, exporter.name)
+    for path in files:
+        click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")

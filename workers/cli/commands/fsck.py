@@ -1,0 +1,82 @@
+"""``octasplat fsck``: whether the store holds what the tables name."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from workers.settings import WorkerSettings
+    from workers.store.fsck import Reference, Report
+
+_SHOWN = 50
+
+
+@click.command(short_help="Compare the tables of a service with its store.")
+@click.option(
+    "--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Data folder of octasplat serve."
+)
+@click.option("--verify", is_flag=True, help="Read every content and compare its digest; takes long.")
+@click.option("--json", "as_json", is_flag=True, help="Write the report as JSON, whole.")
+def fsck(data: Path | None, verify: bool, as_json: bool) -> None:
+    """Report contents that the tables name but the store lacks or has damaged, and contents nothing names.
+
+    Changes nothing. The exit code is 1 if something that is needed is missing or damaged.
+    """
+    import dataclasses
+    import json
+
+    from workers.settings import WorkerSettings, load_settings
+
+    settings = load_settings(WorkerSettings, data=data)
+    report = _report(settings, verify)
+    if as_json:
+        click.echo(json.dumps(dataclasses.asdict(report), indent=2))
+    else:
+        for line in describe(report):
+            click.echo(line)
+    raise SystemExit(0 if report.is_sound else 1)
+
+
+def describe(report: "Report") -> list[str]:
+    """The report for people."""
+    lines = [
+        f"{finding.kind}: {finding.where}: {finding.detail} ({finding.sha256})"
+        for finding in report.findings[:_SHOWN]
+    ]
+    if len(report.findings) > _SHOWN:
+        lines.append(f"... and {len(report.findings) - _SHOWN} more; --json lists all.")
+    lines.append(
+        f"{report.references} places in the tables, {report.blobs} contents of {report.blob_bytes} bytes in "
+        "the store" + (f", {report.verified} of them read whole." if report.verified else ".")
+    )
+    if report.unused:
+        lines.append(f"{len(report.unused)} contents of {report.unused_bytes} bytes are named by nothing.")
+    if report.young:
+        lines.append(f"{report.young} contents came within the last hour and are named by nothing yet.")
+    lines.append(
+        "Everything that is named is there."
+        if report.is_sound
+        else f"{len(report.findings)} places name content that is missing or damaged; restore the store "
+        "from a backup of the same time, or delete these datasets and jobs."
+    )
+    return lines
+
+
+def _report(settings: "WorkerSettings", verify: bool) -> "Report":
+    import asyncio
+
+    from workers.store.fsck import compare
+    from workers.store.opening import open_storage
+
+    conninfo = settings.conninfo()
+    storage = open_storage(settings.storage_address, floor_bytes=0)
+    return compare(storage, asyncio.run(_references(conninfo)), verify=verify)
+
+
+async def _references(conninfo: str) -> "list[Reference]":
+    from workers.records.database import open_pool
+    from workers.records.references import references
+
+    async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
+        return [reference async for reference in references(connection)]

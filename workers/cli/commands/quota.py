@@ -1,0 +1,62 @@
+"""``octasplat quota``: what an owner of tokens may take."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+class _Limit(click.ParamType[int]):
+    """A number, also with k, M, G or T."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if isinstance(value, int):
+            return value
+        units = {"k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
+        text = str(value).strip().lower()
+        number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1)
+        if not number.isdigit():
+            self.fail(f"{value} is not a number such as 500, 20G or 1T", param, ctx)
+        return int(number) * unit
+
+
+@click.command(short_help="Show or set what an owner may take.")
+@click.argument("owner")
+@click.option("--bytes", "max_bytes", type=_Limit(), help="Contents stored, e.g. 20G.")
+@click.option("--datasets", "max_datasets", type=_Limit(), help="Datasets.")
+@click.option("--jobs", "max_jobs", type=_Limit(), help="Jobs that are queued or running.")
+@click.option("--clear", is_flag=True, help="Set no limits but those given.")
+@click.option(
+    "--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Data folder of octasplat serve."
+)
+def quota(owner: str, clear: bool, data: Path | None, **limits: int | None) -> None:
+    """Show what OWNER has and may have, after setting the limits that are given.
+
+    All tokens of an owner share its limits.
+    """
+    import asyncio
+
+    from workers.settings import WorkerSettings, load_settings
+
+    settings = load_settings(WorkerSettings, data=data)
+    for line in asyncio.run(_run(settings.conninfo(), owner, clear, limits)):
+        click.echo(line)
+
+
+async def _run(conninfo: str, owner: str, clear: bool, limits: dict[str, int | None]) -> list[str]:
+    from workers.records.database import open_pool
+    from workers.records.quotas import NO_QUOTA, Quota, quota_of, set_quota, usage_of
+
+    async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
+        if clear or any(value is not None for value in limits.values()):
+            kept = NO_QUOTA if clear else await quota_of(connection, owner)
+            await set_quota(connection, owner, Quota(**limits).or_else(kept))
+        quota, usage = await quota_of(connection, owner), await usage_of(connection, owner)
+    rows = (
+        ("bytes", usage.bytes, quota.max_bytes),
+        ("datasets", usage.datasets, quota.max_datasets),
+        ("unfinished jobs", usage.jobs, quota.max_jobs),
+    )
+    return [f"{name}: {used} of {'any number' if limit is None else limit}" for name, used, limit in rows]

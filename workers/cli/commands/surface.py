@@ -1,0 +1,110 @@
+"""``octasplat surface``: one coloured triangle mesh of a scene."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from workers.cli.options import quiet_option, threads_option
+
+
+def _rim(_context: click.Context, _parameter: click.Parameter, value: str) -> float | None:
+    """A number of voxels, or None for ``all``."""
+    if value == "all":
+        return None
+    try:
+        number = float(value)
+    except ValueError:
+        number = -1.0
+    if not number >= 0:
+        raise click.BadParameter(f"{value!r} is neither a number of voxels nor 'all'.")
+    return number
+
+
+def _box(_context: click.Context, _parameter: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+    """Six numbers with commas between them."""
+    if value is None:
+        return None
+    try:
+        numbers = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 6:
+        raise click.BadParameter(f"{value!r} is not six numbers x0,y0,z0,x1,y1,z1.")
+    return numbers
+
+
+@click.command(short_help="One coloured triangle mesh of a scene.")
+@click.argument("source", metavar="IN", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), required=True, help="A .glb, .ply or .obj file."
+)
+@click.option("--unbounded", is_flag=True, help="Reach to the horizon, with ever coarser voxels.")
+@click.option(
+    "--bounds",
+    callback=_box,
+    metavar="X0,Y0,Z0,X1,Y1,Z1",
+    help="The box to mesh.  [default: what is seen of the space that the cameras surround]",
+)
+@click.option("--voxel", type=click.FloatRange(0, min_open=True), help="Side of a voxel, in scene units.")
+@click.option(
+    "--resolution", type=click.IntRange(16, 4096), help="Voxels along the longest side.  [default: up to 512]"
+)
+@click.option(
+    "--truncation",
+    type=click.FloatRange(2, 128),
+    metavar="VOXELS",
+    help="Half width of the band of distances kept.  [default: 3% of the cameras' distance]",
+)
+@click.option("--depth-trunc", type=click.FloatRange(0, min_open=True), help="Ignore depths beyond this.")
+@click.option("--depth", type=click.Choice(["median", "expected"]), help="Which depth.  [default: median]")
+@click.option(
+    "--depth-side",
+    type=click.IntRange(16, 8192),
+    metavar="PX",
+    help="Longer side of the depth maps.  [default: 640]",
+)
+@click.option("--min-weight", type=click.FloatRange(0, min_open=True), help="Least evidence for a voxel.")
+@click.option("--components", "keep_components", type=click.IntRange(1), help="Keep so many parts only.")
+@click.option(
+    "--min-component",
+    type=click.FloatRange(0, 1),
+    help="Remove parts of less than this share of the largest part's area.  [default: 0.01]",
+)
+@click.option(
+    "--fill-holes",
+    callback=_rim,
+    default="0",
+    metavar="VOXELS",
+    help="Close holes with rims up to this; or 'all'.",
+)
+@click.option("--max-triangles", type=click.IntRange(4), metavar="N", help="Decimate to so many triangles.")
+@click.option(
+    "--texture", "texture_side", type=click.IntRange(64, 16384), metavar="PX",
+    help="Colours in a square texture of this side instead of in the vertices; .glb and .obj.",
+)  # fmt: skip
+@click.option("--max-memory", "max_memory_gb", type=float, metavar="GB", help="For the volume.  [default: 4]")
+@click.option(
+    "--scene",
+    type=click.Path(path_type=Path),
+    help="The photographs' folder, whose cameras to use: where it is now, or for a bare file of Gaussians.",
+)
+@threads_option
+@quiet_option
+def surface(source: Path, output: Path, scene: Path | None, threads: int, quiet: bool, **given: Any) -> None:
+    """Mesh IN, the folder of a run or a file of Gaussians, into one surface of coloured triangles.
+
+    Depth is rendered from where the photographs were taken; for a file without --scene, from cameras all
+    around, which suits an object but no room. The result lies in the frame of the scene.
+    """
+    from engine.errors import Cancelled
+    from workers.cli.signals import Stopped, stop_on_signals
+    from workers.cli.surfacing import run_surface
+
+    # None means "all" for the holes, and the default for everything else.
+    options = {name: value for name, value in given.items() if value is not None or name == "fill_holes"}
+    with stop_on_signals() as should_stop:
+        try:
+            run_surface(source, output, options, scene, threads=threads, quiet=quiet, should_stop=should_stop)
+        except Cancelled as error:
+            raise Stopped(str(error), should_stop.exit_code) from None

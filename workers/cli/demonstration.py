@@ -1,0 +1,67 @@
+"""What ``octasplat demo`` does: the generated scene and its reconstruction, each resumed by itself."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from engine.config import ReconstructionConfig, read_config, resolve_config
+from engine.errors import ConfigError
+from engine.pipeline import CONFIG
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from workers.cli.progress import show_progress, staged
+from workers.cli.reconstruction import run_reconstruction
+from workers.cli.signals import orderly_termination
+
+DEMO_ASSIGNMENTS: dict[str, tuple[str, ...]] = {"fast": ("iterations=2000",)}
+"""Training settings by preset, chosen so that the demo takes less than three minutes on two cores."""
+
+
+def make_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) -> None:
+    """Write the generated scene unless it is there.
+
+    Args:
+        root: folder of the scene.
+        size: fields of :class:`GeneratedSceneConfig`; None values take the default.
+        quiet: show no progress.
+
+    Raises:
+        OctasplatError: the folder holds something else or cannot be written, or a size is out of range.
+    """
+    given: dict[str, Any] = {name: value for name, value in size.items() if value is not None}
+    config = GeneratedSceneConfig(**given)
+    if (root / "generated.json").exists():
+        write_generated_scene(root, config)  # only makes sure that it is the same
+        return
+    with (
+        orderly_termination(),
+        show_progress(quiet=quiet) as listener,
+        staged("generate", listener, config.views) as progress,
+    ):
+        write_generated_scene(root, config, progress)
+
+
+def reconstruct_scene(scene: Path, output: Path, preset: str, *, threads: int, quiet: bool) -> Path:
+    """Reconstruct the demo scene, or go on with it, and return the path of the report.
+
+    Raises:
+        Stopped: by a signal, after a checkpoint.
+        OctasplatError: as :func:`engine.pipeline.reconstruct` does.
+    """
+    config = resolve_config(preset, assignments=DEMO_ASSIGNMENTS.get(preset, ()))
+    resume = (output / CONFIG).exists()
+    if resume and read_config(output / CONFIG) != config:
+        raise ConfigError(
+            f"{output} holds a demo with other settings; delete it or name another folder with -o."
+        )
+    report = output / "report.html"
+    if not (resume and is_complete(output, config)):
+        run_reconstruction(
+            scene, output, config, resume=resume, threads=threads, quiet=quiet, resumes_by_itself=True
+        )
+    return report
+
+
+def is_complete(output: Path, config: ReconstructionConfig) -> bool:
+    """Whether every file of the run is there."""
+    names = ("scene.ply", "metrics.json", "report.html", *config.exports)
+    return all((output / name).exists() for name in names)

@@ -1,0 +1,50 @@
+"""A reconstruction with its progress shown and its signals heard, as several commands need it."""
+
+from pathlib import Path
+
+import click
+
+from engine.config import ReconstructionConfig
+from engine.errors import Cancelled
+from engine.pipeline import reconstruct
+from workers.cli.progress import show_progress, stopping
+from workers.cli.signals import Stopped, stop_on_signals
+from workers.cli.wording import run_summary
+
+
+def run_reconstruction(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    *,
+    resume: bool,
+    threads: int,
+    quiet: bool,
+    resumes_by_itself: bool = False,
+) -> None:
+    """Reconstruct, show the progress, and at the end what was reached.
+
+    With ``resumes_by_itself`` a user who stops is not told of ``--resume``, which the command does not have.
+
+    Raises:
+        Stopped: by SIGINT or SIGTERM, after a checkpoint.
+        OctasplatError: as :func:`engine.pipeline.reconstruct` does.
+    """
+    with stop_on_signals() as should_stop:
+        try:
+            with show_progress(quiet=quiet, should_stop=should_stop) as listener:
+                reconstruct(
+                    scene,
+                    output,
+                    config,
+                    resume=resume,
+                    threads=threads,
+                    listener=stopping(listener, should_stop),
+                    should_stop=should_stop,
+                )
+        except Cancelled as error:
+            message = "Stopped; the same command goes on." if resumes_by_itself else str(error)
+            raise Stopped(message, should_stop.exit_code) from None
+    if not quiet:
+        for line in run_summary(output, config.exports):
+            click.echo(line)

@@ -1,0 +1,299 @@
+"""A private Postgres in the data folder, reached by a socket only, for those who have none.
+
+    postgres/cluster/    the data; never deleted, not even when they cannot be used
+    postgres/run/        the socket
+    postgres/password    of the only user, readable by its owner
+    postgres/log         what the server says
+
+The server outlives a killed parent; the next start finds it running and takes it over.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import secrets
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import psycopg
+from psycopg.conninfo import make_conninfo
+
+from workers.postgres.binaries import PostgresBinaries, find_binaries
+from workers.postgres.server_user import ServerUser, check_reachable, reachable_binaries, server_user
+from workers.records.errors import DatabaseError
+
+NAME = "octasplat"
+"""Name of the database and of its user."""
+PORT = 5432
+"""Only names the socket; nothing listens on it."""
+START_SECONDS = 60
+_MAX_SOCKET_BYTES = 103  # the shortest limit there is (macOS); Linux takes 107
+_SETTINGS = (
+    "listen_addresses=",
+    "unix_socket_permissions=0700",
+    "shared_buffers=32MB",
+    "max_connections=100",
+    "password_encryption=scram-sha-256",
+    "timezone=UTC",
+    "log_timezone=UTC",
+)
+
+
+@dataclass(frozen=True)
+class EmbeddedPostgres:
+    """The private Postgres of one data folder.
+
+    Args:
+        data: the data folder of the service.
+    """
+
+    data: Path
+
+    @property
+    def home(self) -> Path:
+        """The folder of everything that belongs to the database."""
+        return self.data / "postgres"
+
+    @property
+    def cluster(self) -> Path:
+        """The folder of the data themselves."""
+        return self.home / "cluster"
+
+    def conninfo(self) -> str:
+        """How to connect; the password is part of it.
+
+        Raises:
+            DatabaseError: the database was never started here.
+        """
+        try:
+            password = (self.home / "password").read_text(encoding="ascii").strip()
+        except OSError as error:
+            raise DatabaseError(
+                f"{self.home} holds no database of yours ({error.strerror}); start one with octasplat serve "
+                "--data, or set DATABASE_URL."
+            ) from None
+        return make_conninfo(
+            host=str(self._socket_folder()), port=PORT, user=NAME, dbname=NAME, password=password
+        )
+
+    def is_running(self) -> bool:
+        """Whether the server answers."""
+        try:
+            with psycopg.connect(self.conninfo(), connect_timeout=5):
+                return True
+        except (DatabaseError, psycopg.OperationalError):
+            return False
+
+    def start(self) -> str:
+        """Start the server unless it runs, making the database first if there is none.
+
+        Returns:
+            How to connect, see :meth:`conninfo`.
+
+        Raises:
+            DatabaseError: it cannot be started; the text says what to do.
+        """
+        user = server_user()
+        self._make_home(user)
+        with self._alone():
+            if not self.is_running():
+                binaries = self._binaries(user)
+                if not (self.cluster / "PG_VERSION").exists():
+                    self._create(binaries, user)
+                self._remove_stale_locks()
+                self._start(binaries, user)
+            self._create_database()
+        return self.conninfo()
+
+    def stop(self) -> None:
+        """Stop the server, undoing transactions under way; harmless if it is down."""
+        if not (self.cluster / "postmaster.pid").exists():
+            return
+        user = server_user()
+        with self._alone():
+            self._run(
+                self._binaries(user), user, "pg_ctl", "-D", ".", "-m", "fast", "-w", "stop", check=False
+            )
+
+    def _make_home(self, user: ServerUser) -> None:
+        # Root keeps its own folders below to itself; the server's user only needs to pass through.
+        mode = 0o711 if user.switches else 0o700
+        try:
+            for folder in (self.data, self.home):
+                if not folder.exists():
+                    folder.mkdir(parents=True)
+                    folder.chmod(mode)
+            check_reachable(self.home / "cluster", user)
+            (self.home / "run").mkdir(exist_ok=True)
+            for folder in (self.home / "run", self._socket_folder()):
+                folder.mkdir(exist_ok=True, mode=0o700)
+                facts = folder.lstat()
+                if folder.is_symlink() or facts.st_uid not in (os.geteuid(), user.uid):
+                    raise DatabaseError(f"{folder} belongs to somebody else; remove it and start again.")
+                user.own(folder)
+                folder.chmod(0o700)
+            log = self.home / "log"
+            log.touch(mode=0o600)
+            user.own(log)
+        except OSError as error:
+            raise DatabaseError(
+                f"{self.home} cannot be used ({error.strerror or error}); name another data folder."
+            ) from None
+
+    def _socket_folder(self) -> Path:
+        folder = self.home / "run"
+        socket = f"{folder.resolve()}/.s.PGSQL.{PORT}"
+        if len(os.fsencode(socket)) <= _MAX_SOCKET_BYTES:
+            return folder.resolve()
+        digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:16]
+        root = Path(os.environ.get("XDG_RUNTIME_DIR") or "/tmp")  # noqa: S108
+        return root / f"octasplat-{digest}"
+
+    def _binaries(self, user: ServerUser) -> PostgresBinaries:
+        version = self.cluster / "PG_VERSION"
+        try:
+            major = int(version.read_text(encoding="ascii")) if version.exists() else None
+        except (OSError, ValueError):
+            raise DatabaseError(
+                f"{version} cannot be read, so the database is damaged; restore {self.cluster} from a "
+                "backup. Nothing was changed."
+            ) from None
+        return reachable_binaries(find_binaries(major), user, self.home)
+
+    def _create(self, binaries: PostgresBinaries, user: ServerUser) -> None:
+        """Make the cluster beside its place and rename it, so that a kill leaves no half of one."""
+        if self.cluster.exists() and any(self.cluster.iterdir()):
+            raise DatabaseError(
+                f"{self.cluster} holds files but no PG_VERSION, so it is no database that can be started; "
+                "move it away or restore it. Nothing was changed."
+            )
+        for left in self.home.glob("cluster.*.partial"):
+            shutil.rmtree(left)
+        partial = self.home / f"cluster.{os.getpid()}.partial"
+        partial.mkdir(mode=0o700)
+        user.own(partial)
+        password = secrets.token_urlsafe(32)
+        with tempfile.NamedTemporaryFile("w", dir=self.home, prefix=".password.", delete=False) as handle:
+            handle.write(password)
+        given = Path(handle.name)
+        try:
+            user.own(given)
+            self._run(
+                binaries, user, "initdb", "-D", ".", "-U", NAME, f"--pwfile={given}", "--auth=scram-sha-256",
+                "--encoding=UTF8", "--locale=C", "--no-sync", cwd=partial,
+            )  # fmt: skip
+            if user.switches:
+                os.chown(given, os.geteuid(), os.getegid())
+            given.chmod(0o600)
+            given.replace(self.home / "password")
+        finally:
+            given.unlink(missing_ok=True)
+        if self.cluster.exists():
+            self.cluster.rmdir()
+        partial.rename(self.cluster)
+        # A thousand flushes take seconds on some disks; only a power cut within these would tell.
+        threading.Thread(target=self._sync, args=(binaries, user), daemon=True).start()
+
+    def _sync(self, binaries: PostgresBinaries, user: ServerUser) -> None:
+        self._run(binaries, user, "initdb", "--sync-only", "-D", ".", check=False)
+
+    def _remove_stale_locks(self) -> None:
+        """Remove lock files of a server that is gone where Postgres would give up.
+
+        That is where the number in them belongs to another program by now, or to a dead process that nobody
+        has buried, as in containers without an init process.
+        """
+        for path in (
+            self.cluster / "postmaster.pid",
+            self._socket_folder() / f".s.PGSQL.{PORT}.lock",
+        ):
+            if path.exists() and not is_postgres(path):
+                path.unlink(missing_ok=True)
+
+    def _start(self, binaries: PostgresBinaries, user: ServerUser) -> None:
+        options = [f"unix_socket_directories={self._socket_folder()}", *_SETTINGS]
+        quoted = " ".join(f"-c '{option}'" for option in options)
+        try:
+            self._run(
+                binaries, user, "pg_ctl", "-D", ".", "-w", "-t", str(START_SECONDS),
+                "-l", str((self.home / "log").resolve()), "-o", quoted, "start",
+            )  # fmt: skip
+        except DatabaseError:
+            raise DatabaseError(
+                f"The database in {self.home} does not start: {self._last_words()} "
+                f"(more in {self.home / 'log'})"
+            ) from None
+
+    def _create_database(self) -> None:
+        conninfo = make_conninfo(self.conninfo(), dbname="postgres")
+        with psycopg.connect(conninfo, autocommit=True) as connection:
+            query = "SELECT 1 FROM pg_database WHERE datname = %s"
+            if connection.execute(query, [NAME]).fetchone() is None:
+                connection.execute("CREATE DATABASE octasplat")
+
+    def _last_words(self) -> str:
+        lines = (self.home / "log").read_text(encoding="utf-8", errors="replace").splitlines()
+        telling = [line for line in lines[-20:] if "FATAL" in line or "PANIC" in line] or lines[-1:]
+        return telling[-1] if telling else "it says nothing."
+
+    def _run(
+        self,
+        binaries: PostgresBinaries,
+        user: ServerUser,
+        program: str,
+        *arguments: str,
+        cwd: Path | None = None,
+        check: bool = True,
+    ) -> None:
+        command: Sequence[str] = (binaries.program(program), *arguments)
+        identity = (
+            {"user": user.uid, "group": user.gid, "extra_groups": [], "umask": 0o077} if user.switches else {}
+        )
+        # Not through a pipe: the server inherits it and would keep it open.
+        with tempfile.TemporaryFile() as output:
+            try:
+                done = subprocess.run(  # noqa: S603
+                    command,
+                    cwd=cwd or self.cluster,
+                    env={"PATH": os.environ.get("PATH", ""), "LC_ALL": "C", "TZ": "UTC"},
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,
+                    timeout=START_SECONDS + 30,
+                    check=False,
+                    **identity,  # type: ignore[call-overload]
+                )
+            except (OSError, subprocess.SubprocessError) as error:
+                raise DatabaseError(f"{command[0]} cannot be run ({error}).") from None
+            output.seek(0)
+            text = " ".join(output.read().decode(errors="replace").split())
+        if check and done.returncode != 0:
+            raise DatabaseError(f"{program} failed: {text[-600:]}")
+
+    def is_alive(self) -> bool:
+        """Whether the server's process lives; cheaper than asking it, as :meth:`is_running` does."""
+        return is_postgres(self.cluster / "postmaster.pid")
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Hold the lock of this folder, so that two starts at once make one database."""
+        with (self.home / "lock").open("w") as handle:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+
+
+def is_postgres(pid_file: Path) -> bool:
+    """Whether the number in a pid file is that of a living Postgres."""
+    try:
+        process = psutil.Process(int(pid_file.read_text(encoding="utf-8").split("\n", 1)[0]))
+        return process.status() != psutil.STATUS_ZOMBIE and "postgres" in process.name()
+    except (OSError, ValueError, psutil.Error):
+        return False

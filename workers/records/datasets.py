@@ -1,0 +1,225 @@
+"""Datasets and their files in the tables."""
+
+import uuid
+from collections.abc import Mapping
+from typing import Any
+
+from psycopg.rows import class_row
+from psycopg.types.json import Jsonb
+
+from workers.queue.jobs import Conflict
+from workers.records.database import Connection
+from workers.records.ids import new_id
+from workers.records.rows import Dataset, DatasetFile
+
+
+async def create_dataset(connection: Connection, owner: str, name: str) -> Dataset:
+    """A new dataset that takes files."""
+    dataset_id = new_id()
+    await connection.execute(
+        "INSERT INTO datasets (id, owner, name) VALUES (%s, %s, %s)", [dataset_id, owner, name]
+    )
+    dataset = await get_dataset(connection, dataset_id)
+    assert dataset is not None
+    return dataset
+
+
+async def get_dataset(connection: Connection, dataset_id: uuid.UUID, *, lock: bool = False) -> Dataset | None:
+    """The dataset of that id, or None."""
+    query = "SELECT * FROM datasets WHERE id = %s"
+    async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
+        await cursor.execute(f"{query} FOR UPDATE" if lock else query, [dataset_id])
+        return await cursor.fetchone()
+
+
+async def list_datasets(
+    connection: Connection, *, owner: str | None = None, before: uuid.UUID | None = None, limit: int = 50
+) -> list[Dataset]:
+    """Datasets, the newest first; ``owner`` None takes everybody's."""
+    async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
+        await cursor.execute(
+            """
+            SELECT * FROM datasets
+            WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
+              AND (%(before)s::uuid IS NULL OR id < %(before)s)
+            ORDER BY id DESC LIMIT %(limit)s
+            """,
+            {"owner": owner, "before": before, "limit": limit},
+        )
+        return await cursor.fetchall()
+
+
+async def put_file(
+    connection: Connection,
+    dataset_id: uuid.UUID,
+    path: str,
+    sha256: str,
+    size_bytes: int,
+    facts: Mapping[str, Any] | None = None,
+) -> DatasetFile:
+    """Record a file that has arrived, in the place of one of the same path.
+
+    Raises:
+        Conflict: the dataset takes no files any more.
+        KeyError: there is no such dataset.
+    """
+    async with connection.transaction():
+        await _open_dataset(connection, dataset_id)
+        await connection.execute(
+            """
+            INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts)
+            VALUES (%s, %s, %s, %s, %s)
+            ON CONFLICT (dataset_id, path) DO UPDATE
+            SET sha256 = excluded.sha256, size_bytes = excluded.size_bytes, facts = excluded.facts,
+                uploaded_at = now()
+            """,
+            [dataset_id, path, sha256, size_bytes, Jsonb(dict(facts or {}))],
+        )
+        file = await get_file(connection, dataset_id, path)
+    assert file is not None
+    return file
+
+
+async def remove_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> bool:
+    """Take a file out of an open dataset; False if there was none.
+
+    Raises:
+        Conflict: the dataset does not change any more.
+        KeyError: there is no such dataset.
+    """
+    async with connection.transaction():
+        await _open_dataset(connection, dataset_id)
+        cursor = await connection.execute(
+            "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s", [dataset_id, path]
+        )
+        return cursor.rowcount > 0
+
+
+async def get_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> DatasetFile | None:
+    """One file of a dataset, or None."""
+    async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
+        await cursor.execute(
+            "SELECT * FROM dataset_files WHERE dataset_id = %s AND path = %s", [dataset_id, path]
+        )
+        return await cursor.fetchone()
+
+
+async def files_of(
+    connection: Connection, dataset_id: uuid.UUID, *, after: str = "", limit: int | None = None
+) -> list[DatasetFile]:
+    """Files of a dataset by path; those after the path ``after``, at most ``limit``."""
+    async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
+        await cursor.execute(
+            """
+            SELECT * FROM dataset_files WHERE dataset_id = %s AND path COLLATE "C" > %s
+            ORDER BY path COLLATE "C" LIMIT %s
+            """,
+            [dataset_id, after, limit],
+        )
+        return await cursor.fetchall()
+
+
+async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
+    """Close an open dataset for the time of its validation.
+
+    Raises:
+        Conflict: it is being validated already.
+        KeyError: there is no such dataset.
+    """
+    async with connection.transaction():
+        dataset = await get_dataset(connection, dataset_id, lock=True)
+        if dataset is None:
+            raise KeyError(dataset_id)
+        if dataset.state == "checking" and not await _check_was_lost(connection, dataset_id):
+            raise Conflict("The dataset is being checked already; ask again in a moment.")
+        if dataset.state != "committed":
+            await connection.execute(
+                "UPDATE datasets SET state = 'checking', used_at = now(), expires_at = NULL WHERE id = %s",
+                [dataset_id],
+            )
+        return dataset
+
+
+async def end_check(
+    connection: Connection,
+    dataset_id: uuid.UUID,
+    *,
+    sound: bool,
+    has_poses: bool = False,
+    photographs: int = 0,
+    facts: Mapping[str, Any] | None = None,
+) -> Dataset:
+    """Commit a dataset that was found sound, or open it again for better files."""
+    await connection.execute(
+        """
+        UPDATE datasets SET state = CASE WHEN %(sound)s THEN 'committed' ELSE 'open' END,
+            committed_at = CASE WHEN %(sound)s THEN now() END, has_poses = %(poses)s,
+            photographs = %(photographs)s, facts = %(facts)s
+        WHERE id = %(id)s AND state = 'checking'
+        """,
+        {
+            "sound": sound,
+            "poses": has_poses,
+            "photographs": photographs,
+            "facts": Jsonb(dict(facts or {})),
+            "id": dataset_id,
+        },
+    )
+    dataset = await get_dataset(connection, dataset_id)
+    assert dataset is not None
+    return dataset
+
+
+async def change_dataset(
+    connection: Connection, dataset_id: uuid.UUID, *, name: str, pinned: bool
+) -> Dataset:
+    """Rename a dataset, or keep it whatever its age."""
+    await connection.execute(
+        """
+        UPDATE datasets SET name = %(name)s, pinned = %(pinned)s,
+            expires_at = CASE WHEN %(pinned)s THEN NULL ELSE expires_at END
+        WHERE id = %(id)s
+        """,
+        {"name": name, "pinned": pinned, "id": dataset_id},
+    )
+    dataset = await get_dataset(connection, dataset_id)
+    if dataset is None:
+        raise KeyError(dataset_id)
+    return dataset
+
+
+async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
+    """Forget a dataset that no job needs; its blobs stay until they are swept.
+
+    Raises:
+        Conflict: jobs were made from it.
+        KeyError: there is no such dataset.
+    """
+    async with connection.transaction():
+        if await get_dataset(connection, dataset_id, lock=True) is None:
+            raise KeyError(dataset_id)
+        cursor = await connection.execute(
+            "SELECT count(*) AS n FROM jobs WHERE dataset_id = %s", [dataset_id]
+        )
+        row = await cursor.fetchone()
+        if row and row["n"]:
+            raise Conflict(f"{row['n']} jobs were made from this dataset; delete them first.")
+        await connection.execute("DELETE FROM datasets WHERE id = %s", [dataset_id])
+
+
+async def _check_was_lost(connection: Connection, dataset_id: uuid.UUID) -> bool:
+    """Whether a check began so long ago that whoever made it must have gone."""
+    cursor = await connection.execute(
+        "SELECT used_at < now() - interval '15 minutes' AS lost FROM datasets WHERE id = %s", [dataset_id]
+    )
+    row = await cursor.fetchone()
+    return bool(row and row["lost"])
+
+
+async def _open_dataset(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
+    dataset = await get_dataset(connection, dataset_id, lock=True)
+    if dataset is None:
+        raise KeyError(dataset_id)
+    if dataset.state != "open":
+        raise Conflict(f"The dataset is {dataset.state}, so its files do not change; make a new dataset.")
+    return dataset

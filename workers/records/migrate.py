@@ -1,0 +1,126 @@
+"""Brings a database to this version's tables: ours and the queue's, each step once, under one lock."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+
+import psycopg
+
+from workers.records.errors import DatabaseError
+
+OURS, QUEUE = "octasplat", "procrastinate"
+OLDEST_SERVER = 140000
+_LOCK = 0x6F637461  # "octa"
+_VERSIONS = """
+CREATE TABLE IF NOT EXISTS schema_steps (
+    component text NOT NULL,
+    name text NOT NULL,
+    applied_at timestamptz NOT NULL DEFAULT now(),
+    PRIMARY KEY (component, name)
+)
+"""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One file of SQL that is applied once.
+
+    Attributes:
+        component: whose tables it changes.
+        name: name of the file; the files of a component are applied in the order of their names.
+        sql: what is executed.
+    """
+
+    component: str
+    name: str
+    sql: str
+
+
+def migrate(conninfo: str) -> tuple[str, ...]:
+    """Apply every step that the database lacks; others who start meanwhile wait.
+
+    Returns:
+        Names of the steps applied.
+
+    Raises:
+        DatabaseError: the database cannot be reached, is too old, or is newer than this version.
+    """
+    try:
+        with psycopg.connect(conninfo, autocommit=True, connect_timeout=10) as connection:
+            if connection.info.server_version < OLDEST_SERVER:
+                major = connection.info.server_version // 10000
+                raise DatabaseError(f"The database is Postgres {major}; Postgres 14 or newer is needed.")
+            connection.execute("SELECT pg_advisory_lock(%s)", [_LOCK])
+            return tuple(_apply_missing(connection))
+    except psycopg.OperationalError as error:
+        raise DatabaseError(
+            f"The database cannot be reached ({_one_line(error)}); check DATABASE_URL and that it runs."
+        ) from None
+    except psycopg.Error as error:
+        raise DatabaseError(
+            f"The database's tables cannot be brought up to date: {_one_line(error)}"
+        ) from None
+
+
+def missing_steps(applied: set[tuple[str, str]]) -> list[str]:
+    """Names of this version's steps that are not among ``applied``, which are (component, name)."""
+    return [step.name for step in all_steps() if (step.component, step.name) not in applied]
+
+
+def all_steps() -> tuple[Step, ...]:
+    """Every step of this version, in order."""
+    return (*queue_steps(), *_steps(OURS, resources.files("workers.queue") / "migrations"))
+
+
+def queue_steps() -> tuple[Step, ...]:
+    """The steps of the queue's library."""
+    return tuple(_steps(QUEUE, resources.files("procrastinate.sql") / "migrations"))
+
+
+def _steps(component: str, folder: Traversable) -> Iterator[Step]:
+    for file in sorted(folder.iterdir(), key=lambda file: file.name):
+        if file.name.endswith(".sql"):
+            yield Step(component, file.name, file.read_text(encoding="utf-8"))
+
+
+def _apply_missing(connection: psycopg.Connection) -> Iterator[str]:
+    connection.execute(_VERSIONS)
+    rows = connection.execute("SELECT component, name FROM schema_steps").fetchall()
+    applied = {(str(component), str(name)) for component, name in rows}
+    steps = all_steps()
+    unknown = applied - {(step.component, step.name) for step in steps}
+    if unknown:
+        raise DatabaseError(
+            f"The database was made by a newer version of octasplat (it has the step {max(unknown)[1]}); "
+            "install that version. Nothing was changed."
+        )
+    if not any(component == QUEUE for component, _ in applied):
+        yield from _begin_queue(connection)
+        steps = tuple(step for step in steps if step.component != QUEUE)
+    for step in steps:
+        if (step.component, step.name) not in applied:
+            with connection.transaction():
+                connection.execute(step.sql)
+                _record(connection, step)
+            yield step.name
+
+
+def _begin_queue(connection: psycopg.Connection) -> Iterator[str]:
+    """The queue's schema as it is now, which stands for all of its steps."""
+    schema = (resources.files("procrastinate.sql") / "schema.sql").read_text(encoding="utf-8")
+    with connection.transaction():
+        connection.execute(schema)
+        for step in queue_steps():
+            _record(connection, step)
+    yield "schema.sql"
+
+
+def _record(connection: psycopg.Connection, step: Step) -> None:
+    connection.execute(
+        "INSERT INTO schema_steps (component, name) VALUES (%s, %s)", [step.component, step.name]
+    )
+
+
+def _one_line(error: psycopg.Error) -> str:
+    return " ".join(str(error).split()).rstrip(".")

@@ -1,0 +1,52 @@
+"""Which workers are alive."""
+
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from psycopg.rows import class_row
+from psycopg.types.json import Jsonb
+
+from workers.records.database import Connection
+from workers.records.rows import WorkerRow
+
+
+async def see_worker(
+    connection: Connection,
+    worker_id: uuid.UUID,
+    *,
+    name: str,
+    queues: Sequence[str],
+    slots: int,
+    facts: Mapping[str, Any],
+) -> None:
+    """Say that a worker lives."""
+    await connection.execute(
+        """
+        INSERT INTO workers (id, name, queues, slots, facts) VALUES (%s, %s, %s, %s, %s)
+        ON CONFLICT (id) DO UPDATE SET seen_at = now(), facts = excluded.facts
+        """,
+        [worker_id, name, list(queues), slots, Jsonb(dict(facts))],
+    )
+
+
+async def forget_worker(connection: Connection, worker_id: uuid.UUID) -> None:
+    """A worker has gone in good order."""
+    await connection.execute("DELETE FROM workers WHERE id = %s", [worker_id])
+
+
+async def forget_lost_workers(connection: Connection, older_than_seconds: float) -> None:
+    """Forget workers that were not seen for that long."""
+    await connection.execute(
+        "DELETE FROM workers WHERE seen_at < now() - make_interval(secs => %s)", [older_than_seconds]
+    )
+
+
+async def live_workers(connection: Connection, stale_seconds: float) -> list[WorkerRow]:
+    """Workers that were seen within ``stale_seconds``, by name."""
+    async with connection.cursor(row_factory=class_row(WorkerRow)) as cursor:
+        await cursor.execute(
+            "SELECT * FROM workers WHERE seen_at > now() - make_interval(secs => %s) ORDER BY name",
+            [stale_seconds],
+        )
+        return await cursor.fetchall()

@@ -1,0 +1,189 @@
+"""Database, front end and workers of one machine."""
+
+import asyncio
+import contextlib
+import fcntl
+import logging
+import signal
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from engine.errors import OctasplatError, OutputError
+from engine.files import write_json
+from workers.client.api import ADDRESS_FILE
+from workers.postgres.embedded import EmbeddedPostgres
+from workers.records.migrate import migrate
+from workers.serve.children import KeptChild
+from workers.settings import PREFIX, WorkerSettings
+
+logger = logging.getLogger(__name__)
+
+READY_SECONDS = 180.0
+LOOK_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run.
+
+    Attributes:
+        settings: of everything.
+        host: address to listen at; None takes that of the environment.
+        port: port to listen at; None takes that of the environment.
+        queues: queues of the worker of this machine and their jobs at once; empty runs none.
+    """
+
+    settings: WorkerSettings
+    host: str | None
+    port: int | None
+    queues: Mapping[str, int]
+
+
+async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -> int:
+    """Run everything until asked to stop by a signal, or until ``on_ready`` says that it was all.
+
+    Args:
+        plan: what to run.
+        on_ready: told the address once requests are taken; if it returns an awaitable, its end ends all.
+
+    Returns:
+        Exit code.
+
+    Raises:
+        OctasplatError: something cannot be started.
+    """
+    settings = plan.settings
+    with _alone(settings.data) as address_file:
+        database = EmbeddedPostgres(settings.data.absolute()) if settings.database_url is None else None
+        try:
+            conninfo = (
+                await asyncio.to_thread(database.start) if database is not None else settings.conninfo()
+            )
+            await asyncio.to_thread(migrate, conninfo)
+            return await _run(plan, database, conninfo, address_file, on_ready)
+        finally:
+            address_file.unlink(missing_ok=True)
+            if database is not None:
+                await asyncio.to_thread(database.stop)
+
+
+async def _run(
+    plan: Plan,
+    database: EmbeddedPostgres | None,
+    conninfo: str,
+    address_file: Path,
+    on_ready: Callable[[str], Awaitable[None] | None],
+) -> int:
+    address: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+
+    def hear(line: str) -> None:
+        if line.startswith("http"):
+            write_json(address_file, {"url": line})
+            if not address.done():
+                address.set_result(line)
+                # Whoever talks to the front end finds it there again after a restart.
+                api.change_environment(f"{PREFIX}PORT", line.rpartition(":")[2])
+
+    environment = {"DATABASE_URL": conninfo, f"{PREFIX}DATA": str(plan.settings.data.absolute())}
+    listen = {"HOST": plan.host, "PORT": None if plan.port is None else str(plan.port)}
+    front = {f"{PREFIX}{name}": value for name, value in listen.items() if value is not None}
+    api = KeptChild("front end", ("-m", "service"), {**environment, **front}, hear)
+    command = ("-m", "workers", "worker", "--queues")
+    children = [api, KeptChild("maintenance", (*command, "", "--name", "maintenance"), environment)]
+    if plan.queues:
+        queues = ",".join(f"{name}={slots}" for name, slots in plan.queues.items())
+        children.append(KeptChild("worker", (*command, queues), environment))
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    def leave() -> None:
+        if stop.is_set():
+            for child in children:
+                child.stop()
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, leave)
+    kept = [asyncio.create_task(api.keep())]
+    guard = asyncio.create_task(_keep_database(database))
+    stopped = asyncio.create_task(stop.wait())
+    work: asyncio.Future[None] | None = None
+    try:
+        await _until_ready(api, address, stopped)
+        # After the front end, so that they do not take its processor time; nobody misses them yet.
+        kept += [asyncio.create_task(child.keep()) for child in children[1:]]
+        if not stop.is_set():
+            asked = on_ready(address.result())
+            work = asyncio.ensure_future(asked) if asked is not None else None
+            await asyncio.wait({stopped, *([work] if work else [])}, return_when=asyncio.FIRST_COMPLETED)
+            if work is not None and work.done():
+                work.result()
+        return 0
+    finally:
+        if work is not None:
+            work.cancel()
+        stop.set()
+        guard.cancel()
+        # Workers first, so that they can hand back their jobs while everything else still runs.
+        for child in reversed(children):
+            child.stop()
+        await asyncio.gather(*kept, guard, stopped, return_exceptions=True)
+
+
+async def _until_ready(api: KeptChild, address: "asyncio.Future[str]", stopped: "asyncio.Task[bool]") -> None:
+    """Wait for the front end.
+
+    Raises:
+        OutputError: it does not start.
+    """
+    try:
+        async with asyncio.timeout(READY_SECONDS):
+            while not address.done() and not stopped.done():
+                await asyncio.sleep(0.02)
+                if api.last_code is not None and not address.done():
+                    raise OutputError("The front end does not start; what it said stands above.")
+    except TimeoutError:
+        raise OutputError(
+            f"The front end was not ready after {READY_SECONDS:g} s; this machine may be too busy."
+        ) from None
+
+
+async def _keep_database(database: EmbeddedPostgres | None) -> None:
+    """Start the private database again whenever it ends."""
+    while database is not None:
+        await asyncio.sleep(LOOK_SECONDS)
+        if await asyncio.to_thread(database.is_alive):
+            continue
+        logger.warning("the database ended; starting it again")
+        try:
+            await asyncio.to_thread(database.start)
+        except OctasplatError as error:
+            logger.error("%s", error)
+
+
+@contextlib.contextmanager
+def _alone(data: Path) -> Iterator[Path]:
+    """Hold the data folder; yields the path of the file that says where the service is.
+
+    Raises:
+        OutputError: the folder cannot be used, or another ``octasplat serve`` does.
+    """
+    try:
+        if not data.exists():
+            data.mkdir(parents=True)
+            data.chmod(0o711)  # below, everything is shut; the database's user has to pass through
+        handle = (data / "serve.lock").open("w")
+    except OSError as error:
+        raise OutputError(
+            f"{data} cannot be used ({error.strerror or error}); name another folder with --data."
+        ) from None
+    address_file = data / ADDRESS_FILE
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise OutputError(
+                f"Another octasplat serve uses {data}; use that one, or name another folder with --data."
+            ) from None
+        yield address_file

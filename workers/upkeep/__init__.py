@@ -1,0 +1,1 @@
+"""What is done regularly: forgetting what has expired, collecting what nobody names, sending webhooks."""

@@ -1,0 +1,166 @@
+"""When jobs and datasets expire, and forgetting those that have.
+
+What expires is told in its row before it goes: ``expires_at`` is set once, when a job is over or a dataset is
+not in use any more, and stays until it is pinned, used or retried. All times are the database's.
+"""
+
+import logging
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from psycopg import sql
+
+from workers.queue.jobs import Conflict, delete_job
+from workers.records.database import Connection
+from workers.records.datasets import get_dataset
+
+logger = logging.getLogger(__name__)
+
+NOTICE_HOURS = 24.0
+"""What is old already when it comes under retention is kept so long from then on, if not shorter anyway."""
+KEY_DAYS = 7
+_AT_ONCE = 200
+
+
+@dataclass(frozen=True)
+class Retention:
+    """How long things are kept, in hours; 0 keeps them for ever.
+
+    Attributes:
+        jobs_hours: finished jobs with their results and checkpoints, from their end.
+        jobs_hours_by_kind: the same for single kinds of jobs.
+        datasets_hours: committed datasets of which there are no jobs, since they were last used.
+        open_datasets_hours: datasets that were not committed, since the last file came.
+    """
+
+    jobs_hours: float = 0.0
+    jobs_hours_by_kind: Mapping[str, float] = field(default_factory=dict)
+    datasets_hours: float = 0.0
+    open_datasets_hours: float = 0.0
+
+
+@dataclass(frozen=True)
+class Forgotten:
+    """Numbers of jobs and datasets that were forgotten."""
+
+    jobs: int
+    datasets: int
+
+
+async def set_expiries(connection: Connection, retention: Retention) -> None:
+    """Tell what will expire when, and take that back from what is kept after all."""
+    async with connection.transaction():
+        await connection.execute(
+            """
+            UPDATE jobs SET expires_at = NULL
+            WHERE expires_at IS NOT NULL AND (pinned OR state NOT IN ('succeeded', 'failed', 'canceled'))
+            """
+        )
+        kinds = dict(retention.jobs_hours_by_kind)
+        await connection.execute(
+            """
+            UPDATE jobs SET expires_at = greatest(finished_at + make_interval(secs => 3600 * kept.hours),
+                now() + make_interval(secs => 3600 * least(kept.hours, %(notice)s)))
+            FROM (
+                SELECT jobs.id, coalesce(special.hours, %(hours)s::float8) AS hours FROM jobs
+                LEFT JOIN unnest(%(kinds)s::text[], %(kind_hours)s::float8[]) AS special (kind, hours)
+                    ON special.kind = jobs.kind
+                WHERE jobs.expires_at IS NULL AND NOT jobs.pinned
+                  AND jobs.state IN ('succeeded', 'failed', 'canceled')
+            ) AS kept
+            WHERE kept.id = jobs.id AND kept.hours > 0
+            """,
+            {
+                "hours": retention.jobs_hours,
+                "notice": NOTICE_HOURS,
+                "kinds": list(kinds),
+                "kind_hours": list(kinds.values()),
+            },
+        )
+        await connection.execute(
+            """
+            UPDATE datasets SET expires_at = NULL
+            WHERE expires_at IS NOT NULL
+              AND (pinned OR EXISTS (SELECT 1 FROM jobs WHERE jobs.dataset_id = datasets.id)
+                   OR (SELECT max(uploaded_at) FROM dataset_files WHERE dataset_id = datasets.id)
+                      + make_interval(secs => 3600 * %(open)s::float8) > expires_at AND state = 'open')
+            """,
+            {"open": retention.open_datasets_hours},
+        )
+        await connection.execute(
+            """
+            UPDATE datasets SET expires_at = greatest(kept.used_at + make_interval(secs => 3600 * kept.hours),
+                now() + make_interval(secs => 3600 * least(kept.hours, %(notice)s)))
+            FROM (
+                SELECT d.id, CASE WHEN d.state = 'committed' THEN %(hours)s::float8 ELSE %(open)s::float8 END
+                    AS hours,
+                    greatest(d.used_at, (SELECT max(uploaded_at) FROM dataset_files WHERE dataset_id = d.id))
+                    AS used_at
+                FROM datasets d
+                WHERE d.expires_at IS NULL AND NOT d.pinned
+                  AND NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.dataset_id = d.id)
+            ) AS kept
+            WHERE kept.id = datasets.id AND kept.hours > 0
+            """,
+            {
+                "hours": retention.datasets_hours,
+                "open": retention.open_datasets_hours,
+                "notice": NOTICE_HOURS,
+            },
+        )
+
+
+async def forget_expired(connection: Connection) -> Forgotten:
+    """Forget what has expired; its contents stay in the store until they are collected."""
+    jobs = [await _forget_job(connection, job_id) for job_id in await _expired(connection, "jobs")]
+    datasets = [await _forget_dataset(connection, d) for d in await _expired(connection, "datasets")]
+    return Forgotten(sum(jobs), sum(datasets))
+
+
+async def forget_old_keys(connection: Connection) -> None:
+    """Forget idempotency keys that nobody repeats any more."""
+    await connection.execute(
+        "DELETE FROM idempotency_keys WHERE created_at < now() - make_interval(days => %s)", [KEY_DAYS]
+    )
+
+
+async def _expired(connection: Connection, table: str) -> list[uuid.UUID]:
+    query = sql.SQL("SELECT id FROM {} WHERE expires_at < now() AND NOT pinned ORDER BY expires_at LIMIT %s")
+    cursor = await connection.execute(query.format(sql.Identifier(table)), [_AT_ONCE])
+    return [row["id"] for row in await cursor.fetchall()]
+
+
+async def _forget_job(connection: Connection, job_id: uuid.UUID) -> bool:
+    try:
+        async with connection.transaction():
+            cursor = await connection.execute(
+                "SELECT owner FROM jobs WHERE id = %s AND expires_at < now() AND NOT pinned FOR UPDATE",
+                [job_id],
+            )
+            row = await cursor.fetchone()
+            if row is None:
+                return False
+            await delete_job(connection, job_id)
+    except Conflict:
+        return False  # unfinished jobs work on its results; later, then
+    logger.info("job %s of %s has expired", job_id, row["owner"])
+    return True
+
+
+async def _forget_dataset(connection: Connection, dataset_id: uuid.UUID) -> bool:
+    async with connection.transaction():
+        dataset = await get_dataset(connection, dataset_id, lock=True)
+        if dataset is None or dataset.pinned or dataset.expires_at is None or dataset.state == "checking":
+            return False
+        cursor = await connection.execute(
+            """
+            DELETE FROM datasets WHERE id = %s AND expires_at < now()
+              AND NOT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = datasets.id)
+            """,
+            [dataset_id],
+        )
+        if not cursor.rowcount:
+            return False
+    logger.info("dataset %s of %s has expired", dataset_id, dataset.owner)
+    return True

@@ -1,0 +1,105 @@
+"""The queue of messages: who takes one has it for a while, and says what became of it."""
+
+from dataclasses import dataclass
+
+from psycopg.rows import class_row
+
+from workers.records.database import Connection
+from workers.upkeep.webhooks.rows import Delivery, Endpoint, get_endpoint
+
+LEASE_SECONDS = 60
+"""After so long a message whose sender was lost is taken by another."""
+WAITS_SECONDS = (5, 60, 300, 1800, 7200, 14_400, 28_800, 33_000)
+"""Between the tries; 23.7 hours in all, to which up to a tenth is added by chance."""
+KEPT_DAYS = 30
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a try: HTTP status, or what went wrong before there was one."""
+
+    status: int | None
+    error: str | None = None
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the message has arrived."""
+        return self.status is not None and 200 <= self.status < 300
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether nobody wants to be told any more."""
+        return self.status == 410
+
+
+async def take_due(connection: Connection, limit: int) -> list[tuple[Delivery, Endpoint]]:
+    """Messages to send now; nobody else gets them for :data:`LEASE_SECONDS`."""
+    async with connection.transaction(), connection.cursor(row_factory=class_row(Delivery)) as cursor:
+        await cursor.execute(
+            """
+            WITH due AS (
+                SELECT deliveries.id FROM webhook_deliveries deliveries
+                JOIN webhook_endpoints endpoints ON endpoints.id = deliveries.endpoint_id
+                WHERE deliveries.state = 'pending' AND deliveries.due_at <= now() AND endpoints.enabled
+                ORDER BY deliveries.due_at LIMIT %(limit)s FOR UPDATE OF deliveries SKIP LOCKED
+            )
+            UPDATE webhook_deliveries SET tries = tries + 1, tried_at = now(),
+                due_at = now() + make_interval(secs => %(lease)s)
+            FROM due WHERE webhook_deliveries.id = due.id RETURNING webhook_deliveries.*
+            """,
+            {"limit": limit, "lease": LEASE_SECONDS},
+        )
+        taken = await cursor.fetchall()
+        with_endpoints = [
+            (delivery, await get_endpoint(connection, delivery.endpoint_id)) for delivery in taken
+        ]
+    return [(delivery, endpoint) for delivery, endpoint in with_endpoints if endpoint is not None]
+
+
+async def settle(connection: Connection, delivery: Delivery, outcome: Outcome) -> None:
+    """Enter what became of a try; if another has been made meanwhile, that one counts."""
+    wait = WAITS_SECONDS[delivery.failures] if delivery.failures < len(WAITS_SECONDS) else None
+    again = wait is not None and not outcome.is_gone
+    async with connection.transaction():
+        cursor = await connection.execute(
+            """
+            UPDATE webhook_deliveries SET status = %(status)s, error = %(error)s,
+                state = CASE WHEN %(success)s THEN 'delivered' WHEN %(again)s THEN 'pending'
+                    ELSE 'failed' END,
+                failures = failures + CASE WHEN %(success)s THEN 0 ELSE 1 END,
+                due_at = now() + make_interval(secs => %(wait)s * (1 + random() / 10))
+            WHERE id = %(id)s AND tries = %(tries)s AND state = 'pending'
+            """,
+            {
+                "status": outcome.status,
+                "error": outcome.error,
+                "success": outcome.is_success,
+                "again": again,
+                "wait": wait or 0,
+                "id": delivery.id,
+                "tries": delivery.tries,
+            },
+        )
+        if cursor.rowcount and outcome.is_gone:
+            await connection.execute(
+                "UPDATE webhook_endpoints SET enabled = false, disabled_reason = %s WHERE id = %s",
+                ["The address answered 410 Gone.", delivery.endpoint_id],
+            )
+            await connection.execute(
+                """
+                UPDATE webhook_deliveries SET state = 'failed', error = 'The webhook was disabled.'
+                WHERE endpoint_id = %s AND state = 'pending'
+                """,
+                [delivery.endpoint_id],
+            )
+
+
+async def forget_old(connection: Connection) -> None:
+    """Forget messages that were settled long ago."""
+    await connection.execute(
+        """
+        DELETE FROM webhook_deliveries
+        WHERE state <> 'pending' AND created_at < now() - make_interval(days => %s)
+        """,
+        [KEPT_DAYS],
+    )

@@ -1,0 +1,115 @@
+"""The child process of a worker: does one job, tells of it in JSON lines, stops when asked or orphaned.
+
+Run as ``python -m workers.work.child``. The first line of stdin is the task as JSON; a later line ``stop``
+asks to stop with a checkpoint, and its end means that the worker is gone. Events go to stdout, one JSON
+object a line; whatever libraries print goes to stderr, which is the job's log.
+"""
+
+import contextlib
+import importlib
+import json
+import os
+import signal
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import Any, NoReturn
+
+from engine.errors import Cancelled, OctasplatError
+from engine.events import Event
+from workers.parent import die_with
+from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, Task
+
+_OOM_SCORE = 800
+
+
+class _Lines:
+    """The original stdout, for JSON lines only."""
+
+    def __init__(self) -> None:
+        self._file = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        os.dup2(2, 1)
+        self._lock = threading.Lock()
+
+    def write(self, line: dict[str, object]) -> None:
+        with self._lock:
+            self._file.write(json.dumps(line) + "\n")
+            self._file.flush()
+
+
+def main() -> NoReturn:
+    """Do the task that stdin brings and exit."""
+    lines = _Lines()
+    given: dict[str, Any] = json.loads(sys.stdin.readline())
+    die_with(given["parent_pid"], signal.SIGKILL)  # elsewhere than on Linux the end of stdin does
+    _be_first_to_go()
+    stop = threading.Event()
+    threading.Thread(target=_watch_stdin, args=(stop,), daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    code = _work(given, lines, stop)
+    sys.stderr.flush()
+    # Not by way of the interpreter's clean-up, in which a library may hang or crash after all is done.
+    os._exit(code)
+
+
+def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
+    def tell(event: Event) -> None:
+        lines.write(event.as_dict())
+
+    try:
+        for module in given["kind_modules"]:
+            importlib.import_module(module)
+        module_name, _, function = given["program"].partition(":")
+        program = getattr(importlib.import_module(module_name), function)
+        # After all imports, as pycolmap takes SIGTERM for itself.
+        signal.signal(signal.SIGTERM, lambda _number, _frame: stop.set())
+        lines.write({"kind": "ready"})
+        program(
+            Task(
+                folder=Path(given["folder"]),
+                options=given["options"],
+                scene=Path(given["scene"]) if given["scene"] else None,
+                title=given["title"],
+                threads=given["threads"],
+                listener=tell,
+                should_stop=stop.is_set,
+            )
+        )
+    except Cancelled as error:
+        lines.write({"kind": "stopped", "message": str(error)})
+        return EXIT_STOPPED
+    except OctasplatError as error:
+        lines.write({"kind": "error", "type": _snake(type(error).__name__), "message": str(error)})
+        return EXIT_REFUSED
+    except MemoryError:
+        lines.write({"kind": "error", "type": "out_of_memory", "message": "The job ran out of memory."})
+        return EXIT_REFUSED
+    except Exception as error:  # noqa: BLE001 - told to the worker, which tells the user
+        traceback.print_exc()
+        message = f"{type(error).__name__}: {error}"
+        lines.write({"kind": "error", "type": "unexpected", "message": message})
+        return EXIT_UNEXPECTED
+    lines.write({"kind": "done"})
+    return 0
+
+
+def _watch_stdin(stop: threading.Event) -> None:
+    for line in sys.stdin:
+        if line.strip() == "stop":
+            stop.set()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _be_first_to_go() -> None:
+    """Where memory runs out, the system shall end this process rather than the database."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE), encoding="ascii")
+
+
+def _snake(name: str) -> str:
+    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).lstrip("_")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""The child process as its worker sees it: started, asked to stop, killed, heard."""
+
+import asyncio
+import contextlib
+import json
+import os
+import re
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import psutil
+
+MAX_LINE_BYTES = 1 << 20
+LAST_WORDS = 20
+_READ_BYTES = 1 << 16
+_PASSED_ON = re.compile(
+    r"PATH|HOME|USER|LOGNAME|SHELL|LANG|LC_\w+|TZ|TMPDIR|TEMP|TMP|VIRTUAL_ENV|PYTHON\w*|LD_LIBRARY_PATH|"
+    r"DYLD_LIBRARY_PATH|XDG_CACHE_HOME|CUDA_\w+|NVIDIA_\w+|NUMBA_\w+|OMP_\w+|MKL_\w+|OPENBLAS_\w+|"
+    r"OCTASPLAT_DEBUG"
+)
+
+
+def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """What a job's process may know of this one's environment: no password, key or token among it."""
+    passed = {name: value for name, value in environment.items() if _PASSED_ON.fullmatch(name)}
+    # Threads that wait for each other sleep instead of spinning, as in the command line.
+    passed.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    return passed
+
+
+class ChildProcess:
+    """A running child.
+
+    Args:
+        process: with pipes for stdin, stdout and stderr, in a session of its own.
+        on_event: told every JSON line of stdout.
+        on_log: told every line of stderr.
+    """
+
+    def __init__(
+        self,
+        process: asyncio.subprocess.Process,
+        on_event: Callable[[dict[str, Any]], None],
+        on_log: Callable[[str], None],
+    ) -> None:
+        self._process = process
+        self._on_event = on_event
+        self._on_log = on_log
+        self.last_heard = time.monotonic()
+        self.last_words: deque[str] = deque(maxlen=LAST_WORDS)
+        self.error: dict[str, Any] | None = None
+        assert process.stdout is not None and process.stderr is not None
+        self._readers = (
+            asyncio.create_task(self._read(process.stdout, self._hear)),
+            asyncio.create_task(self._read(process.stderr, self._log)),
+        )
+
+    @classmethod
+    async def start(
+        cls,
+        task: Mapping[str, Any],
+        on_event: Callable[[dict[str, Any]], None],
+        on_log: Callable[[str], None],
+    ) -> "ChildProcess":
+        """Start a child with its task, see :mod:`workers.work.child`."""
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "workers.work.child",
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,
+            env=child_environment(os.environ),
+            limit=MAX_LINE_BYTES,
+        )
+        child = cls(process, on_event, on_log)
+        child._send(json.dumps({**task, "parent_pid": os.getpid()}))
+        return child
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    async def wait(self) -> int:
+        """Wait for the end and everything said until then; returns the exit code, negative for a signal."""
+        code = await self._process.wait()
+        # A grandchild may hold the pipes open.
+        _, late = await asyncio.wait(self._readers, timeout=5)
+        for reader in late:
+            reader.cancel()
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        return code
+
+    def ask_to_stop(self) -> None:
+        """Ask for a checkpoint and the end."""
+        self._send("stop")
+
+    def kill(self) -> None:
+        """End it and whatever it started, at once."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+
+    def memory_bytes(self) -> int:
+        """Resident memory of the child and what it started."""
+        total = 0
+        with contextlib.suppress(psutil.Error):
+            child = psutil.Process(self._process.pid)
+            for process in (child, *child.children(recursive=True)):
+                with contextlib.suppress(psutil.Error):
+                    total += process.memory_info().rss
+        return total
+
+    def _send(self, line: str) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError, RuntimeError):
+            self._process.stdin.write(f"{line}\n".encode())
+
+    async def _read(self, stream: asyncio.StreamReader, take: Callable[[str], None]) -> None:
+        """Take whole lines; a line without an end is cut, so that memory stays bounded."""
+        rest = b""
+        while piece := await stream.read(_READ_BYTES):
+            self.last_heard = time.monotonic()
+            *lines, rest = (rest + piece).split(b"\n")
+            if len(rest) > MAX_LINE_BYTES:
+                lines, rest = [*lines, rest], b""
+            for line in lines:
+                take(line.decode("utf-8", errors="replace"))
+        if rest:
+            take(rest.decode("utf-8", errors="replace"))
+
+    def _hear(self, line: str) -> None:
+        try:
+            event = json.loads(line)
+        except ValueError:
+            return
+        if not isinstance(event, dict) or not isinstance(event.get("kind"), str):
+            return
+        if event["kind"] == "error":
+            self.error = {"type": str(event.get("type")), "message": str(event.get("message"))}
+        self._on_event(event)
+
+    def _log(self, line: str) -> None:
+        text = line[-4000:].split("\r")[-1].rstrip()
+        if text:
+            self.last_words.append(text)
+            self._on_log(text)

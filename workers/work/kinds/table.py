@@ -1,0 +1,81 @@
+"""The table of job kinds."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pydantic import BaseModel, ValidationError
+
+from engine.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class JobKind:
+    """A kind of job.
+
+    Attributes:
+        name: what the API calls it.
+        title: one line for people.
+        needs: what it works on: a committed dataset, or the results of a finished job.
+        options: model of its options, whose JSON Schema is published.
+        program: ``module:function`` that does the work, imported by the job's own process only; it takes a
+            :class:`workers.work.task.Task` and returns the names of its results.
+        stages: names of its stages, in order, given the options.
+        resolve: from what a user asks for to complete options.
+        source_files: results of the source job that it reads, if it needs one; those that are missing are
+            left out.
+        needs_photographs: whether it reads the photographs of the source job as well.
+        needs_poses: whether its dataset must hold a COLMAP model, given the options.
+        settle: the options as they are kept, given whether the dataset holds a COLMAP model.
+    """
+
+    name: str
+    title: str
+    needs: Literal["dataset", "result"]
+    options: type[BaseModel]
+    program: str
+    stages: Callable[[BaseModel], tuple[str, ...]]
+    resolve: Callable[[Mapping[str, Any]], BaseModel]
+    source_files: tuple[str, ...] = ()
+    needs_photographs: Callable[[BaseModel], bool] = lambda _options: False
+    needs_poses: Callable[[BaseModel], bool] = lambda _options: False
+    settle: Callable[[BaseModel, bool], BaseModel] = lambda options, _has_poses: options
+
+
+_KINDS: dict[str, JobKind] = {}
+
+
+def register(kind: JobKind) -> JobKind:
+    """Add a kind; its name must be new."""
+    if kind.name in _KINDS:
+        raise ValueError(f"a job kind named '{kind.name}' is registered already")
+    _KINDS[kind.name] = kind
+    return kind
+
+
+def job_kinds() -> tuple[JobKind, ...]:
+    """All kinds, in the order in which they were registered."""
+    return tuple(_KINDS.values())
+
+
+def kind_named(name: str) -> JobKind:
+    """The kind of that name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name not in _KINDS:
+        raise ConfigError(f"There is no job kind '{name}'; choose one of {', '.join(_KINDS)}.")
+    return _KINDS[name]
+
+
+def validated(model: type[BaseModel]) -> Callable[[Mapping[str, Any]], BaseModel]:
+    """A ``resolve`` that only validates; it raises pydantic's :class:`ValidationError`."""
+
+    def resolve(asked: Mapping[str, Any]) -> BaseModel:
+        return model.model_validate(dict(asked))
+
+    return resolve
+
+
+__all__ = ["JobKind", "ValidationError", "job_kinds", "kind_named", "register", "validated"]

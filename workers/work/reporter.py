@@ -1,0 +1,202 @@
+"""What a child says, as rows of the database: progress, events, log, checkpoints and pictures.
+
+Hearing never waits for the database. What cannot be written is dropped, but for checkpoints; a verdict at the
+end does not depend on any of it.
+"""
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import psycopg
+from psycopg_pool import PoolTimeout
+
+from workers.queue.attempts import Attempt, Fenced
+from workers.store.errors import StorageError
+from workers.work.task import RUN
+from workers.work.workspace import Checkpoint, Workspace
+
+logger = logging.getLogger(__name__)
+
+FLUSH_SECONDS = 0.5
+MAX_LOG_LINES = 20_000
+_WAITING_LINES = 2_000
+_WAITING_EVENTS = 1_000
+_STORED_KINDS = ("stage_started", "stage_finished", "held_out_measured", "warning", "run_finished")
+_IGNORED = (psycopg.Error, PoolTimeout, TimeoutError, OSError)
+
+
+class Reporter:
+    """Tells the database what a child says.
+
+    Args:
+        attempt: the job.
+        workspace: where the child writes.
+    """
+
+    def __init__(self, attempt: Attempt, workspace: Workspace) -> None:
+        self._attempt = attempt
+        self._workspace = workspace
+        self._events: deque[tuple[str, dict[str, Any]]] = deque(maxlen=_WAITING_EVENTS)
+        self._lines: deque[str] = deque(maxlen=_WAITING_LINES)
+        self._lines_seen = 0
+        self._progress: dict[str, Any] | None = None
+        self._stage = ""
+        self._stages: tuple[str, ...] = ()
+        self._stage_began = 0.0
+        self._steps = 0
+        self._first_step: int | None = None
+        self._wanted: tuple[str, int] | None = None
+        self._preview: dict[str, Any] | None = None
+        self._kept: Checkpoint | None = None
+        self._wake = asyncio.Event()
+        self._flushing = asyncio.Lock()
+        self._tasks = [asyncio.create_task(self._flush_forever()), asyncio.create_task(self._keep_forever())]
+
+    def expect(self, stages: Sequence[str]) -> None:
+        """Say which stages there will be."""
+        self._stages = tuple(stages)
+        self._events.append(("stages", {"stages": list(stages)}))
+
+    def resumed_from(self, checkpoint: Checkpoint) -> None:
+        """Say what the attempt goes on from; only what is beyond it is progress."""
+        self._kept = checkpoint
+
+    def log(self, line: str) -> None:
+        """Take a line of the child's log."""
+        self._lines_seen += 1
+        if self._lines_seen <= MAX_LOG_LINES:
+            self._lines.append(line)
+        elif self._lines_seen == MAX_LOG_LINES + 1:
+            self._lines.append(f"(More than {MAX_LOG_LINES} lines; the rest is left out.)")
+
+    def hear(self, event: dict[str, Any]) -> None:
+        """Take an event of the child."""
+        kind = event["kind"]
+        if kind == "stage_started":
+            self._stage, self._stage_began, self._first_step = event["stage"], time.monotonic(), None
+            self._steps = int(event["total_steps"])
+            self._progress = {"stage": self._stage, "step": 0, "total_steps": self._steps or None}
+        elif kind == "stage_progress":
+            self._count(event)
+        elif kind == "training_progress":
+            self._progress = {
+                "stage": self._stage,
+                "step": event["iteration"],
+                "total_steps": event["total_iterations"],
+                "seconds_left": event["seconds_left"],
+                "psnr": event["psnr"],
+                "event": {key: value for key, value in event.items() if key != "kind"},
+            }
+        elif kind == "checkpoint_written":
+            self._want_checkpoint(event["iteration"])
+        elif kind == "stage_finished":
+            # The last step comes before the end in the journal too, and is not lost to the next first one.
+            if self._progress is not None and "event" in self._progress:
+                self._events.append(("progress", self._progress.pop("event")))
+            if event["stage"] in ("poses", "train"):
+                self._want_checkpoint(self._steps if event["stage"] == "train" else 0)
+        elif kind == "preview_written":
+            self._preview = event
+            self._wake.set()
+        if kind == "warning":
+            self.log(f"Warning: {event['message']}")
+        if kind in _STORED_KINDS:
+            self._events.append((kind, {key: value for key, value in event.items() if key != "kind"}))
+
+    async def finish(self) -> None:
+        """Write everything that is left, the last checkpoint included."""
+        async with self._flushing:  # a flush that is under way would lose what it has taken
+            for task in self._tasks:
+                task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        with contextlib.suppress(*_IGNORED):
+            await self._flush()
+        await self._keep()
+
+    async def close(self) -> None:
+        """Stop, leaving what is left."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def _count(self, event: dict[str, Any]) -> None:
+        step, total = int(event["step"]), int(event["total_steps"])
+        left = None
+        if self._first_step is None:
+            self._first_step, self._stage_began = step, time.monotonic()
+        elif step > self._first_step:
+            pace = (time.monotonic() - self._stage_began) / (step - self._first_step)
+            left = pace * (total - step)
+        self._progress = {
+            "stage": event["stage"],
+            "step": step,
+            "total_steps": total,
+            "seconds_left": left,
+            "event": {key: value for key, value in event.items() if key != "kind"},
+        }
+
+    def _want_checkpoint(self, step: int) -> None:
+        self._wanted = (self._stage, step)
+        self._wake.set()
+
+    async def _flush_forever(self) -> None:
+        while True:
+            await asyncio.sleep(FLUSH_SECONDS)
+            try:
+                async with self._flushing:
+                    await self._flush()
+            except Fenced:
+                return
+            except _IGNORED as error:
+                logger.info("progress of job %s was not written: %s", self._attempt.job.id, error)
+
+    async def _flush(self) -> None:
+        progress, self._progress = self._progress, None
+        events, self._events = tuple(self._events), deque(maxlen=_WAITING_EVENTS)
+        lines, self._lines = tuple(self._lines), deque(maxlen=_WAITING_LINES)
+        for kind, data in events:
+            await self._attempt.tell(kind, data)
+        if progress is not None:
+            await self._attempt.progress(**progress)
+        if lines:
+            await self._attempt.log(lines)
+
+    async def _keep_forever(self) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            try:
+                await self._keep()
+            except Fenced:
+                return
+
+    async def _keep(self) -> None:
+        """Store the newest checkpoint and picture, if there are new ones."""
+        wanted, self._wanted = self._wanted, None
+        preview, self._preview = self._preview, None
+        try:
+            if wanted is not None:
+                await self._keep_checkpoint(*wanted)
+            if preview is not None:
+                sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN}/{preview['path']}")
+                row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
+                await self._attempt.keep_preview(row)
+        except asyncio.CancelledError:
+            self._wanted, self._preview = self._wanted or wanted, self._preview or preview
+            raise
+        except (StorageError, *_IGNORED) as error:
+            logger.warning("checkpoint of job %s was not stored: %s", self._attempt.job.id, error)
+            self.log(f"A checkpoint could not be stored: {error}")
+            self._wanted = self._wanted or wanted
+
+    async def _keep_checkpoint(self, stage: str, step: int) -> None:
+        checkpoint = await asyncio.to_thread(self._workspace.keep, stage, step)
+        if checkpoint is not None:
+            advances = checkpoint.is_beyond(self._kept)
+            await self._attempt.keep_checkpoint(checkpoint.as_row(), advances=advances)
+            self._kept = checkpoint

@@ -1,0 +1,323 @@
+"""One attempt at a job: the child at work, the heartbeat beside it, and a verdict at the end."""
+
+import asyncio
+import logging
+import math
+import time
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import Enum
+from functools import partial
+from typing import Any, TypeVar
+
+from engine.errors import OctasplatError
+from workers.queue.attempts import Attempt, Fenced
+from workers.queue.jobs import artifacts_of
+from workers.queue.port import Slips
+from workers.records.datasets import files_of, get_dataset
+from workers.settings import WorkerSettings
+from workers.store.errors import BlobMissing, DigestMismatch, StorageError
+from workers.store.protocol import Storage
+from workers.store.room import Room
+from workers.work.child_process import ChildProcess
+from workers.work.contact import DATABASE_ERRORS, Contact
+from workers.work.kinds import JobKind, kind_named
+from workers.work.reporter import Reporter
+from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED
+from workers.work.workspace import Checkpoint, Workspace
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+
+CANCEL_SECONDS = 10.0
+_EYE = ThreadPoolExecutor(1, "watch")
+"""A thread for watching children; the common ones may all be waiting for a store that is cut off as well."""
+
+
+class LostDatabase(Exception):
+    """The worker cannot say any more whether its jobs are its own, so it has let go of them."""
+
+
+class End(Enum):
+    """Why a child was stopped before its time."""
+
+    FENCED = "the job has gone on without this worker"
+    LOST = "the database was lost"
+    CANCELED = "its owner cancelled it"
+    LEAVING = "its worker is stopping"
+    SILENT = "its program said nothing for too long"
+    MEMORY = "its program needed more memory than allowed"
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What all attempts of a worker share."""
+
+    settings: WorkerSettings
+    slips: Slips
+    storage: Storage
+    room: Room
+    leaving: asyncio.Event
+
+    async def lacking_room(self) -> str | None:
+        """What lacks room for jobs, in a sentence, or None."""
+        try:
+            return await asyncio.to_thread(self.room.lacking)
+        except StorageError as error:
+            return str(error)
+
+
+class Supervisor:
+    """Runs one attempt.
+
+    Args:
+        attempt: the claimed job.
+        around: the worker.
+        since: when the claim was asked for, by ``time.monotonic()``.
+    """
+
+    def __init__(self, attempt: Attempt, around: Surroundings, since: float) -> None:
+        self._attempt = attempt
+        self._around = around
+        self._settings = around.settings
+        self._job = attempt.job
+        self._workspace = Workspace(around.settings.work_folder, attempt.job, around.storage)
+        self._reporter = Reporter(attempt, self._workspace)
+        self._child: ChildProcess | None = None
+        self._end: End | None = None
+        self._kill_at = math.inf
+        self._news = asyncio.Event()
+        self._contact = Contact(attempt, around.settings, since)
+
+    async def run(self) -> None:
+        """Work until the job is over, handed back or lost.
+
+        Raises:
+            LostDatabase: the database did not answer for too long.
+        """
+        watches = [
+            asyncio.create_task(watch())
+            for watch in (self._watch_contact, self._watch_clock, self._watch_leaving)
+        ]
+        try:
+            await asyncio.to_thread(self._workspace.open)
+            await self._work()
+        except Fenced:
+            logger.warning("attempt %d of job %s is over: others have it", self._job.attempt, self._job.id)
+        except DATABASE_ERRORS as error:
+            raise LostDatabase(str(error)) from error
+        finally:
+            for watch in watches:
+                watch.cancel()
+            if self._child is not None:
+                self._child.kill()
+            await asyncio.gather(*watches, return_exceptions=True)
+            await self._reporter.close()
+            await asyncio.to_thread(self._workspace.close)
+
+    async def _work(self) -> None:
+        try:
+            earlier = await asyncio.to_thread(self._workspace.published_before)
+            if earlier is not None:
+                await self._said(lambda: self._attempt.succeed(earlier))
+                return
+            kind = kind_named(self._job.kind)
+            task = await self._prepare(kind)
+        except OctasplatError as error:
+            await self._said(partial(self._give_up_preparing, error))
+            return
+        if self._end is not None:
+            await self._after_stop(self._end)
+            return
+        self._child = await ChildProcess.start(task, self._reporter.hear, self._reporter.log)
+        code = await self._wait_for_child(self._child)
+        if self._end not in (End.FENCED, End.LOST):
+            await self._reporter.finish()
+        # A program that was done before it heard of the wish to stop has succeeded.
+        if code == 0 and self._end in (None, End.CANCELED, End.LEAVING):
+            await self._publish()
+        elif self._end is not None:
+            await self._after_stop(self._end)
+        else:
+            await self._after_exit(self._child, code)
+
+    async def _prepare(self, kind: JobKind) -> dict[str, Any]:
+        """Fill the workspace; returns the child's task."""
+        job, settings = self._job, self._settings
+        options = kind.options.model_validate(job.options)
+        scene, title = None, ""
+        async with self._attempt.pool.connection() as connection:
+            dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
+            files = await files_of(connection, job.dataset_id) if job.dataset_id else []
+            artifacts = await artifacts_of(connection, job.source_id) if job.source_id else []
+        if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
+            title = dataset.name
+            scene = await asyncio.to_thread(self._workspace.fetch_dataset, dataset.id, files, dataset.name)
+        if kind.needs == "result":
+            await asyncio.to_thread(self._workspace.fetch_source, artifacts, kind.source_files)
+        if job.checkpoint is not None:
+            await self._restore(Checkpoint.from_row(job.checkpoint))
+        self._reporter.expect(kind.stages(options))
+        return {
+            "program": kind.program,
+            "kind_modules": list(settings.kind_modules),
+            "folder": str(self._workspace.folder),
+            "options": job.options,
+            "scene": str(scene) if scene else None,
+            "title": title,
+            "threads": settings.threads,
+        }
+
+    async def _restore(self, checkpoint: Checkpoint) -> None:
+        try:
+            await asyncio.to_thread(self._workspace.restore, checkpoint)
+        except (BlobMissing, DigestMismatch) as error:
+            await asyncio.to_thread(self._workspace.discard_run)
+            self._reporter.log(f"The checkpoint cannot be used, so the job begins anew: {error}")
+            return
+        self._reporter.resumed_from(checkpoint)
+        data = {"stage": checkpoint.stage, "step": checkpoint.step, "attempt": checkpoint.attempt}
+        await self._attempt.tell("resumed", data)
+
+    async def _give_up_preparing(self, error: OctasplatError) -> None:
+        described = {"type": type(error).__name__, "message": str(error)}
+        if isinstance(error, StorageError) and not isinstance(error, BlobMissing | DigestMismatch):
+            await self._let_go(described)
+        else:
+            await self._attempt.fail(described)
+
+    async def _publish(self) -> None:
+        try:
+            results = await asyncio.to_thread(self._workspace.publish)
+        except StorageError as error:
+            described = {"type": type(error).__name__, "message": str(error)}
+            await self._said(lambda: self._let_go(described))
+            return
+        await self._said(lambda: self._attempt.succeed(results))
+
+    async def _let_go(self, error: dict[str, Any]) -> None:
+        """Put the job back for a reason that may pass; where room is lacking, that is no fault of the job."""
+        lacking = await self._around.lacking_room()
+        if lacking is None:
+            await self._attempt.lose(self._around.slips, error)
+        else:
+            await self._attempt.hand_back(self._around.slips, f"{error['message']} {lacking}")
+
+    async def _after_stop(self, end: End) -> None:
+        if end is End.FENCED:
+            raise Fenced
+        if end is End.LOST:
+            raise LostDatabase(end.value)
+        if end is End.CANCELED:
+            await self._said(self._attempt.cancel)
+        elif end is End.LEAVING:
+            await self._said(lambda: self._attempt.hand_back(self._around.slips, end.value))
+        elif end is End.SILENT:
+            seconds = self._settings.silent_seconds
+            message = f"The job's program said nothing for {seconds:g} s and was stopped."
+            await self._said(
+                lambda: self._attempt.lose(self._around.slips, {"type": "silent", "message": message})
+            )
+        else:
+            limit = (self._settings.memory_limit_bytes or 0) / 2**30
+            message = (
+                f"The job needed more than the {limit:.1f} GB of memory that it may use; "
+                "use fewer Gaussians, smaller photographs, or a machine with more."
+            )
+            await self._said(lambda: self._attempt.fail({"type": "memory_limit", "message": message}))
+
+    async def _after_exit(self, child: ChildProcess, code: int) -> None:
+        if code in (EXIT_REFUSED, EXIT_UNEXPECTED) and child.error is not None:
+            error = child.error
+            # What fails on a full disk may well succeed on another.
+            full = await self._around.lacking_room() is not None
+            await self._said(lambda: self._let_go(error) if full else self._attempt.fail(error))
+        elif code == EXIT_STOPPED:
+            # Somebody else asked the child to stop; it wrote what is needed to go on.
+            await self._said(lambda: self._attempt.hand_back(self._around.slips, "its program was stopped"))
+        else:
+            how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+            last = f" Its last words: {child.last_words[-1]}" if child.last_words else ""
+            message = f"The job's program ended {how}.{last}"
+            await self._said(lambda: self._let_go({"type": "crashed", "message": message}))
+
+    async def _wait_for_child(self, child: ChildProcess) -> int:
+        """Wait for the child's end, which is brought about if anything asks for it."""
+        exited = asyncio.create_task(child.wait())
+        limits = asyncio.create_task(self._watch_limits(child))
+        asked = False
+        try:
+            while not exited.done():
+                left = self._kill_at - time.monotonic()
+                if left <= 0:
+                    child.kill()
+                    break
+                if self._end is not None and not asked:
+                    child.ask_to_stop()
+                    asked = True
+                self._news.clear()
+                news = asyncio.create_task(self._news.wait())
+                timeout = left if math.isfinite(left) else None
+                await asyncio.wait({exited, news}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+                news.cancel()
+            return await exited
+        finally:
+            limits.cancel()
+
+    async def _watch_contact(self) -> None:
+        """Say that the worker lives, and hear of the wishes of others."""
+        try:
+            await self._contact.keep(lambda state: self._stop(End.CANCELED) if state == "canceling" else None)
+        except Fenced:
+            self._stop(End.FENCED)
+
+    async def _watch_clock(self) -> None:
+        await self._contact.until_lost()
+        self._stop(End.LOST)
+
+    async def _watch_leaving(self) -> None:
+        await self._around.leaving.wait()
+        self._stop(End.LEAVING)
+
+    async def _watch_limits(self, child: ChildProcess) -> None:
+        """Stop a child that is silent or too big, also one that was asked to stop already."""
+        settings, loop = self._settings, asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(min(1.0, settings.silent_seconds / 4))
+            if time.monotonic() - child.last_heard > settings.silent_seconds:
+                self._stop(End.SILENT)
+            limit = settings.memory_limit_bytes
+            if limit is not None and await loop.run_in_executor(_EYE, child.memory_bytes) > limit:
+                self._stop(End.MEMORY)
+
+    def _stop(self, end: End) -> None:
+        """The first reason counts, but for the two that forbid writing; of the deadlines the earliest."""
+        if self._end is None or end in (End.FENCED, End.LOST):
+            self._end = end
+        self._kill_at = min(self._kill_at, self._deadline(end))
+        self._news.set()
+
+    def _deadline(self, end: End) -> float:
+        """Until when the child may go on to stop by itself, by ``time.monotonic()``."""
+        now, grace = time.monotonic(), self._settings.grace_seconds
+        if end is End.LOST:
+            return self._contact.late_at
+        if end is End.CANCELED:
+            return now + min(CANCEL_SECONDS, grace)
+        return now + grace if end is End.LEAVING else now
+
+    async def _said(self, say: Callable[[], Awaitable[T]]) -> T:
+        """Write the verdict, trying again for as long as the job is surely ours.
+
+        Raises:
+            LostDatabase: that time is over.
+        """
+        while True:
+            try:
+                async with asyncio.timeout(self._settings.heartbeat_seconds):
+                    return await say()
+            except DATABASE_ERRORS as error:
+                if self._contact.is_lost:
+                    raise LostDatabase(str(error)) from error
+                await asyncio.sleep(self._settings.poll_seconds)

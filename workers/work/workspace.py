@@ -1,0 +1,236 @@
+"""The folder of an attempt: filled from the store before the work, stored after it. All calls block."""
+
+import contextlib
+import fcntl
+import os
+import re
+import shutil
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from workers.queue.attempts import Result
+from workers.records.rows import Artifact, DatasetFile, Job
+from workers.store.errors import StorageError
+from workers.store.protocol import Storage
+from workers.store.trees import Manifest, TreeFile, fetch_tree, publish_manifest, read_manifest, store_tree
+from workers.work.media_types import media_type
+from workers.work.task import POSES, RESULTS, RUN
+
+_LOCK = ".lock"
+_CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
+_ALWAYS_KEPT = (
+    "run/config.json", "run/held_out.json", "run/events.jsonl", "run/training.json", "run/scene.ply",
+    "run/checkpoints/best.npz",
+)  # fmt: skip
+_TRIES = 5
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a later attempt goes on from, as the job's row keeps it."""
+
+    attempt: int
+    stage: str
+    step: int
+    files: tuple[TreeFile, ...]
+
+    def as_row(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {
+            "attempt": self.attempt,
+            "stage": self.stage,
+            "step": self.step,
+            "files": [file.model_dump() for file in self.files],
+        }
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> "Checkpoint":
+        """From JSON values."""
+        files = tuple(TreeFile.model_validate(file) for file in row["files"])
+        return cls(row["attempt"], row["stage"], row["step"], files)
+
+    def is_beyond(self, other: "Checkpoint | None") -> bool:
+        """Whether the work is further than at ``other``."""
+        order = {"poses": 0, "load": 1, "train": 2, "evaluate": 3, "export": 4}
+        if other is None:
+            return True
+        return (order.get(self.stage, 0), self.step) > (order.get(other.stage, 0), other.step)
+
+
+class Workspace:
+    """The folder of one attempt; nobody else uses it, and it is removed at the end.
+
+    Args:
+        root: folder of all work on this machine.
+        job: the job, claimed.
+        storage: the store.
+    """
+
+    def __init__(self, root: Path, job: Job, storage: Storage) -> None:
+        self._root = root
+        self._job = job
+        self._storage = storage
+        self.folder = root / "attempts" / f"{job.id}.{job.attempt}"
+        self._lock: IO[bytes] | None = None
+
+    def open(self) -> None:
+        """Make the folder, anew if there is one of that name."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True, mode=0o700)
+        self._lock = _locked(self.folder / _LOCK)
+
+    def close(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
+        """A folder with the photographs for all attempts on this machine; its files must not be changed."""
+        folder = self._root / "datasets" / str(dataset_id)
+        place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
+        if not place.exists():
+            partial = folder / f".{uuid.uuid4().hex}.partial"
+            tree = [TreeFile(path=f.path, sha256=f.sha256, size_bytes=f.size_bytes) for f in files]
+            try:
+                fetch_tree(self._storage, tree, partial)
+                with contextlib.suppress(OSError):  # another attempt was faster
+                    partial.rename(place)
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+        os.utime(folder)
+        return place
+
+    def fetch_source(self, artifacts: Sequence[Artifact], wanted: Sequence[str]) -> None:
+        """Results of the source job into the run folder."""
+        tree = [
+            TreeFile(path=a.name, sha256=a.sha256, size_bytes=a.size_bytes)
+            for a in artifacts
+            if a.name in wanted
+        ]
+        poses = [
+            TreeFile(path=a.name, sha256=a.sha256, size_bytes=a.size_bytes)
+            for a in artifacts
+            if a.name.startswith(f"{POSES}/")
+        ]
+        fetch_tree(self._storage, [*tree, *poses], self.folder / RUN, writable=True)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Put back what an earlier attempt kept.
+
+        Raises:
+            StorageError: some of it is gone or damaged.
+        """
+        fetch_tree(self._storage, checkpoint.files, self.folder, writable=True)
+
+    def discard_run(self) -> None:
+        """Forget what was restored."""
+        for name in (RUN, POSES):
+            shutil.rmtree(self.folder / name, ignore_errors=True)
+
+    def keep(self, stage: str, step: int) -> Checkpoint | None:
+        """Store what is needed to go on from here; None if there is nothing yet."""
+        for _ in range(_TRIES):
+            names = self._names_to_keep()
+            if not names:
+                return None
+            try:
+                files = store_tree(self._storage, self.folder, names).files
+            except StorageError:
+                # The program replaces files while they are read; whatever else is wrong stays wrong.
+                if all((self.folder / name).exists() for name in names):
+                    raise
+                time.sleep(0.05)
+                continue
+            return Checkpoint(self._job.attempt, stage, step, files)
+        return None
+
+    def publish(self) -> list[Result]:
+        """Store the results and publish their manifest; the job's row makes them visible."""
+        manifest = store_tree(
+            self._storage,
+            self.folder / RESULTS,
+            about={"job": str(self._job.id), "attempt": self._job.attempt, "kind": self._job.kind},
+        )
+        if not publish_manifest(self._storage, _document(self._job, self._job.attempt), manifest):
+            raise StorageError("Another result was published for this attempt; ask for a retry.")
+        return _results(manifest)
+
+    def published_before(self) -> list[Result] | None:
+        """Results that an earlier attempt published without getting to say so."""
+        for attempt in range(self._job.attempt - 1, self._job.fresh_after, -1):
+            manifest = read_manifest(self._storage, _document(self._job, attempt))
+            if manifest is not None:
+                return _results(manifest)
+        return None
+
+    def store_file(self, name: str) -> str:
+        """Store one file of the folder and return its digest."""
+        return store_tree(self._storage, self.folder, [name]).files[0].sha256
+
+    def _names_to_keep(self) -> list[str]:
+        names = [name for name in _ALWAYS_KEPT if (self.folder / name).is_file()]
+        names += [
+            path.relative_to(self.folder).as_posix() for path in (self.folder / POSES).glob("sparse/0/*")
+        ]
+        if "run/scene.ply" in names:  # the training is done, its checkpoints are of no more use
+            return [name for name in names if not name.endswith(".npz")]
+        checkpoints = [
+            path.relative_to(self.folder).as_posix()
+            for path in (self.folder / RUN / "checkpoints").glob("iteration_*.npz")
+        ]
+        newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
+        if newest is not None:
+            return [*names, newest]
+        return names if any(name.startswith(f"{POSES}/") for name in names) else []
+
+
+def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
+    """Remove the folders of attempts whose worker is gone, and photographs not used for a while.
+
+    Returns:
+        Number of folders removed.
+    """
+    removed = 0
+    for folder in (root / "attempts").glob("*"):
+        try:
+            lock = _locked(folder / _LOCK, create=False)
+        except BlockingIOError:
+            continue
+        except OSError:
+            if time.time() - folder.stat().st_mtime < 60:
+                continue  # being made right now
+            shutil.rmtree(folder, ignore_errors=True)
+        else:
+            with lock:
+                shutil.rmtree(folder, ignore_errors=True)
+        removed += 1
+    for folder in (root / "datasets").glob("*"):
+        if time.time() - folder.stat().st_mtime > dataset_seconds:
+            shutil.rmtree(folder, ignore_errors=True)
+            removed += 1
+    return removed
+
+
+def _results(manifest: Manifest) -> list[Result]:
+    return [Result(f.path, f.sha256, f.size_bytes, media_type(f.path)) for f in manifest.files]
+
+
+def _document(job: Job, attempt: int) -> str:
+    return f"results/{job.id}/{attempt}"
+
+
+def _locked(path: Path, *, create: bool = True) -> IO[bytes]:
+    """Open a file and hold its lock, which ends with this process."""
+    handle = path.open("wb" if create else "r+b")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        handle.close()
+        raise
+    return handle
