@@ -20,7 +20,7 @@ import grimp
 import networkx as nx
 
 PACKAGES = ("engine", "workers", "service")
-EVERYBODY = frozenset({"errors", "events", "colour", "rays", "threads", "settings", "logs"})
+EVERYBODY = frozenset({"errors", "events", "colour", "rays", "threads"})
 """Small modules that any other may use; they would hide the rest of the drawing."""
 
 

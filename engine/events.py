@@ -6,10 +6,13 @@ neither torch nor numba, so that a front end can use it.
 
 import json
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, ClassVar
+
+from engine.errors import Cancelled
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,29 @@ def broadcast(listeners: Iterable[Listener]) -> Listener:
             listener(event)
 
     return send
+
+
+def stopping(listener: Listener, should_stop: Callable[[], bool]) -> Listener:
+    """``listener``, but stopping the work at its next event if so asked; training does it by itself.
+
+    The returned listener raises :class:`engine.errors.Cancelled`.
+    """
+
+    def listen(event: Event) -> None:
+        listener(event)
+        if isinstance(event, StageProgress) and should_stop():
+            raise Cancelled(f"Stopped at the stage {event.stage!r}; the same command with --resume goes on.")
+
+    return listen
+
+
+@contextmanager
+def staged(name: str, tell: Listener, steps: int = 0) -> Iterator[Callable[[int, int], None]]:
+    """Announce a stage and its end; yields its progress callback (steps done, steps in all)."""
+    tell(StageStarted(name, steps))
+    began = time.monotonic()
+    yield lambda done, total: tell(StageProgress(name, done, total))
+    tell(StageFinished(name, time.monotonic() - began))
 
 
 class JsonLinesListener:

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from engine.errors import OctasplatError
 from service.intake.faults import IntakeRefused
-from workers.queue.jobs import Conflict
+from workers.records.errors import Conflict
 from workers.records.quotas import QuotaExceeded
 from workers.store.errors import (
     BlobMissing,

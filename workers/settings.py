@@ -1,6 +1,8 @@
 """Settings of everything that talks to the database, from the environment; the service adds its own."""
 
 import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -10,9 +12,10 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from engine.errors import ConfigError
 from workers.postgres.embedded import EmbeddedPostgres
-from workers.upkeep.retention import Retention
 
 PREFIX = "OCTASPLAT_"
+ADDRESS_FILE = "serve.json"
+"""In the data folder while ``octasplat serve`` runs: where the service is."""
 
 
 S = TypeVar("S", bound="WorkerSettings")
@@ -23,6 +26,23 @@ def default_data_folder() -> Path:
     if os.geteuid() == 0:
         return Path("/var/lib/octasplat")
     return platformdirs.user_data_path("octasplat")
+
+
+@dataclass(frozen=True)
+class Retention:
+    """How long things are kept, in hours; 0 keeps them for ever.
+
+    Attributes:
+        jobs_hours: finished jobs with their results and checkpoints, from their end.
+        jobs_hours_by_kind: the same for single kinds of jobs.
+        datasets_hours: committed datasets of which there are no jobs, since they were last used.
+        open_datasets_hours: datasets that were not committed, since the last file came.
+    """
+
+    jobs_hours: float = 0.0
+    jobs_hours_by_kind: Mapping[str, float] = field(default_factory=dict)
+    datasets_hours: float = 0.0
+    open_datasets_hours: float = 0.0
 
 
 class WorkerSettings(BaseSettings):

@@ -28,9 +28,9 @@ from service.schemas import (
     NewDataset,
 )
 from service.state import Service, ServiceDep
-from workers.queue.jobs import Conflict
 from workers.records import datasets as rows
 from workers.records.database import Connection
+from workers.records.errors import Conflict
 from workers.records.quotas import QuotaExceeded, bytes_left, check_bytes, check_new_dataset
 from workers.records.rows import Dataset, DatasetFile
 from workers.store.errors import TooLarge

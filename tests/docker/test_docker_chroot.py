@@ -89,7 +89,7 @@ def test_the_images_work_together(front_end: Image, worker: Image, database: str
         config = GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
         write_generated_scene(scene, config)
         with Api("http://127.0.0.1:8643", TOKEN) as api:
-            job = submit(api, Submission(scene, {"preset": "fast", "train": FEW}), quiet=True)
+            job = submit(api, Submission(scene, {"preset": "fast", "train": FEW}))
             done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
             assert done["state"] == "succeeded", (done, worker.log())
             assert {"mesh.glb", "metrics.json"} <= {

@@ -10,7 +10,6 @@ import pytest
 
 from workers.queue.attempts import Attempt, Fenced, Result, claim
 from workers.queue.jobs import (
-    Conflict,
     NewJob,
     artifacts_of,
     cancel_job,
@@ -25,6 +24,7 @@ from workers.queue.port import Slips
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.queue.rescue import rescue_lost_jobs
 from workers.records.database import Connection, Pool, open_pool
+from workers.records.errors import Conflict
 from workers.records.ids import new_id
 from workers.records.rows import Job
 

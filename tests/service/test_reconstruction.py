@@ -119,7 +119,7 @@ def test_everything_is_killed_and_the_result_is_the_same(
     machine: Machine, scene: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
     with machine.api as api:
-        job = submit(api, Submission(scene, OPTIONS, "killed"), quiet=True)
+        job = submit(api, Submission(scene, OPTIONS, "killed"))
         address = f"/v1/jobs/{job['id']}"
 
         def until(ready: Any, seconds: float = 60.0) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
             dataset = upload_scene(api, scene)
             assert dataset["state"] == "committed" and dataset["photographs"] == 8
             assert upload_scene(api, scene)["id"] == dataset["id"]  # nothing is sent twice
-            job = submit(api, Submission(Path(dataset["id"]), OPTIONS), quiet=True)
+            job = submit(api, Submission(Path(dataset["id"]), OPTIONS))
             while api.get(f"/v1/jobs/{job['id']}")["checkpoint"] is None:
                 time.sleep(0.05)
         assert machine.stop() == 0
@@ -194,7 +194,7 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
 
 def test_killed_database_comes_back(machine: Machine, scene: Path) -> None:
     with machine.api as api:
-        job = submit(api, Submission(scene, OPTIONS), quiet=True)
+        job = submit(api, Submission(scene, OPTIONS))
         while api.get(f"/v1/jobs/{job['id']}")["checkpoint"] is None:
             time.sleep(0.05)
         pid = int((machine.data / "postgres/cluster/postmaster.pid").read_text().split()[0])

@@ -15,8 +15,9 @@ from engine.events import (
     StageStarted,
     TrainingProgress,
     Warned,
+    stopping,
 )
-from workers.cli.progress import Bars, PlainLines, stopping
+from workers.cli.progress import Bars, PlainLines
 from workers.cli.wording import clock, duration, rate
 
 TRAINING = TrainingProgress(

@@ -6,9 +6,10 @@ from typing import Any
 
 from engine.config import ReconstructionConfig, read_config, resolve_config
 from engine.errors import ConfigError
+from engine.events import staged
 from engine.pipeline import CONFIG
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.cli.progress import show_progress, staged
+from workers.cli.progress import show_progress
 from workers.cli.reconstruction import run_reconstruction
 from workers.cli.signals import orderly_termination
 

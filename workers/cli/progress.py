@@ -10,7 +10,6 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
-from engine.errors import Cancelled
 from engine.events import (
     Event,
     HeldOutMeasured,
@@ -214,30 +213,6 @@ def show_progress(
     display = Bars(console, should_stop)
     with display.bars:
         yield display
-
-
-def stopping(listener: Listener, should_stop: Callable[[], bool]) -> Listener:
-    """``listener``, but stopping the work at its next event if so asked; training does it by itself.
-
-    The returned listener raises :class:`engine.errors.Cancelled`.
-    """
-
-    def listen(event: Event) -> None:
-        listener(event)
-        if isinstance(event, StageProgress) and should_stop():
-            doing = _DOING.get(event.stage, event.stage).lower()
-            raise Cancelled(f"Stopped while {doing}; the same command with --resume goes on.")
-
-    return listen
-
-
-@contextmanager
-def staged(name: str, tell: Listener, steps: int = 0) -> Iterator[Callable[[int, int], None]]:
-    """Announce a stage that is not the engine's; yields its progress callback (steps done, steps in all)."""
-    tell(StageStarted(name, steps))
-    began = time.monotonic()
-    yield lambda done, total: tell(StageProgress(name, done, total))
-    tell(StageFinished(name, time.monotonic() - began))
 
 
 def _echo(line: str) -> None:

@@ -6,8 +6,9 @@ import click
 
 from engine.config import ReconstructionConfig
 from engine.errors import Cancelled
+from engine.events import stopping
 from engine.pipeline import reconstruct
-from workers.cli.progress import show_progress, stopping
+from workers.cli.progress import show_progress
 from workers.cli.signals import Stopped, stop_on_signals
 from workers.cli.wording import run_summary
 

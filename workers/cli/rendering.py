@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from engine.config import read_config
 from engine.errors import OutputError
-from engine.events import Listener
+from engine.events import Listener, staged
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply
 from engine.pipeline import CONFIG, SCENE, run_scene
@@ -34,7 +34,7 @@ from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings
 from engine.train.trainer import trace_settings
 from workers.cli.options import is_run
-from workers.cli.progress import show_progress, staged
+from workers.cli.progress import show_progress
 from workers.cli.scene_files import open_scene
 
 DEFAULT_FPS = 30.0

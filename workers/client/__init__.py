@@ -1,1 +1,1 @@
-"""The service from the outside: uploads, jobs, progress, downloads, over HTTP only."""
+"""The service from the outside: uploads, jobs, progress, downloads, over HTTP only; prints nothing."""

@@ -11,11 +11,10 @@ from typing import Any, Self
 import httpx
 
 from engine.errors import OctasplatError
-from workers.settings import default_data_folder
+from workers.settings import ADDRESS_FILE, default_data_folder
 
 DEFAULT_ADDRESS = "http://127.0.0.1:8642"
 SERVER, TOKEN, DATA = "OCTASPLAT_SERVER", "OCTASPLAT_TOKEN", "OCTASPLAT_DATA"
-ADDRESS_FILE = "serve.json"
 TRIES = 6
 _AGAIN = frozenset({408, 429, 502, 503, 504})
 _TIMEOUT = httpx.Timeout(60.0, connect=10.0)

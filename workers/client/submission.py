@@ -1,15 +1,13 @@
 """From a folder to results: upload, queue, wait, download."""
 
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import click
-
 from engine.errors import OctasplatError
-from workers.cli.progress import show_progress, staged
+from engine.events import Listener, Warned, ignore, staged
 from workers.client.api import Api
 from workers.client.download import download_results
 from workers.client.upload import upload_scene
@@ -39,19 +37,24 @@ class Submission:
     priority: int = 0
 
 
-def submit(api: Api, what: Submission, *, quiet: bool = False) -> dict[str, Any]:
+def submit(api: Api, what: Submission, listener: Listener = ignore) -> dict[str, Any]:
     """Upload what is missing and queue the job; returns the job.
+
+    Args:
+        api: the service.
+        what: the scene and what to do with it.
+        listener: hears of the stage ``upload``, whose steps are kB, and of what the service warns of.
 
     Raises:
         OctasplatError: the scene or the options are refused, or the service does not answer.
     """
     dataset_id = _as_id(str(what.scene))
     if dataset_id is None:
-        with show_progress(quiet=quiet) as listener, staged("upload", listener) as progress:
+        with staged("upload", listener) as progress:
             dataset = upload_scene(api, what.scene, progress=lambda d, t: progress(d >> 10, t >> 10))
         dataset_id = dataset["id"]
         for warning in dataset["facts"].get("warnings", ()):
-            click.echo(f"Warning: {warning}", err=True)
+            listener(Warned(warning))
     body = {
         "dataset_id": dataset_id,
         "options": dict(what.options),
@@ -63,24 +66,31 @@ def submit(api: Api, what: Submission, *, quiet: bool = False) -> dict[str, Any]
     return job
 
 
-def wait_for(api: Api, job_id: str, *, quiet: bool = False) -> dict[str, Any]:
-    """Show a job's progress until it is over; returns it.
+def wait_for(
+    api: Api, job_id: str, listener: Listener = ignore, on_note: Callable[[str], None] = lambda _note: None
+) -> dict[str, Any]:
+    """Follow a job until it is over; returns it.
+
+    Args:
+        api: the service.
+        job_id: which.
+        listener: hears what the engine tells.
+        on_note: told in a sentence when another worker takes the job over.
 
     Raises:
         JobFailed: it failed or was cancelled.
     """
 
     def on_state(event: dict[str, Any]) -> None:
-        text = {
+        note = {
             "rescued": "The worker was lost; another one goes on.",
             "handed_back": "The worker stops; another one goes on.",
             "resumed": f"Going on from step {event.get('step')} of {event.get('stage')}.",
         }.get(event["kind"])
-        if text is not None and not quiet:
-            click.echo(text)
+        if note is not None:
+            on_note(note)
 
-    with show_progress(quiet=quiet) as listener:
-        job = watch_job(api, job_id, listener, on_state)
+    job = watch_job(api, job_id, listener, on_state)
     if job["state"] == "failed":
         raise JobFailed(f"The job failed: {job['error']['message']} (octasplat logs {job_id} says more)")
     if job["state"] == "canceled":
@@ -88,32 +98,19 @@ def wait_for(api: Api, job_id: str, *, quiet: bool = False) -> dict[str, Any]:
     return job
 
 
-def fetch(api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), *, quiet: bool = False) -> None:
-    """Save the results of a job."""
-    with show_progress(quiet=quiet) as listener, staged("download", listener) as progress:
-        paths = download_results(
-            api, job_id, folder, names=names, progress=lambda d, t: progress(d >> 10, t >> 10)
+def fetch(
+    api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), listener: Listener = ignore
+) -> tuple[Path, ...]:
+    """Save the results of a job, or only those called ``names``; returns the files.
+
+    The stage ``download``, whose steps are kB, is told to ``listener``.
+    """
+    with staged("download", listener) as progress:
+        return tuple(
+            download_results(
+                api, job_id, folder, names=names, progress=lambda d, t: progress(d >> 10, t >> 10)
+            )
         )
-    if not quiet:
-        click.echo(f"Saved {len(paths)} file{'s' if len(paths) > 1 else ''} in {folder}.")
-
-
-def submit_and_wait(api: Api, what: Submission, output: Path, *, quiet: bool = False) -> None:
-    """All of it, and a summary at the end."""
-    from workers.cli.wording import run_summary
-
-    job = submit(api, what, quiet=quiet)
-    if not quiet:
-        click.echo(f"Queued as job {job['id']}.")
-    try:
-        job = wait_for(api, job["id"], quiet=quiet)
-    except KeyboardInterrupt:
-        click.echo(f"The job goes on without you: octasplat status {job['id']}", err=True)
-        raise
-    fetch(api, job["id"], output, quiet=quiet)
-    if not quiet and (output / "metrics.json").exists():
-        for line in run_summary(output, job["options"].get("exports", ())):
-            click.echo(line)
 
 
 def _as_id(text: str) -> str | None:

@@ -11,19 +11,15 @@ from typing import Any
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from engine.errors import OctasplatError
 from workers.queue.port import QueueDepth, Slips
 from workers.records.database import Connection
+from workers.records.errors import Conflict
 from workers.records.ids import new_id
 from workers.records.journal import add_event
 from workers.records.rows import Artifact, Job
 
 LOCK_SECONDS = 10
 """A transaction that has locked a job and falls silent for so long is undone; its process is gone."""
-
-
-class Conflict(OctasplatError):
-    """The job is in a state that does not allow what was asked."""
 
 
 @dataclass(frozen=True)

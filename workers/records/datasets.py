@@ -7,8 +7,8 @@ from typing import Any
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from workers.queue.jobs import Conflict
 from workers.records.database import Connection
+from workers.records.errors import Conflict
 from workers.records.ids import new_id
 from workers.records.rows import Dataset, DatasetFile
 

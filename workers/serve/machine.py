@@ -11,11 +11,10 @@ from pathlib import Path
 
 from engine.errors import OctasplatError, OutputError
 from engine.files import write_json
-from workers.client.api import ADDRESS_FILE
 from workers.postgres.embedded import EmbeddedPostgres
 from workers.records.migrate import migrate
 from workers.serve.children import KeptChild
-from workers.settings import PREFIX, WorkerSettings
+from workers.settings import ADDRESS_FILE, PREFIX, WorkerSettings
 
 logger = logging.getLogger(__name__)
 

@@ -6,14 +6,15 @@ not in use any more, and stays until it is pinned, used or retried. All times ar
 
 import logging
 import uuid
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from psycopg import sql
 
-from workers.queue.jobs import Conflict, delete_job
+from workers.queue.jobs import delete_job
 from workers.records.database import Connection
 from workers.records.datasets import get_dataset
+from workers.records.errors import Conflict
+from workers.settings import Retention
 
 logger = logging.getLogger(__name__)
 
@@ -21,23 +22,6 @@ NOTICE_HOURS = 24.0
 """What is old already when it comes under retention is kept so long from then on, if not shorter anyway."""
 KEY_DAYS = 7
 _AT_ONCE = 200
-
-
-@dataclass(frozen=True)
-class Retention:
-    """How long things are kept, in hours; 0 keeps them for ever.
-
-    Attributes:
-        jobs_hours: finished jobs with their results and checkpoints, from their end.
-        jobs_hours_by_kind: the same for single kinds of jobs.
-        datasets_hours: committed datasets of which there are no jobs, since they were last used.
-        open_datasets_hours: datasets that were not committed, since the last file came.
-    """
-
-    jobs_hours: float = 0.0
-    jobs_hours_by_kind: Mapping[str, float] = field(default_factory=dict)
-    datasets_hours: float = 0.0
-    open_datasets_hours: float = 0.0
 
 
 @dataclass(frozen=True)

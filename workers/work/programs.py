@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from engine.config import read_config
-from engine.events import StageProgress, broadcast
+from engine.events import StageProgress, broadcast, staged, stopping
 from engine.export.options import ExportOptions
 from engine.export.registry import export_scene
 from engine.files import write_json
@@ -15,7 +15,6 @@ from engine.gaussians.ply import read_gaussian_ply
 from engine.pipeline import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
-from workers.cli.progress import staged, stopping
 from workers.work.kinds.options import ExportJobOptions, ReconstructOptions, RenderJobOptions
 from workers.work.preview import Previews
 from workers.work.task import POSES, Task

@@ -70,7 +70,8 @@ def submit(
 
     The same command goes on with an upload that broke off.
     """
-    from workers.client.submission import Submission, submit, submit_and_wait
+    from workers.cli.submitting import submit, submit_and_wait
+    from workers.client.submission import Submission
 
     what = Submission(scene, _options(given), given["label"], given["queue"], given["priority"])
     with connected(server) as api:
@@ -103,7 +104,7 @@ def jobs(state: tuple[str, ...], limit: int, server: str | None) -> None:
 @quiet_option
 def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bool) -> None:
     """Show how far JOB is; 'last' is the newest one."""
-    from workers.client.submission import wait_for
+    from workers.cli.submitting import wait_for
 
     with connected(server) as api:
         job = _job(api, job_id)
@@ -172,7 +173,7 @@ def download(
     job_id: str, names: tuple[str, ...], output: Path | None, server: str | None, quiet: bool
 ) -> None:
     """Save the results of JOB, or only those called NAMES; goes on where it broke off."""
-    from workers.client.submission import fetch
+    from workers.cli.submitting import fetch
 
     with connected(server) as api:
         job = _job(api, job_id)

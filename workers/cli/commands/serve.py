@@ -41,7 +41,7 @@ def serve(data: Path | None, host: str | None, port: int | None, queues: str, de
         click.echo(f"octasplat serves at {address}  (Ctrl-C stops it)")
 
     async def show(address: str) -> None:
-        from workers.client.demo import run_demo
+        from workers.cli.submitting import run_demo
 
         say(address)
         await asyncio.to_thread(run_demo, address)

@@ -1,0 +1,68 @@
+"""Talking to a service with the progress shown: submit, wait, save the results."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from workers.cli.progress import show_progress
+from workers.cli.wording import run_summary
+from workers.client import submission
+from workers.client.api import TOKEN, Api
+from workers.client.submission import Submission
+
+DEMO_OUTPUT = Path("octasplat-demo")
+
+
+def submit(api: Api, what: Submission, *, quiet: bool = False) -> dict[str, Any]:
+    """Upload what is missing and queue the job; returns the job."""
+    with show_progress(quiet=quiet) as listener:
+        return submission.submit(api, what, listener)
+
+
+def wait_for(api: Api, job_id: str, *, quiet: bool = False) -> dict[str, Any]:
+    """Show a job's progress until it is over; returns it."""
+    with show_progress(quiet=quiet) as listener:
+        return submission.wait_for(api, job_id, listener, (lambda _note: None) if quiet else click.echo)
+
+
+def fetch(api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), *, quiet: bool = False) -> None:
+    """Save the results of a job."""
+    with show_progress(quiet=quiet) as listener:
+        paths = submission.fetch(api, job_id, folder, names, listener)
+    if not quiet:
+        click.echo(f"Saved {len(paths)} file{'s' if len(paths) > 1 else ''} in {folder}.")
+
+
+def submit_and_wait(api: Api, what: Submission, output: Path, *, quiet: bool = False) -> None:
+    """All of it, and a summary at the end."""
+    job = submit(api, what, quiet=quiet)
+    if not quiet:
+        click.echo(f"Queued as job {job['id']}.")
+    try:
+        job = wait_for(api, job["id"], quiet=quiet)
+    except KeyboardInterrupt:
+        click.echo(f"The job goes on without you: octasplat status {job['id']}", err=True)
+        raise
+    fetch(api, job["id"], output, quiet=quiet)
+    if not quiet and (output / "metrics.json").exists():
+        for line in run_summary(output, job["options"].get("exports", ())):
+            click.echo(line)
+
+
+def run_demo(address: str, output: Path = DEMO_OUTPUT) -> None:
+    """The way of a user through the service, on a scene that octasplat makes itself.
+
+    Args:
+        address: of the service.
+        output: folder for the scene and the result.
+    """
+    from workers.cli.demonstration import make_scene
+
+    scene = output / "scene"
+    make_scene(scene, {}, quiet=False)
+    options = {"preset": "fast", "train": {"iterations": 2000}}
+    with Api(address, os.environ.get(TOKEN)) as api:
+        submit_and_wait(api, Submission(scene, options=options, label="demo"), output / "result")
+    click.echo(f"Open {output / 'result' / 'report.html'} in a browser to see the result.")
