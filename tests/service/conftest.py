@@ -5,6 +5,6 @@ from pathlib import Path
 
 from postgres_for_tests import conninfo, postgres, short_root, template
 
-sys.path.append(str(Path(__file__).parents[1] / "worker"))
+sys.path.append(str(Path(__file__).parents[1] / "work"))
 
 __all__ = ["conninfo", "postgres", "short_root", "template"]

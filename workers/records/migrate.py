@@ -70,7 +70,7 @@ def missing_steps(applied: set[tuple[str, str]]) -> list[str]:
 
 def all_steps() -> tuple[Step, ...]:
     """Every step of this version, in order."""
-    return (*queue_steps(), *_steps(OURS, resources.files("workers.queue") / "migrations"))
+    return (*queue_steps(), *_steps(OURS, resources.files("workers.records") / "migrations"))
 
 
 def queue_steps() -> tuple[Step, ...]:
