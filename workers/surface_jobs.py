@@ -20,7 +20,7 @@ from engine.surface.files import check_surface_path, write_surface
 from engine.surface.options import SurfaceOptions
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings
-from engine.train.trainer import trace_settings
+from engine.train.config import trace_settings
 from workers.options import is_run
 from workers.progress import show_progress
 from workers.scene_files import open_scene
