@@ -23,7 +23,8 @@ from engine.gaussians.order import morton_order
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceGradients
 from engine.train.config import McmcConfig, TrainConfig
-from engine.train.trainer import Trainer, fresh_state
+from engine.train.state import fresh_state
+from engine.train.trainer import Trainer
 
 SMALLEST = 10_000
 

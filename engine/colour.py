@@ -21,3 +21,12 @@ def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*s
 def to_bytes(values: Float[np.ndarray, "*shape"]) -> np.ndarray:
     """Values in [0, 1], clipped and rounded, as uint8 of the same shape."""
     return np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def composited(
+    rgb_srgb: Float[np.ndarray, "*pixels 3"],
+    alpha: Float[np.ndarray, "*pixels"],
+    background_srgb: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "*pixels 3"]:
+    """Straight colours over a background, display values throughout."""
+    return rgb_srgb * alpha[..., None] + background_srgb * (np.float32(1) - alpha[..., None])

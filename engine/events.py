@@ -28,7 +28,7 @@ class Event:
 
 @dataclass(frozen=True)
 class StageStarted(Event):
-    """A stage of the pipeline begins (``load``, ``initialise``, ``train``, ``evaluate``, ``export``)."""
+    """A stage of a job begins; a reconstruction has ``load``, ``train``, ``evaluate`` and ``export``."""
 
     kind: ClassVar[str] = "stage_started"
     stage: str

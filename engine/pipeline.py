@@ -6,17 +6,12 @@ or killed goes on where it was.
     load -> train (initialise, fit) -> scene.ply -> evaluate -> export
 """
 
-import hashlib
-import importlib.metadata
 import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-
-import engine
 from engine.config import ReconstructionConfig, read_config
 from engine.errors import ConfigError, DamagedCheckpoint, DatasetError, OutputError
 from engine.evaluate.held_out import evaluate_held_out
@@ -37,18 +32,20 @@ from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
 from engine.threads import use_threads
-from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
-from engine.train.config import TrainConfig, iteration_count, most_gaussians
-from engine.train.dense_points import dense_points
-from engine.train.initialise import from_points, from_rays
-from engine.train.trainer import Trainer, fresh_state, trace_settings
+from engine.train.batches import BatchSource
+from engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from engine.train.config import TrainConfig, iteration_count, trace_settings
+from engine.train.fingerprint import run_fingerprint
+from engine.train.initialise import initial_gaussians
+from engine.train.parts import make_shading
+from engine.train.state import TrainState, fresh_state
+from engine.train.trainer import Trainer
+from engine.versions import versions
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json",
 )  # fmt: skip
 CHECKPOINTS, CACHE = "checkpoints", "cache"
-MIN_POINTS = 50
-"""Fewer sparse points than this are no use to begin from; random ones are taken."""
 
 
 def reconstruct(
@@ -78,7 +75,7 @@ def reconstruct(
     Raises:
         DatasetError: the photographs or the model cannot be used.
         OutputError: ``output`` holds something else or cannot be written.
-        ConfigError: with ``resume``, other settings than the run's.
+        ConfigError: settings that the photographs rule out or, with ``resume``, other ones than the run's.
         TrainingFailure: training collapsed.
         Cancelled: stopped as asked.
     """
@@ -91,7 +88,8 @@ def reconstruct(
         with _stage("load", tell):
             try:
                 dataset = _open_dataset(scene, output, config, threads, tell)
-            except DatasetError:
+                BatchSource(dataset, config.train)  # refuses settings that do not suit the photographs
+            except (DatasetError, ConfigError):
                 if is_new:  # so that the corrected command finds the folder free
                     (output / CONFIG).unlink()
                     (output / EVENTS).unlink()
@@ -165,12 +163,6 @@ def open_run_dataset(output: Path, *, scene: Path | None = None, threads: int = 
     )
 
 
-def versions() -> dict[str, str]:
-    """Versions of everything that can change a result."""
-    names = ("embreex", "numba", "numpy", "scipy", "pycolmap", "OpenImageIO", "flip-evaluator")
-    return {"octasplat": engine.__version__, **{name: importlib.metadata.version(name) for name in names}}
-
-
 @contextmanager
 def _stage(name: str, tell: Listener, steps: int = 0) -> Iterator[None]:
     tell(StageStarted(name, steps))
@@ -237,13 +229,6 @@ def _open_dataset(
     return dataset
 
 
-def _fingerprint(dataset: Dataset, config: TrainConfig) -> str:
-    """Names the settings and the photographs that a checkpoint belongs to."""
-    views = [(v.name, v.width_px, v.height_px, v.origin_world.tolist()) for v in dataset.views]
-    text = json.dumps([config.model_dump(mode="json"), views, dataset.train_indices.tolist()])
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def _train(
     dataset: Dataset,
     output: Path,
@@ -253,7 +238,7 @@ def _train(
     should_stop: Callable[[], bool],
 ) -> FlatGaussians:
     folder = output / CHECKPOINTS
-    fingerprint = _fingerprint(dataset, config)
+    fingerprint = run_fingerprint(dataset, config)
     state = _resume(folder, fingerprint, tell)
     if state is None:
         first = initial_gaussians(dataset, config, threads=use_threads(threads))
@@ -284,40 +269,6 @@ def _resume(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None
     return None
 
 
-def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> FlatGaussians:
-    """The first Gaussians: on the sparse points, or on random rays where there are too few of them."""
-    rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
-    points = dataset.points
-    limit = min(config.initial_points, most_gaussians(config, dataset.train_pixel_count))
-    if len(points.xyz_world) >= MIN_POINTS:
-        centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
-        xyz, rgb = points.xyz_world, points.rgb_srgb
-        if config.lift_pixels and len(xyz) < limit:
-            more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng, threads=threads)
-            xyz, rgb = np.concatenate([xyz, more_xyz]), np.concatenate([rgb, more_rgb])
-        return from_points(
-            xyz,
-            rgb,
-            centres,
-            extent=dataset.extent,
-            limit=limit,
-            opacity=config.initial_opacity,
-            rng=rng,
-        )
-    view, y, x = dataset.sample_pixels(rng, limit)
-    origins, directions = dataset.rays(view, y, x)
-    rgb, alpha, weight = dataset.pixels(view, y, x)
-    seen = (weight > 0) & (alpha > 0)
-    return from_rays(
-        origins[seen],
-        directions[seen],
-        rgb[seen],
-        extent=dataset.extent,
-        opacity=config.initial_opacity,
-        rng=rng,
-    )
-
-
 def _evaluate(
     dataset: Dataset, output: Path, config: ReconstructionConfig, threads: int, tell: Listener
 ) -> None:
@@ -328,6 +279,7 @@ def _evaluate(
         gaussians,
         output,
         settings=trace_settings(config.train, dataset.extent),
+        shading=make_shading(config.train, len(dataset.views)),
         background=config.evaluate_background,
         run={
             "gaussians": len(gaussians),

@@ -152,7 +152,7 @@ class NewJob(Strict):
     source_id: uuid.UUID | None = Field(None, description="A job that succeeded, for kinds that work on one.")
     options: dict[str, Any] = Field(default_factory=dict, description="See GET /v1/options/{kind}.")
     label: str | None = Field(None, max_length=200)
-    queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$", description="Which workers: `cpu` or `gpu`.")
+    queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$", description="Workers that take this queue.")
     priority: int = Field(0, ge=-100, le=100, description="Higher goes first.")
     webhook: JobWebhook | None = Field(None, description="Be told of this job; see POST /v1/webhooks.")
 

@@ -1,1 +1,1 @@
-"""Runs the engine: the command line, and later the processes that take jobs from the queue."""
+"""Runs the engine: the command line, and the queue of jobs with all that takes and keeps them."""

@@ -6,8 +6,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numba
-import numpy as np
 
+from engine.colour import composited
 from engine.evaluate.gallery import ViewImages, WorstAndBest
 from engine.evaluate.report import write_report
 from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
@@ -18,8 +18,9 @@ from engine.render.images import write_png
 from engine.render.names import render_names
 from engine.render.renderer import background_colour, render_rays
 from engine.scene import Dataset
+from engine.shading.protocol import ShadingModel
 from engine.trace.cpu import CpuTracer
-from engine.trace.protocol import TraceSettings
+from engine.trace.protocol import Tracer, TraceSettings
 
 RENDERS, METRICS, REPORT = "renders", "metrics.json", "report.html"
 
@@ -30,6 +31,7 @@ def evaluate_held_out(
     output: Path,
     *,
     settings: TraceSettings,
+    shading: ShadingModel,
     background: str,
     run: Mapping[str, object],
     config: Mapping[str, object],
@@ -43,6 +45,7 @@ def evaluate_held_out(
         gaussians: the scene.
         output: folder that receives ``renders/<name>.png``, ``metrics.json`` and ``report.html``.
         settings: where rays end, as in training.
+        shading: what the scene was trained with.
         background: ``black`` or ``white``, behind renders and behind photographs with alpha.
         run: facts about the run that join the metrics.
         config: shown in the report.
@@ -50,14 +53,14 @@ def evaluate_held_out(
         tell: hears the progress.
     """
     tracer = CpuTracer(settings, threads=threads)
-    tracer.build(gaussians)
+    tracer.build(gaussians, shading.features(gaussians))
     rows: list[ViewMetrics] = []
     images = WorstAndBest()
     total = len(dataset.test_indices)
     photographs = [view.name for view in dataset.views]
     names = dict(zip(photographs, render_names(photographs), strict=True))
     for view, measured in _measured(
-        _rendered(dataset, tracer, background), threads or numba.get_num_threads()
+        _rendered(dataset, tracer, shading, background), threads or numba.get_num_threads()
     ):
         path = output / RENDERS / f"{names[view.name]}.png"
         write_png(path, view.render)
@@ -78,13 +81,15 @@ def evaluate_held_out(
     )
 
 
-def _rendered(dataset: Dataset, tracer: CpuTracer, background: str) -> Iterator[RenderedView]:
+def _rendered(
+    dataset: Dataset, tracer: Tracer, shading: ShadingModel, background: str
+) -> Iterator[RenderedView]:
     colour = background_colour(background)
     for index in dataset.test_indices:
         origin, directions = dataset.view_rays(int(index))
         rgb, alpha, weight = dataset.view_image(int(index))
-        image = render_rays(tracer, origin, directions, colour)
-        reference = rgb * alpha[..., None] + colour * (np.float32(1) - alpha[..., None])
+        image = render_rays(tracer, origin, directions, colour, shading)
+        reference = composited(rgb, alpha, colour)
         yield RenderedView(
             dataset.views[index].name, image.rgb_srgb, reference, weight, alpha if dataset.has_alpha else None
         )

@@ -1,8 +1,14 @@
 """Image metrics: PSNR, SSIM in two variants, MS-SSIM and FLIP.
 
 All take images of display values in [0, 1] and compute in float64. ``ssim`` is not one number: the papers on
-Gaussian splatting pad the image with zeros, Wang et al. keep only windows that lie wholly inside, and the two
-differ in the second decimal; both are here under names of their own.
+Gaussian splatting pad the image with zeros, its inventors keep only windows that lie wholly inside, and the
+two differ in the second decimal; both are here under names of their own. Sources:
+
+- SSIM: "Image Quality Assessment: From Error Visibility to Structural Similarity"
+  (https://doi.org/10.1109/TIP.2003.819861);
+- MS-SSIM: "Multi-scale structural similarity for image quality assessment"
+  (https://doi.org/10.1109/ACSSC.2003.1292216);
+- FLIP: "FLIP: A Difference Evaluator for Alternating Images" (https://doi.org/10.1145/3406183).
 """
 
 from typing import NamedTuple
@@ -28,9 +34,9 @@ DEFINITIONS: dict[str, str] = {
     "closest to the photograph: what is left when its exposure does not count",
     "ssim": "as in 3D Gaussian Splatting: Gaussian window 11, sigma 1.5, zero padding, C1 1e-4, C2 9e-4, "
     "mean over all pixels and channels",
-    "ssim_valid": "the same formula over the windows that lie wholly inside the image (Wang et al. 2004)",
-    "ms_ssim": "Wang et al. 2003, five scales; null where the smaller side is 160 pixels or less",
-    "flip": "mean LDR-FLIP (Andersson et al. 2020) at 67 pixels per degree; 0 is best",
+    "ssim_valid": "the same formula over the windows that lie wholly inside the image",
+    "ms_ssim": "multi-scale SSIM, five scales; null where the smaller side is 160 pixels or less",
+    "flip": "mean LDR-FLIP at 67 pixels per degree; 0 is best",
     "images": "renders and references are rounded to 8 bits first; pixels that a mask rules out do not count "
     "in PSNR and are replaced by the reference's in the other metrics",
     "mean": "the mean of the per-view values, not of pooled errors",
@@ -119,7 +125,7 @@ def ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h
 
 
 def ssim_valid(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float:
-    """SSIM of Wang et al. (2004): only windows that lie wholly inside the image count.
+    """SSIM as first published: only windows that lie wholly inside the image count.
 
     Not-a-number when the image is smaller than the window of 11 pixels.
     """
@@ -137,7 +143,7 @@ def ssim_both(
 
 
 def ms_ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float | None:
-    """Multi-scale SSIM over five scales (Wang, Simoncelli and Bovik 2003), windows wholly inside.
+    """Multi-scale SSIM over five scales, windows wholly inside.
 
     Negative means are cut to 0, per channel and scale, and the channels averaged last.
 
@@ -159,7 +165,7 @@ def ms_ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray,
 
 
 def flip(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> FlipError:
-    """LDR-FLIP (Andersson et al. 2020): what a viewer notices when the two images alternate.
+    """LDR-FLIP: what a viewer notices when the two images alternate.
 
     Computed by NVIDIA's own library for a screen of 67 pixels per degree.
     """

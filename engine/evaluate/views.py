@@ -174,8 +174,9 @@ def summarise(views: Iterable[ViewMetrics]) -> Metrics:
 def bootstrap_interval(
     values: Sequence[float], *, level: float = 0.95, seed: int = 0
 ) -> tuple[float, float] | None:
-    """Percentile bootstrap interval of the mean (Efron 1979); the same values always give the same interval.
+    """Percentile bootstrap interval of the mean; the same values always give the same interval.
 
+    After "Bootstrap Methods: Another Look at the Jackknife" (https://doi.org/10.1214/aos/1176344552).
     Numbers that are not finite are left out. ``None`` for fewer than two values, which have no spread.
     """
     kept = np.array([value for value in values if math.isfinite(value)])

@@ -1,4 +1,7 @@
-"""The octagon of a flat Gaussian (paper Eq. 6), its opacity-adapted radius, and the way back."""
+"""The octagon of a flat Gaussian, its opacity-adapted radius, and the way back.
+
+"The paper" is "REdiSplats: Ray Tracing for Editable Gaussian Splatting" (https://arxiv.org/abs/2503.12284).
+"""
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int

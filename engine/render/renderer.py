@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from engine.shading.plain import PLAIN
+from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
 
 RAYS_AT_ONCE = 1 << 18
@@ -36,8 +38,12 @@ def render_rays(
     origin_world: Float32[np.ndarray, "3"],
     directions_world: Float32[np.ndarray, "h w 3"],
     background: Float32[np.ndarray, "3"],
+    shading: ShadingModel = PLAIN,
 ) -> RenderedImage:
-    """Trace an image whose rays share one origin; directions have unit length."""
+    """Trace an image whose rays share one origin, and develop it; directions have unit length.
+
+    Where ``shading`` has features, ``tracer`` must have been built with them.
+    """
     height, width = directions_world.shape[:2]
     out = RenderedImage(
         np.empty((height, width, 3), np.float32),
@@ -52,8 +58,9 @@ def render_rays(
         directions = directions_world[band].reshape(-1, 3)
         order = tile_order(min(rows, height - top), width)
         directions = directions[order]
-        seen = tracer.trace(np.broadcast_to(origin_world, directions.shape), directions)
-        rgb = seen.rgb_srgb + seen.transmittance[:, None] * background
+        origins = np.broadcast_to(origin_world, directions.shape)
+        seen = tracer.trace(origins, directions)
+        rgb = shading.develop(Sight(origins, directions, seen, tracer)).over(background)
         length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
         for image, values in (
             (out.rgb_srgb, np.clip(rgb, 0, 1)),

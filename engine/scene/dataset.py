@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
+from engine.errors import DatasetError
 from engine.scene import kernels
 from engine.scene.cache import PixelCache, open_pixel_cache
 from engine.scene.cameras import Camera
@@ -66,6 +67,11 @@ class Dataset:
         )
         self.has_masks: bool = len(cache.mask.values) > 0
         self._mask_is_alpha = masks == "alpha"
+        if self._mask_is_alpha and not self.has_masks:
+            raise DatasetError(
+                f"{scene.root} has no masks to take as the alpha; put them into "
+                f"{scene.root / 'masks'}/<image name>.png, or leave masks at ignore."
+            )
         self.has_alpha: bool = len(cache.alpha.values) > 0 or (self._mask_is_alpha and self.has_masks)
         self._cache = cache
         self._tables = tables

@@ -37,7 +37,11 @@ class SurfaceScore:
 
     @property
     def f_score(self) -> float:
-        """Harmonic mean of precision and recall (Knapitsch et al. 2017)."""
+        """Harmonic mean of precision and recall.
+
+        As in "Tanks and Temples: Benchmarking Large-Scale Scene Reconstruction"
+        (https://doi.org/10.1145/3072959.3073599).
+        """
         total = self.precision + self.recall
         return 2 * self.precision * self.recall / total if total > 0 else 0.0
 

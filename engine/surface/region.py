@@ -33,7 +33,8 @@ _ANY_AXIS = np.array([0.36, 0.48, 0.8])
 class Region:
     """A grid of cubic voxels over a box, or over all of space by contraction.
 
-    Contraction (mip-NeRF 360, Eq. 10): with x = (world - centre) / radius, x stays where it is inside the
+    Contraction is Eq. 10 of "Mip-NeRF 360: Unbounded Anti-Aliased Neural Radiance Fields"
+    (https://arxiv.org/abs/2111.12077): with x = (world - centre) / radius, x stays where it is inside the
     unit ball and goes to (2 - 1/|x|) x/|x| outside. The grid then lies over the box [-2, 2]^3 and its unit
     is ``radius``.
 

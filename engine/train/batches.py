@@ -7,6 +7,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from engine.colour import composited
+from engine.errors import ConfigError
+from engine.scene import View
+from engine.train.config import TrainConfig, window_side_px
+
 
 @runtime_checkable
 class Pixels(Protocol):
@@ -25,11 +30,23 @@ class Pixels(Protocol):
         ...
 
 
+@runtime_checkable
+class TrainingData(Pixels, Protocol):
+    """The photographs: pixel access, the views and the split (see :class:`engine.scene.Dataset`)."""
+
+    views: tuple[View, ...]
+    train_indices: Int64[np.ndarray, " t"]
+    test_indices: Int64[np.ndarray, " h"]
+    has_alpha: bool
+    extent: float
+
+
 @dataclass(frozen=True)
 class Batch:
     """Rays and what the photographs show there.
 
-    The last ``patches * side * side`` rays are patches, row-major one after another.
+    The last ``patches * side * side`` rays are patches, row-major one after another. ``background_srgb`` lies
+    behind both the Gaussians and photographs with alpha.
     """
 
     origins_world: Float32[np.ndarray, "r 3"]
@@ -40,6 +57,12 @@ class Batch:
     view: Int64[np.ndarray, " r"]
     patches: int
     side: int
+    background_srgb: Float32[np.ndarray, "3"]
+
+    @property
+    def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
+        """The photographs' colours over the background."""
+        return composited(self.rgb_srgb, self.alpha, self.background_srgb)
 
 
 class PixelSampler:
@@ -124,33 +147,76 @@ def _fold(position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]) ->
     return np.minimum(period, 2 * size - 1 - period)
 
 
-def draw_batch(
-    dataset: Pixels,
-    sampler: PixelSampler,
-    rng: np.random.Generator,
-    *,
-    rays: int,
-    window_rays: int,
-    window_side: int,
-    patch_fraction: float,
-    side: int,
-) -> Batch:
-    """``rays`` rays, of which about ``patch_fraction`` come as patches (none where a view is too small).
+class BatchSource:
+    """Draws the batches of a training.
 
-    The others come in windows of ``window_rays``, as far as that goes, and one by one where it is 1.
+    A batch has ``config.rays`` rays. Where the loss has an SSIM term, about ``config.patch_fraction`` of them
+    come as patches; the others come in windows, as far as that goes, and singly where a window is one ray.
+
+    Args:
+        dataset: the photographs.
+        config: sizes and shares.
+
+    Raises:
+        ConfigError: the SSIM term would have no patch.
     """
-    patches = min(round(rays * patch_fraction / side**2), rays // side**2)
-    if sampler.smallest_side_px < side:
-        patches = 0
-    loose = rays - patches * side**2
-    windows = loose // window_rays if window_rays > 1 else 0
-    view, y, x = sampler.pixels(rng, loose - windows * window_rays)
-    if windows:
-        more = sampler.windows(rng, windows, rays=window_rays, side=window_side)
-        view, y, x = (np.concatenate(pair) for pair in zip((view, y, x), more, strict=True))
-    if patches:
-        extra = sampler.patches(rng, patches, side)
-        view, y, x = (np.concatenate(pair) for pair in zip((view, y, x), extra, strict=True))
-    origins, directions = dataset.rays(view, y, x)
-    rgb, alpha, weight = dataset.pixels(view, y, x)
-    return Batch(origins, directions, rgb, alpha, weight, view, patches, side)
+
+    def __init__(self, dataset: TrainingData, config: TrainConfig) -> None:
+        self._dataset = dataset
+        self._config = config
+        self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
+        self._window_side_px = window_side_px(config, self.sampler.longest_side_px)
+        self._patches = self._patch_count()
+
+    def draw(self, rng: np.random.Generator) -> Batch:
+        """The next batch."""
+        config, sampler, side = self._config, self.sampler, self._config.patch_side
+        loose = config.rays - self._patches * side**2
+        windows = loose // config.window_rays if config.window_rays > 1 else 0
+        drawn = [sampler.pixels(rng, loose - windows * config.window_rays)]
+        if windows:
+            drawn.append(sampler.windows(rng, windows, rays=config.window_rays, side=self._window_side_px))
+        if self._patches:
+            drawn.append(sampler.patches(rng, self._patches, side))
+        view, y, x = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        origins, directions = self._dataset.rays(view, y, x)
+        rgb, alpha, weight = self._dataset.pixels(view, y, x)
+        background = self._background(rng)
+        return Batch(origins, directions, rgb, alpha, weight, view, self._patches, side, background)
+
+    def _patch_count(self) -> int:
+        config, side = self._config, self._config.patch_side
+        if config.loss.ssim == 0:
+            return 0
+        smallest = self.sampler.smallest_side_px
+        if smallest < side:
+            raise ConfigError(
+                f"loss.ssim compares patches of {side} x {side} pixels, but a training view is only "
+                f"{smallest} pixels wide or high; lower patch_side (16 at least), or set loss.ssim to 0."
+            )
+        count = min(round(config.rays * config.patch_fraction / side**2), config.rays // side**2)
+        if count == 0:
+            raise ConfigError(
+                f"loss.ssim compares patches of {side} x {side} pixels, but a share of "
+                f"{config.patch_fraction:g} of {config.rays} rays makes none; raise rays or "
+                "patch_fraction, or set loss.ssim to 0."
+            )
+        return count
+
+    def _background(self, rng: np.random.Generator) -> Float32[np.ndarray, "3"]:
+        name = self._config.background
+        if name == "auto":
+            name = "random" if self._dataset.has_alpha else "black"
+        if name == "random":
+            return rng.random(3, dtype=np.float32)
+        return still_background(self._config)
+
+
+def still_background(config: TrainConfig) -> Float32[np.ndarray, "3"]:
+    """The background that stays the same: white if asked for, else black."""
+    return np.full(3, 1.0 if config.background == "white" else 0.0, np.float32)
+
+
+def view_sizes_px(dataset: TrainingData) -> Int64[np.ndarray, "n 2"]:
+    """Width and height of every view."""
+    return np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)

@@ -4,7 +4,8 @@ import json
 import struct
 import zipfile
 import zlib
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -12,46 +13,18 @@ import numpy as np
 from engine.errors import CheckpointError, DamagedCheckpoint
 from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
-from engine.train.exposure import Exposures
 from engine.train.optimiser import Adam
+from engine.train.state import TrainState
 
-FORMAT = 1
+FORMAT = 2
 KEEP = 2
 _PREFIX = "iteration_"
+_GROUPS = ("gaussians", "adam", "densifier", "shading")
 # What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array.
 _DAMAGE = (
     OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
     OverflowError, struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
-
-
-@dataclass
-class TrainState:
-    """The state before iteration ``iteration`` (0 at the start).
-
-    Attributes:
-        iteration: iterations done.
-        gaussians: parameters.
-        adam: optimiser state.
-        rng: the generator that draws batches and everything else that is random.
-        densifier: what the densification strategy has observed.
-        seconds: training time so far, evaluation left out.
-        running_mse: smoothed squared error of the training rays.
-        best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
-        best_iteration: when that was.
-        exposures: those of the views, where they are learnt.
-    """
-
-    iteration: int
-    gaussians: FlatGaussians
-    adam: Adam
-    rng: np.random.Generator
-    densifier: dict[str, np.ndarray]
-    seconds: float = 0.0
-    running_mse: float = 0.0
-    best_psnr: float = -np.inf
-    best_iteration: int = 0
-    exposures: Exposures | None = None
 
 
 def checkpoint_path(folder: Path, iteration: int) -> Path:
@@ -86,8 +59,7 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
     arrays = {f"gaussians.{f.name}": getattr(state.gaussians, f.name) for f in fields(FlatGaussians)}
     arrays |= {f"adam.{f.name}": getattr(state.adam, f.name) for f in fields(Adam)}
     arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
-    if state.exposures is not None:
-        arrays |= {f"exposures.{f.name}": getattr(state.exposures, f.name) for f in fields(Exposures)}
+    arrays |= {f"shading.{name}": value for name, value in state.shading.items()}
     meta["arrays"] = sorted(arrays)
     with replacing(path) as temporary:
         np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
@@ -108,22 +80,18 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
     try:
         arrays = _read_arrays(path)
         meta = json.loads(str(arrays.pop("meta")))
-        if sorted(arrays) != meta.get("arrays", sorted(arrays)):
+        if meta.get("format") != FORMAT or meta["fingerprint"] != fingerprint:
+            raise CheckpointError(
+                f"{path} belongs to other settings or other photographs; "
+                "give the settings it was made with, or choose another output folder."
+            )
+        if sorted(arrays) != meta["arrays"]:
             raise ValueError("arrays are missing")
-        names = ("gaussians", "adam", "densifier", "exposures")
-        groups: dict[str, dict[str, np.ndarray]] = {name: {} for name in names}
-        for name, array in arrays.items():
-            group, _, key = name.partition(".")
-            groups[group][key] = array
+        groups = _grouped(arrays)
     except _DAMAGE as error:
         raise DamagedCheckpoint(
             f"{path} is damaged ({error}); delete it to go on from the one before it."
         ) from None
-    if meta.get("format") != FORMAT or meta["fingerprint"] != fingerprint:
-        raise CheckpointError(
-            f"{path} belongs to other settings or other photographs; "
-            "give the settings it was made with, or choose another output folder."
-        )
     rng = np.random.Generator(np.random.PCG64())
     rng.bit_generator.state = meta["rng"]
     return TrainState(
@@ -132,21 +100,23 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         adam=Adam(**groups["adam"]),
         rng=rng,
         densifier=groups["densifier"],
+        shading=groups["shading"],
         seconds=meta["seconds"],
         running_mse=meta["running_mse"],
         best_psnr=-np.inf if meta["best_psnr"] is None else meta["best_psnr"],
         best_iteration=meta["best_iteration"],
-        exposures=Exposures(**groups["exposures"]) if groups["exposures"] else None,
     )
 
 
-def save_best(gaussians: FlatGaussians, folder: Path) -> None:
-    """Write the Gaussians that did best so far to ``best.npz``."""
+def save_best(gaussians: FlatGaussians, shading: Mapping[str, np.ndarray], folder: Path) -> None:
+    """Write the Gaussians that did best so far, and the shading model's state then, to ``best.npz``."""
+    arrays = {f"gaussians.{f.name}": getattr(gaussians, f.name) for f in fields(FlatGaussians)}
+    arrays |= {f"shading.{name}": value for name, value in shading.items()}
     with replacing(folder / "best.npz") as temporary:
-        np.savez(temporary, **{f.name: getattr(gaussians, f.name) for f in fields(FlatGaussians)})
+        np.savez(temporary, **arrays)
 
 
-def load_best(folder: Path) -> FlatGaussians:
+def load_best(folder: Path) -> tuple[FlatGaussians, dict[str, np.ndarray]]:
     """Read what :func:`save_best` wrote.
 
     Raises:
@@ -154,9 +124,19 @@ def load_best(folder: Path) -> FlatGaussians:
     """
     path = folder / "best.npz"
     try:
-        return FlatGaussians(**_read_arrays(path))
+        groups = _grouped(_read_arrays(path))
+        return FlatGaussians(**groups["gaussians"]), groups["shading"]
     except _DAMAGE as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None
+
+
+def _grouped(arrays: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """Arrays by what comes before the first dot of their names, then by the rest."""
+    groups: dict[str, dict[str, np.ndarray]] = {name: {} for name in _GROUPS}
+    for name, array in arrays.items():
+        group, _, key = name.partition(".")
+        groups[group][key] = array
+    return groups
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:

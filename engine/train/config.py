@@ -4,9 +4,10 @@ Lengths marked "of the extent" are relative to the scene's robust extent (from t
 preset serves a coin and a street.
 """
 
+import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from engine.errors import ConfigError
 from engine.gaussians.octagon import CHI2_3_99
@@ -42,8 +43,9 @@ class LearningRates(_Frozen):
 class LossWeights(_Frozen):
     """Weights of the loss terms; means over the batch's valid rays and channels.
 
-    The families of the field: 0.8 L1 + 0.2 (1 - SSIM) (GaMeS, 3DGRT) is l1 = 0.8, ssim = 0.2; the paper's
-    authors use 0.8 MSE + 0.2 (1 - SSIM)/2: l2 = 0.8, ssim = 0.1.
+    The families of the field: 0.8 L1 + 0.2 (1 - SSIM), as in "3D Gaussian Ray Tracing: Fast Tracing of
+    Particle Scenes" (https://arxiv.org/abs/2407.07090), is l1 = 0.8, ssim = 0.2; the authors of REdiSplats
+    (https://arxiv.org/abs/2503.12284) use 0.8 MSE + 0.2 (1 - SSIM)/2: l2 = 0.8, ssim = 0.1.
     """
 
     l1: float = Field(0.8, ge=0)
@@ -54,7 +56,7 @@ class LossWeights(_Frozen):
 
 
 class McmcConfig(_Frozen):
-    """Relocation of the dead and growth up to a cap (3DGS-MCMC), on flat Gaussians."""
+    """Relocation of the dead and growth up to a cap, see :mod:`engine.train.densify.mcmc`."""
 
     kind: Literal["mcmc"] = "mcmc"
     start: int = Field(100, ge=0)
@@ -68,7 +70,7 @@ class McmcConfig(_Frozen):
 
 
 class PaperConfig(_Frozen):
-    """Clone and split by the Adam step of the mean, prune by opacity and size (method section 5)."""
+    """Clone and split by the Adam step of the mean, prune; see :mod:`engine.train.densify.paper`."""
 
     kind: Literal["paper"] = "paper"
     start: int = Field(400, ge=0)
@@ -87,7 +89,11 @@ class PaperConfig(_Frozen):
 
 
 class TrainConfig(_Frozen):
-    """One training run, fully resolved; the defaults are the ``standard`` preset."""
+    """One training run, fully resolved; the defaults are the ``standard`` preset.
+
+    ``paper`` stands for "REdiSplats: Ray Tracing for Editable Gaussian Splatting"
+    (https://arxiv.org/abs/2503.12284), where one of several ways is named after it.
+    """
 
     iterations: int = Field(
         0,
@@ -105,7 +111,7 @@ class TrainConfig(_Frozen):
         0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM"
     )
     patch_side: int = Field(32, ge=16)
-    fit_iterations: int = Field(100, ge=0, description="paper 4.2: fitting before anything is added")
+    fit_iterations: int = Field(100, ge=0, description="fitting before anything is added")
     sh_degree: int = Field(2, ge=0, le=3)
     sh_every: int = Field(400, ge=1, description="iterations between raising the degree")
     max_gaussians: int = Field(
@@ -135,6 +141,13 @@ class TrainConfig(_Frozen):
     probe_rays: int = Field(16_384, ge=256, description="fixed training rays that choose the best checkpoint")
     seed: int = Field(0, ge=0)
 
+    @field_validator("window_rays")
+    @classmethod
+    def _is_a_square(cls, value: int) -> int:
+        if math.isqrt(value) ** 2 != value:
+            raise ValueError("must be a square number, since a window has as many rows as columns")
+        return value
+
 
 def iteration_count(config: TrainConfig, training_pixels: int) -> int:
     """``config.iterations``, or where that is 0 three rays for each pixel, in whole thousands.
@@ -163,6 +176,11 @@ def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
     A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
     """
     return config.rebuild_every * (1 + gaussians // 500_000)
+
+
+def trace_settings(config: TrainConfig, extent: float) -> TraceSettings:
+    """The run's trace settings with the near distance in world units."""
+    return config.trace.model_copy(update={"t_min": config.near * extent})
 
 
 def preset(name: str) -> TrainConfig:

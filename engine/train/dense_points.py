@@ -3,8 +3,10 @@
 Structure from motion leaves plain walls, floors and leaves almost empty, and growth needs thousands of
 iterations to carry Gaussians there. Here random pixels of the training views take the depths of the points
 seen around them as guesses; each guess is judged by how well a small patch, moved into neighbouring views,
-matches what they show (plane sweep on a few planes). What agrees becomes a point, and serves as a guess in
-the next round.
+matches what they show. What agrees becomes a point, and serves as a guess in the next round.
+
+A plane sweep on a few planes a pixel, after "A Space-Sweep Approach to True Multi-Image Matching"
+(https://doi.org/10.1109/CVPR.1996.517097).
 """
 
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,9 @@
-"""The first Gaussians: flat ones on the sparse points, or random ones in the cameras' view (paper 4.2)."""
+"""The first Gaussians: flat ones on the points of the model, or random ones in the cameras' view.
+
+After "GaMeS: Mesh-Based Adapting and Modification of Gaussian Splatting" (https://arxiv.org/abs/2402.01459),
+from which "REdiSplats: Ray Tracing for Editable Gaussian Splatting" (https://arxiv.org/abs/2503.12284,
+section 4.2) begins too.
+"""
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -7,13 +12,52 @@ from scipy.spatial import cKDTree
 from engine.errors import DatasetError
 from engine.gaussians.frames import frames_from_normals, quaternions
 from engine.gaussians.model import SH_C0, FlatGaussians
+from engine.scene import Dataset
+from engine.train.config import TrainConfig, most_gaussians
+from engine.train.dense_points import dense_points
 
+MIN_POINTS = 50
+"""Fewer sparse points than this are no use to begin from; random ones are taken."""
 NEIGHBOURS = 3
 PLANE_NEIGHBOURS = 8
 MAX_ANGLE = 0.3
 """Largest scale as seen from the nearest camera, in radians."""
 FARTHEST = 50.0
 """Points farther from the cameras than this many extents are matching errors."""
+
+
+def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> FlatGaussians:
+    """The first Gaussians: on the sparse points, or on random rays where there are too few of them."""
+    rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
+    points = dataset.points
+    limit = min(config.initial_points, most_gaussians(config, dataset.train_pixel_count))
+    if len(points.xyz_world) >= MIN_POINTS:
+        centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
+        xyz, rgb = points.xyz_world, points.rgb_srgb
+        if config.lift_pixels and len(xyz) < limit:
+            more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng, threads=threads)
+            xyz, rgb = np.concatenate([xyz, more_xyz]), np.concatenate([rgb, more_rgb])
+        return from_points(
+            xyz,
+            rgb,
+            centres,
+            extent=dataset.extent,
+            limit=limit,
+            opacity=config.initial_opacity,
+            rng=rng,
+        )
+    view, y, x = dataset.sample_pixels(rng, limit)
+    origins, directions = dataset.rays(view, y, x)
+    rgb, alpha, weight = dataset.pixels(view, y, x)
+    seen = (weight > 0) & (alpha > 0)
+    return from_rays(
+        origins[seen],
+        directions[seen],
+        rgb[seen],
+        extent=dataset.extent,
+        opacity=config.initial_opacity,
+        rng=rng,
+    )
 
 
 def from_points(
@@ -26,7 +70,7 @@ def from_points(
     opacity: float,
     rng: np.random.Generator,
 ) -> FlatGaussians:
-    """Flat Gaussians on sparse points, GaMeS style.
+    """Flat Gaussians on sparse points.
 
     The scales are the mean distance to the three nearest points; the normal is that of the plane through
     the eight nearest where they lie on one, else it looks at the cameras. More than ``limit`` points are

@@ -6,6 +6,9 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.ndimage import correlate1d
 
+from engine.train.batches import Batch
+from engine.train.config import LossWeights
+
 C1, C2 = 0.01**2, 0.03**2
 WINDOW, SIGMA = 11, 1.5
 
@@ -28,8 +31,9 @@ def ssim_loss(
 ) -> tuple[float, Float32[np.ndarray, "p h w 3"]]:
     """1 - SSIM over the patches' interior, where windows are whole, and its gradient by ``render``.
 
-    The formula of Wang et al. 2004 with the 11 x 11 Gaussian window; the mean is over patches, interior
-    pixels and channels.
+    The formula of "Image Quality Assessment: From Error Visibility to Structural Similarity"
+    (https://doi.org/10.1109/TIP.2003.819861) with its 11 x 11 Gaussian window; the mean is over patches,
+    interior pixels and channels.
     """
     x, y = render, target
     mu_x, mu_y = _filter(x), _filter(y)
@@ -54,13 +58,45 @@ def ssim_loss(
 
 
 @dataclass(frozen=True)
-class PixelLoss:
-    """Value and gradient of the pixel terms; ``squared_error`` is the mean over valid rays and channels."""
+class BatchLoss:
+    """A loss and its gradient by the rendered colours.
+
+    Attributes:
+        value: the loss.
+        gradient: by the colours.
+        squared_error: mean over the rays of non-zero weight and the channels.
+        ray_errors: each ray's mean absolute error, for densification.
+    """
 
     value: float
     gradient: Float32[np.ndarray, "r 3"]
     squared_error: float
     ray_errors: Float32[np.ndarray, " r"]
+
+
+def batch_loss(render: Float32[np.ndarray, "r 3"], batch: Batch, weights: LossWeights) -> BatchLoss:
+    """All terms by the rendered colours: those of the pixels, and SSIM where the batch has patches."""
+    target = batch.target_srgb
+    pixel = pixel_loss(render, target, batch.weight, l1=weights.l1, l2=weights.l2)
+    if not batch.patches or weights.ssim == 0:
+        return pixel
+    structure, by_patches = _patch_term(render, target, batch)
+    gradient = pixel.gradient.copy()
+    gradient[-len(by_patches) :] += np.float32(weights.ssim) * by_patches
+    return BatchLoss(pixel.value + weights.ssim * structure, gradient, pixel.squared_error, pixel.ray_errors)
+
+
+def _patch_term(
+    render: Float32[np.ndarray, "r 3"], target: Float32[np.ndarray, "r 3"], batch: Batch
+) -> tuple[float, Float32[np.ndarray, "p 3"]]:
+    """1 - SSIM of the batch's patches and its gradient; masked pixels take the photograph's colour."""
+    count = batch.patches * batch.side**2
+    shape = (batch.patches, batch.side, batch.side, 3)
+    weight = batch.weight[-count:, None]
+    shown = target[-count:]
+    mixed = render[-count:] * weight + shown * (1 - weight)
+    value, gradient = ssim_loss(mixed.reshape(shape), shown.reshape(shape))
+    return value, gradient.reshape(-1, 3) * weight
 
 
 def pixel_loss(
@@ -70,11 +106,8 @@ def pixel_loss(
     *,
     l1: float,
     l2: float,
-) -> PixelLoss:
-    """L1 and squared error, averaged over the rays of non-zero weight and the channels.
-
-    ``ray_errors`` is each ray's mean absolute error, for densification.
-    """
+) -> BatchLoss:
+    """L1 and squared error, averaged over the rays of non-zero weight and the channels."""
     difference = render - target
     valid = max(float(weight.sum(dtype=np.float64)), 1.0)
     per_ray = weight[:, None]
@@ -84,4 +117,4 @@ def pixel_loss(
     value = l1 * float(absolute.sum(dtype=np.float64)) / (3 * valid) + l2 * mse
     gradient = (np.float32(l1) * np.sign(difference) + np.float32(2 * l2) * difference) * per_ray
     gradient /= np.float32(3 * valid)
-    return PixelLoss(value, gradient.astype(np.float32), mse, absolute.mean(axis=1, dtype=np.float32))
+    return BatchLoss(value, gradient.astype(np.float32), mse, absolute.mean(axis=1, dtype=np.float32))

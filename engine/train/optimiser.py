@@ -1,4 +1,7 @@
-"""The optimiser: Adam whose state and work follow the Gaussians that are hit."""
+"""The optimiser: Adam whose state and work follow the Gaussians that are hit.
+
+After "Adam: A Method for Stochastic Optimization" (https://arxiv.org/abs/1412.6980).
+"""
 
 from dataclasses import dataclass
 

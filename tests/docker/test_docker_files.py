@@ -72,7 +72,7 @@ def test_what_is_copied_exists_and_is_let_in() -> None:
 
 def test_images_do_not_run_as_root_and_hold_no_secret() -> None:
     stages = {stage for stage, _, _ in instructions()} - {"", "base"}
-    assert stages == {"front-end", "worker-cpu", "worker-cuda"}
+    assert stages == {"front-end", "worker-cpu"}
     for stage in stages:
         users = [rest for s, word, rest in instructions() if s == stage and word == "USER"]
         assert users == ["10001"], stage
@@ -99,7 +99,7 @@ def test_compose_names_images_that_the_dockerfile_makes() -> None:
             assert volume.partition(":")[0] in compose()["volumes"]
         for config in service.get("configs", []):
             assert config["source"] in compose()["configs"]
-    for name in ("front-end", "worker", "maintenance", "worker-gpu"):
+    for name in ("front-end", "worker", "maintenance"):
         service = services[name]
         assert service["cap_drop"] == ["ALL"] and "no-new-privileges:true" in service["security_opt"]
         assert service["depends_on"]["database"]["condition"] == "service_healthy"
@@ -135,7 +135,7 @@ def test_settings_are_ones_that_exist() -> None:
 
 def test_workers_get_longer_to_stop_than_they_take() -> None:
     grace = ServiceSettings.model_fields["grace_seconds"].default
-    for name in ("worker", "worker-gpu", "maintenance"):
+    for name in ("worker", "maintenance"):
         assert int(compose()["services"][name]["stop_grace_period"].removesuffix("s")) > grace
 
 

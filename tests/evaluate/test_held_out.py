@@ -10,6 +10,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.render.images import read_image, write_png
 from engine.scene import Dataset
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.shading.plain import PLAIN
 from engine.trace.protocol import TraceSettings
 
 
@@ -43,6 +44,7 @@ def test_photographs_that_differ_in_the_suffix_alone_both_get_a_render(tmp_path)
         grey,
         output,
         settings=TraceSettings(),
+        shading=PLAIN,
         background="black",
         run={},
         config={},

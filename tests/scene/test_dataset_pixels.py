@@ -165,6 +165,12 @@ def test_both_uses_of_masks(tmp_path, make_scene, save_image, coded):
     assert (weight == 1).all()
 
 
+def test_masks_as_alpha_are_refused_where_there_are_none(tmp_path, make_scene):
+    root = make_scene(tmp_path / "scene")
+    with pytest.raises(DatasetError, match="has no masks to take as the alpha"):
+        Dataset.open(root, tmp_path / "cache", masks="alpha")
+
+
 def test_black_masks_are_told(tmp_path, make_scene, save_image):
     root = make_scene(tmp_path / "scene")
     for i in range(4):

@@ -1,10 +1,13 @@
 """Batches: uniform over the pixels of the training views, with whole patches."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from flat_world import FlatWorld
+from flat_world import FlatWorld, small_config
 
-from engine.train.batches import PixelSampler, draw_batch
+from engine.errors import ConfigError
+from engine.train.batches import BatchSource, PixelSampler
 
 SIZES = np.array([[8, 6], [20, 10], [16, 16], [5, 3]], np.int64)
 
@@ -74,26 +77,36 @@ def test_patch_as_large_as_the_view() -> None:
     assert x.tolist() == np.tile(np.arange(16), 16).tolist()
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.25, 0.5, 1.0])
+@pytest.mark.parametrize(("ssim", "fraction"), [(0.0, 0.25), (0.2, 0.6), (0.2, 1.0)])
 @pytest.mark.parametrize("rays", [256, 1000, 1024])
 @pytest.mark.parametrize("window_rays", [1, 64])
-def test_batch_has_its_rays(fraction: float, rays: int, window_rays: int) -> None:
+def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, window_rays: int) -> None:
     world = FlatWorld(side_px=40)
-    sampler = PixelSampler(world.train_indices, np.full((7, 2), 40))
-    batch = draw_batch(
-        world, sampler, np.random.default_rng(0),
-        rays=rays, window_rays=window_rays, window_side=24, patch_fraction=fraction, side=16,
-    )  # fmt: skip
+    config = small_config(
+        rays=rays, window_rays=window_rays, window_side=24, patch_fraction=fraction, loss={"ssim": ssim}
+    )
+    batch = BatchSource(world, config).draw(np.random.default_rng(0))
     assert len(batch.rgb_srgb) == len(batch.origins_world) == len(batch.alpha) == len(batch.weight) == rays
-    assert abs(batch.patches * 256 - fraction * rays) <= 256
+    assert abs(batch.patches * 256 - (fraction * rays if ssim else 0)) <= 256
     np.testing.assert_allclose(np.linalg.norm(batch.directions_world, axis=1), 1, atol=1e-6)
 
 
-def test_views_too_small_for_patches_give_none() -> None:
-    world = FlatWorld(side_px=12)
-    sampler = PixelSampler(world.train_indices, np.full((7, 2), 12))
-    batch = draw_batch(
-        world, sampler, np.random.default_rng(0),
-        rays=600, window_rays=64, window_side=32, patch_fraction=0.5, side=16,
-    )  # fmt: skip
-    assert batch.patches == 0 and len(batch.rgb_srgb) == 600
+def test_ssim_is_refused_where_it_would_be_ignored() -> None:
+    with pytest.raises(ConfigError, match="only 12 pixels wide or high; lower patch_side"):
+        BatchSource(FlatWorld(side_px=12), small_config(loss={"ssim": 0.2}))
+    with pytest.raises(ConfigError, match="raise rays or patch_fraction"):
+        BatchSource(FlatWorld(), small_config(rays=256, patch_fraction=0.3, loss={"ssim": 0.2}))
+
+
+@pytest.mark.parametrize(("background", "has_alpha"), [("white", False), ("auto", False), ("auto", True)])
+def test_photographs_lie_over_the_background(background: str, has_alpha: bool) -> None:
+    world = FlatWorld()
+    world.has_alpha = has_alpha
+    batch = BatchSource(world, small_config(background=background)).draw(np.random.default_rng(0))
+    if has_alpha:
+        assert len(np.unique(batch.background_srgb)) == 3
+    else:
+        assert batch.background_srgb.tolist() == [float(background == "white")] * 3
+    np.testing.assert_array_equal(batch.target_srgb, batch.rgb_srgb)  # opaque throughout
+    clear = replace(batch, alpha=np.zeros_like(batch.alpha))
+    assert (clear.target_srgb == batch.background_srgb).all()

@@ -10,7 +10,6 @@ from flat_world import FlatWorld
 from engine.errors import CheckpointError
 from engine.gaussians.model import FlatGaussians
 from engine.train.checkpoint import (
-    TrainState,
     latest_checkpoint,
     load_best,
     load_checkpoint,
@@ -18,6 +17,7 @@ from engine.train.checkpoint import (
     save_checkpoint,
 )
 from engine.train.optimiser import Adam
+from engine.train.state import TrainState
 
 
 def make_state(iteration: int = 30, count: int = 12) -> TrainState:
@@ -28,6 +28,7 @@ def make_state(iteration: int = 30, count: int = 12) -> TrainState:
     adam.steps[:] = 7
     return TrainState(
         iteration=iteration, gaussians=gaussians, adam=adam, rng=rng, densifier={"errors": np.arange(5.0)},
+        shading={"toy.light": np.arange(4.0)},
         seconds=1.25, running_mse=0.01, best_psnr=20.5, best_iteration=20,
     )  # fmt: skip
 
@@ -44,6 +45,7 @@ def test_round_trip(tmp_path: Path) -> None:
     for name in ("iteration", "seconds", "running_mse", "best_psnr", "best_iteration"):
         assert getattr(back, name) == getattr(state, name)
     np.testing.assert_array_equal(back.densifier["errors"], np.arange(5.0))
+    np.testing.assert_array_equal(back.shading["toy.light"], np.arange(4.0))
     np.testing.assert_array_equal(back.rng.random(9), state.rng.random(9))
 
 
@@ -105,8 +107,10 @@ def test_missing_file(tmp_path: Path) -> None:
 
 def test_best(tmp_path: Path) -> None:
     gaussians = FlatWorld().start(20)
-    save_best(gaussians, tmp_path)
-    np.testing.assert_array_equal(load_best(tmp_path).means_world, gaussians.means_world)
+    save_best(gaussians, {"toy.light": np.arange(3.0)}, tmp_path)
+    back, shading = load_best(tmp_path)
+    np.testing.assert_array_equal(back.means_world, gaussians.means_world)
+    np.testing.assert_array_equal(shading["toy.light"], np.arange(3.0))
     assert latest_checkpoint(tmp_path) is None
     (tmp_path / "best.npz").write_bytes(b"xx")
     with pytest.raises(CheckpointError, match=r"best\.npz"):

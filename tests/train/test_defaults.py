@@ -13,7 +13,8 @@ from engine.train.config import (
     rebuild_interval,
     window_side_px,
 )
-from engine.train.trainer import Trainer, fresh_state
+from engine.train.state import fresh_state
+from engine.train.trainer import Trainer
 
 
 @pytest.mark.parametrize(
@@ -49,7 +50,7 @@ def test_the_trainer_knows_its_iterations(tmp_path: Path, wanted: int, count: in
     trainer = Trainer(
         world, config, state, folder=tmp_path, fingerprint="test", listener=lambda _event: None, threads=1
     )
-    assert trainer.iterations == count
+    assert trainer.schedule.iterations == count
 
 
 def test_more_rays_an_iteration_want_fewer_iterations() -> None:

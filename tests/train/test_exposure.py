@@ -1,5 +1,6 @@
 """Exposures of the views: their gradients, and that they explain photographs of unlike brightness."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,22 @@ from flat_world import FlatWorld, small_config
 
 from engine.errors import Cancelled
 from engine.events import Event, HeldOutMeasured
-from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
+from engine.shading.exposure import Exposures
+from engine.shading.protocol import Sight
+from engine.trace.cpu import CpuTracer
+from engine.trace.protocol import GaussianGradients, TraceResult
+from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig
-from engine.train.exposure import Exposures
-from engine.train.trainer import Trainer, fresh_state
+from engine.train.state import TrainState, fresh_state
+from engine.train.trainer import Trainer
+
+NO_GRADIENTS = GaussianGradients(
+    ids=np.zeros(0, np.int32),
+    means_world=np.zeros((0, 3), np.float32), quats_wxyz=np.zeros((0, 4), np.float32),
+    log_scales=np.zeros((0, 2), np.float32), opacity_logits=np.zeros(0, np.float32),
+    sh=np.zeros((0, 1, 3), np.float32), features=np.zeros((0, 0), np.float32),
+    weight_sums=np.zeros(0, np.float32), error_sums=np.zeros(0, np.float32), hit_counts=np.zeros(0, np.int32),
+)  # fmt: skip
 
 
 class UnevenWorld(FlatWorld):
@@ -54,27 +67,66 @@ def last_psnr(events: list[Event]) -> float:
     return [event.psnr for event in events if isinstance(event, HeldOutMeasured)][-1]
 
 
+def sight(view: np.ndarray, rgb: np.ndarray, alpha: np.ndarray) -> Sight:
+    """A sight of given colours and alphas; Gaussians and rays do not matter to exposures."""
+    zeros, three = np.zeros(len(view), np.float32), np.zeros((len(view), 3), np.float32)
+    seen = TraceResult(
+        rgb_srgb=rgb, transmittance=np.float32(1) - alpha, depth_sum=zeros, depth_median=zeros,
+        normal_world=three, features=three[:, :0], hit_counts=np.zeros(len(view), np.int32),
+    )  # fmt: skip
+    return Sight(three, three, seen, CpuTracer(), view)
+
+
+def made_exposures(views: int, rng: np.random.Generator) -> Exposures:
+    exposures = Exposures(views, rate=0.02, decay=0.01)
+    exposures.log_gains[:] = rng.normal(0, 0.3, (views, 3))
+    exposures.offsets[:] = rng.normal(0, 0.1, (views, 3))
+    return exposures
+
+
 def test_gradients_agree_with_finite_differences() -> None:
     rng = np.random.default_rng(0)
-    exposures = Exposures.neutral(3)
-    exposures.log_gains[:] = rng.normal(0, 0.3, (3, 3))
-    exposures.offsets[:] = rng.normal(0, 0.1, (3, 3))
+    exposures = made_exposures(3, rng)
     view = np.array([0, 2, 2, 1])
     rgb, alpha = rng.random((4, 3), dtype=np.float32), rng.random(4, dtype=np.float32)
-    gradient = rng.normal(size=(4, 3)).astype(np.float32)
-    by_rgb, by_alpha = exposures.undevelop(view, gradient)
+    by_rgb = rng.normal(size=(4, 3)).astype(np.float32)
+    by_transmittance = rng.normal(size=4).astype(np.float32)
+    seen = sight(view, rgb, alpha)
+    found = exposures.reverse(seen, exposures.develop(seen), by_rgb, by_transmittance)
+
+    def loss(rgb: np.ndarray = rgb, alpha: np.ndarray = alpha) -> float:
+        developed = exposures.develop(sight(view, rgb, alpha))
+        terms = (developed.rgb_srgb * by_rgb).sum() + developed.transmittance @ by_transmittance
+        return float(terms)
+
     step = np.float32(0.5)  # the map is linear, so that a large step is exact
-    before = exposures.develop(view, rgb, alpha)
+    assert found.seen.transmittance is not None
     for ray in range(4):
         more = alpha.copy()
         more[ray] += step
-        moved = exposures.develop(view, rgb, more) - before
-        assert by_alpha[ray] == pytest.approx((moved * gradient).sum() / step, abs=1e-5)
+        assert -found.seen.transmittance[ray] == pytest.approx((loss(alpha=more) - loss()) / step, abs=1e-5)
         for channel in range(3):
             brighter = rgb.copy()
             brighter[ray, channel] += step
-            moved = exposures.develop(view, brighter, alpha) - before
-            assert by_rgb[ray, channel] == pytest.approx((moved * gradient).sum() / step, abs=1e-5)
+            moved = (loss(rgb=brighter) - loss()) / step
+            assert found.seen.rgb_srgb[ray, channel] == pytest.approx(moved, abs=1e-5)
+    views, sums = found.parameters["exposure.views"], found.parameters["exposure.sums"]
+    assert views.tolist() == [0, 1, 2]
+    for column in range(6):
+        parameter, channel = (exposures.log_gains, exposures.offsets)[column // 3], column % 3
+        parameter[2, channel] += 1e-2
+        above = loss()
+        parameter[2, channel] -= 2e-2
+        moved = (above - loss()) / 2e-2
+        parameter[2, channel] += 1e-2
+        assert sums[2, column] == pytest.approx(moved, abs=1e-3)
+
+
+def test_views_that_were_not_trained_on_are_developed_as_they_are() -> None:
+    rng = np.random.default_rng(0)
+    seen = sight(np.arange(3), rng.random((3, 3), dtype=np.float32), rng.random(3, dtype=np.float32))
+    developed = made_exposures(3, rng).develop(replace(seen, view=None))
+    assert developed.rgb_srgb is seen.seen.rgb_srgb and developed.transmittance is seen.seen.transmittance
 
 
 def test_known_gains_and_offsets_are_found() -> None:
@@ -83,13 +135,16 @@ def test_known_gains_and_offsets_are_found() -> None:
     offsets = rng.normal(0, 0.05, (4, 3))
     log_gains -= log_gains.mean(axis=0)
     offsets -= offsets.mean(axis=0)
-    exposures = Exposures.neutral(4)
+    exposures = Exposures(4, rate=0.02, decay=0.01)
+    gaussians, nothing = FlatWorld().start(1), np.zeros(256, np.float32)
     for iteration in range(2000):
         view = rng.integers(0, 4, 256)
         rgb, alpha = rng.random((256, 3)).astype(np.float32), np.ones(256, np.float32)
-        target = np.exp(log_gains[view]) * rgb + offsets[view]
-        error = exposures.develop(view, rgb, alpha) - target
-        exposures.step(view, rgb, alpha, error.astype(np.float32), rate=0.02 * 0.01 ** (iteration / 2000))
+        seen = sight(view, rgb, alpha)
+        developed = exposures.develop(seen)
+        error = (developed.rgb_srgb - (np.exp(log_gains[view]) * rgb + offsets[view])).astype(np.float32)
+        found = exposures.reverse(seen, developed, error, nothing)
+        exposures.step(gaussians, NO_GRADIENTS, found.parameters, progress=iteration / 2000)
     np.testing.assert_allclose(exposures.log_gains, log_gains, atol=2e-3)
     np.testing.assert_allclose(exposures.offsets, offsets, atol=2e-3)
 
@@ -99,8 +154,8 @@ def test_uneven_photographs_are_explained_by_their_exposure(tmp_path: Path) -> N
     trainer, events = run(tmp_path / "learnt", config)
     _, plain = run(tmp_path / "plain", small_config(iterations=240))
     assert last_psnr(events) > last_psnr(plain) + 2
-    found = trainer.state.exposures
-    assert found is not None
+    found = trainer.shading
+    assert isinstance(found, Exposures)
     world = UnevenWorld()
     true = world.log_gains[world.train_indices]
     mid = 0.3  # where offsets and gains are told apart by little, compare what they do to a middle tone
@@ -114,11 +169,14 @@ def test_a_resumed_run_has_the_same_exposures(tmp_path: Path) -> None:
     config = small_config(exposure=True)
     whole, _ = run(tmp_path / "whole", config)
     parts, _ = run(tmp_path / "parts", config, stop_after=50)
-    assert whole.state.exposures is not None and parts.state.exposures is not None
-    assert whole.state.exposures.log_gains.tobytes() == parts.state.exposures.log_gains.tobytes()
+    assert (
+        whole.state.shading.keys() == parts.state.shading.keys() >= {"exposure.log_gains", "exposure.steps"}
+    )
+    for name, values in whole.state.shading.items():
+        assert values.tobytes() == parts.state.shading[name].tobytes(), name
     assert whole.state.gaussians.sh.tobytes() == parts.state.gaussians.sh.tobytes()
 
 
 def test_without_the_setting_nothing_is_learnt(tmp_path: Path) -> None:
     trainer, _ = run(tmp_path, small_config())
-    assert trainer.state.exposures is None
+    assert trainer.state.shading == {}

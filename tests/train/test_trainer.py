@@ -11,9 +11,10 @@ from flat_world import FlatWorld, small_config
 from engine.errors import Cancelled, TrainingFailure
 from engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
-from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint, save_best
+from engine.train.checkpoint import latest_checkpoint, load_checkpoint, save_best
 from engine.train.config import PaperConfig, TrainConfig
-from engine.train.trainer import Trainer, fresh_state
+from engine.train.state import TrainState, fresh_state
+from engine.train.trainer import Trainer
 
 
 def train(
@@ -163,7 +164,7 @@ def test_collapsed_end_gives_the_best_state(tmp_path: Path) -> None:
     assert path is not None
     state = load_checkpoint(path, "test")
     best = FlatWorld().start(50)
-    save_best(best, tmp_path)
+    save_best(best, {}, tmp_path)
     state.best_psnr = 90.0
     found, events = train(tmp_path, config, state=state)
     assert content(found) == content(best)

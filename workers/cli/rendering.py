@@ -32,7 +32,7 @@ from engine.render.renderer import background_colour
 from engine.scene import SceneModel, load_scene, scene_extent, split_views
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings
-from engine.train.trainer import trace_settings
+from engine.train.config import trace_settings
 from workers.cli.options import is_run
 from workers.cli.progress import show_progress
 from workers.cli.scene_files import open_scene

@@ -20,7 +20,7 @@ from engine.surface.files import check_surface_path, write_surface
 from engine.surface.options import SurfaceOptions
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings
-from engine.train.trainer import trace_settings
+from engine.train.config import trace_settings
 from workers.cli.options import is_run
 from workers.cli.progress import show_progress
 from workers.cli.scene_files import open_scene

@@ -15,7 +15,7 @@ from engine.render.jobs import view_shots
 from engine.render.renderer import background_colour, render_rays
 from engine.scene import SceneModel, load_scene, scene_extent, split_views
 from engine.trace.cpu import CpuTracer
-from engine.train.trainer import trace_settings
+from engine.train.config import trace_settings
 
 SIDE_PX = 320
 FILE = ".preview.png"

@@ -1,4 +1,7 @@
-"""Relocation and growth up to a cap, after 3DGS-MCMC (Kheradmand et al. 2024), for flat Gaussians."""
+"""Relocation and growth up to a cap, for flat Gaussians.
+
+After "3D Gaussian Splatting as Markov Chain Monte Carlo" (https://arxiv.org/abs/2404.09591).
+"""
 
 from math import comb
 
@@ -26,7 +29,7 @@ def shared_scale(
     """Factor on the scales of ``copies`` coincident Gaussians that keeps the integral of what they cover.
 
     a / sum_{i=1..N} sum_{k=0..i-1} C(i-1,k) (-1)^k a'^(k+1) / sqrt(k+1), a' = 1-(1-a)^(1/N)
-    (3DGS-MCMC Eq. 9).
+    (the paper's Eq. 9).
     """
     shared = shared_opacity(opacity, copies)
     factor = np.ones_like(opacity)

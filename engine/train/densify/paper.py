@@ -1,4 +1,7 @@
-"""Clone, split and prune by the Adam step of the mean, as REdiSplats' authors do (method section 5)."""
+"""Clone, split and prune by the Adam step of the mean, as the authors of REdiSplats do.
+
+"REdiSplats: Ray Tracing for Editable Gaussian Splatting" (https://arxiv.org/abs/2503.12284).
+"""
 
 import numpy as np
 from jaxtyping import Float32

@@ -9,7 +9,7 @@ _QUEUE = re.compile(r"([a-z][a-z0-9_-]{0,40})(?:=(\d{1,3}))?")
 
 
 def parse_queues(text: str) -> dict[str, int]:
-    """``cpu,gpu=2`` as names of queues and numbers of jobs at once.
+    """``cpu,long=2`` as names of queues and numbers of jobs at once.
 
     Raises:
         click.UsageError: it cannot be read so.
@@ -31,7 +31,7 @@ def parse_queues(text: str) -> dict[str, int]:
     default="cpu",
     show_default=True,
     metavar="NAMES",
-    help="Queues to take jobs from, e.g. gpu or cpu=2,gpu; an empty text only looks after lost jobs.",
+    help="Queues to take jobs from, e.g. cpu or cpu=2,long; an empty text only looks after lost jobs.",
 )
 @click.option("--name", metavar="NAME", help="Name of this worker.  [default: host and process id]")
 @click.option(

@@ -1,0 +1,119 @@
+"""Exposure of the training views: a gain and an offset for each channel of each, learnt beside the Gaussians.
+
+A phone sets its exposure anew for every photograph. Without a model of that, Gaussians learn to look
+different from where each photograph was taken. The scene keeps the exposure that is the mean of all.
+
+Not done: held-out views are measured as they are, nothing is fitted to them.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from engine.gaussians.model import FlatGaussians
+from engine.shading.plain import PLAIN
+from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from engine.trace.protocol import GaussianGradients
+
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+_STATE = ("log_gains", "offsets", "first", "second", "steps")
+
+
+class Exposures:
+    """Of each view and channel: shown colour = exp(log_gain) * developed colour + offset.
+
+    Follows :class:`engine.shading.protocol.ShadingModel`. Views that were not trained on have the mean
+    exposure.
+
+    Args:
+        views: how many there are, whether they are trained on or not.
+        rate: size of a step of log gains and offsets at the beginning.
+        decay: what is left of that at the end; it falls exponentially.
+        inner: the model whose colours are exposed.
+
+    Attributes:
+        log_gains: logarithm of each view's gains.
+        offsets: of each view, display values.
+        first: first moments of Adam, gains before offsets; ``second`` holds the second ones.
+        steps: each view's steps.
+    """
+
+    name = "exposure"
+
+    def __init__(self, views: int, *, rate: float, decay: float = 1.0, inner: ShadingModel = PLAIN) -> None:
+        self.log_gains: Float32[np.ndarray, "v 3"] = np.zeros((views, 3), np.float32)
+        self.offsets: Float32[np.ndarray, "v 3"] = np.zeros((views, 3), np.float32)
+        self.first: Float32[np.ndarray, "v 6"] = np.zeros((views, 6), np.float32)
+        self.second: Float32[np.ndarray, "v 6"] = np.zeros((views, 6), np.float32)
+        self.steps: Int64[np.ndarray, " v"] = np.zeros(views, np.int64)
+        self._rate = rate
+        self._decay = decay
+        self._inner = inner
+
+    def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
+        """Those of the model inside."""
+        return self._inner.features(gaussians)
+
+    def develop(self, sight: Sight) -> Developed:
+        """Colours as the rays' views show them; exposures say nothing about other views."""
+        inner = self._inner.develop(sight)
+        if sight.view is None:
+            return inner
+        gains, offsets = np.exp(self.log_gains)[sight.view], self.offsets[sight.view]
+        alpha = np.float32(1) - inner.transmittance
+        return Developed(gains * inner.rgb_srgb + offsets * alpha[:, None], inner.transmittance, inner)
+
+    def reverse(
+        self,
+        sight: Sight,
+        developed: Developed,
+        by_rgb: Float32[np.ndarray, "r 3"],
+        by_transmittance: Float32[np.ndarray, " r"],
+    ) -> Reversed:
+        """Gradients by what the model inside developed, and of each used view's log gains and offsets."""
+        view, inner = sight.view, developed.kept
+        assert view is not None and isinstance(inner, Developed), "only views of the training are learnt from"
+        gains = np.exp(self.log_gains)[view]
+        used, place = np.unique(view, return_inverse=True)
+        alpha = np.float32(1) - inner.transmittance
+        terms = np.concatenate([by_rgb * gains * inner.rgb_srgb, by_rgb * alpha[:, None]], axis=1)
+        sums = np.stack([np.bincount(place, terms[:, c], len(used)) for c in range(6)], axis=1)
+        by_alpha = (by_rgb * self.offsets[view]).sum(axis=1)
+        below = self._inner.reverse(sight, inner, by_rgb * gains, by_transmittance - by_alpha)
+        own = {"exposure.views": used, "exposure.sums": sums}
+        return Reversed(below.seen, below.further, {**below.parameters, **own})
+
+    def step(
+        self,
+        gaussians: FlatGaussians,
+        gradients: GaussianGradients,
+        parameters: Mapping[str, np.ndarray],
+        *,
+        progress: float,
+    ) -> None:
+        """One step of Adam for the views of the batch, then the mean over all views so far is taken out."""
+        self._inner.step(gaussians, gradients, parameters, progress=progress)
+        used, sums = parameters["exposure.views"], parameters["exposure.sums"]
+        self.steps[used] += 1
+        steps = self.steps[used, None]
+        self.first[used] = BETA1 * self.first[used] + (1 - BETA1) * sums
+        self.second[used] = BETA2 * self.second[used] + (1 - BETA2) * sums**2
+        mean = self.first[used] / (1 - BETA1**steps)
+        size = np.sqrt(self.second[used] / (1 - BETA2**steps)) + EPSILON
+        change = (self._rate * self._decay**progress * mean / size).astype(np.float32)
+        self.log_gains[used] -= change[:, :3]
+        self.offsets[used] -= change[:, 3:]
+        seen = self.steps > 0
+        for values in (self.log_gains, self.offsets):
+            values[seen] -= values[seen].mean(axis=0, dtype=np.float64).astype(np.float32)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Gains, offsets and moments, and what the model inside keeps."""
+        return {**self._inner.state(), **{f"exposure.{name}": getattr(self, name) for name in _STATE}}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Take them back."""
+        self._inner.restore(state)
+        for name in _STATE:
+            setattr(self, name, state[f"exposure.{name}"])

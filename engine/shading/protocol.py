@@ -1,0 +1,132 @@
+"""What a shading model is: it makes of what a tracer saw along rays what a photograph would show there.
+
+    batch of rays -> trace -> develop -> loss -> reverse -> backward pass of the trace -> steps
+
+The training loop and the renderer know models by this protocol alone. A model may look at all that a trace
+gives (colours, transmittance, depths, normals, blended features), may trace further rays through the same
+Gaussians, and may have parameters of its own: of the views, or of the scene as a whole.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from engine.gaussians.model import FlatGaussians
+from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, Tracer, TraceResult
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What is to be shaded.
+
+    Attributes:
+        origins_world: where the rays begin.
+        directions_world: unit directions.
+        seen: what the tracer saw along them.
+        tracer: for further rays, mirrored ones say, through the same Gaussians.
+        view: number of each ray's training view; None for views that were not trained on.
+        progress: share of the training that is done; 1 for a finished scene.
+    """
+
+    origins_world: Float32[np.ndarray, "r 3"]
+    directions_world: Float32[np.ndarray, "r 3"]
+    seen: TraceResult
+    tracer: Tracer
+    view: Int64[np.ndarray, " r"] | None = None
+    progress: float = 1.0
+
+
+@dataclass(frozen=True)
+class Developed:
+    """Colours as a photograph shows them, in front of no background yet.
+
+    Attributes:
+        rgb_srgb: display colour, premultiplied by 1 - ``transmittance``.
+        transmittance: share of the background that shines through; 0 where a model brings its own.
+        kept: whatever the model needs to :meth:`ShadingModel.reverse` this.
+    """
+
+    rgb_srgb: Float32[np.ndarray, "r 3"]
+    transmittance: Float32[np.ndarray, " r"]
+    kept: object = None
+
+    def over(self, background_srgb: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "r 3"]:
+        """Display colours in front of a background."""
+        return self.rgb_srgb + self.transmittance[:, None] * background_srgb
+
+
+@dataclass(frozen=True)
+class Reversed:
+    """Gradients of a loss by all that went into :meth:`ShadingModel.develop`.
+
+    Attributes:
+        seen: by the outputs of the sight's own trace.
+        further: by those of the traces that the model recorded itself.
+        parameters: by the model's own parameters, in whatever form its ``step`` wants them; names begin
+            with the model's.
+    """
+
+    seen: TraceGradients
+    further: tuple[tuple[HitLists, TraceGradients], ...] = ()
+    parameters: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@runtime_checkable
+class ShadingModel(Protocol):
+    """Develops what was seen, and is trained beside the Gaussians.
+
+    Attributes:
+        name: begins the names of the model's arrays in checkpoints.
+    """
+
+    name: str
+
+    def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
+        """What the tracer has to blend of each Gaussian beside its colour, e.g. its material; None: nothing.
+
+        The array stays the same one until the next call: :meth:`step` may change its values.
+        """
+        ...
+
+    def develop(self, sight: Sight) -> Developed:
+        """What photographs show of ``sight``; depends on nothing else but the model's parameters."""
+        ...
+
+    def reverse(
+        self,
+        sight: Sight,
+        developed: Developed,
+        by_rgb: Float32[np.ndarray, "r 3"],
+        by_transmittance: Float32[np.ndarray, " r"],
+    ) -> Reversed:
+        """Gradients by what went into ``developed`` from those by what came out; changes nothing."""
+        ...
+
+    def step(
+        self,
+        gaussians: FlatGaussians,
+        gradients: GaussianGradients,
+        parameters: Mapping[str, np.ndarray],
+        *,
+        progress: float,
+    ) -> None:
+        """One step of the optimiser for the model's own parameters.
+
+        Args:
+            gaussians: those traced, after their own step.
+            gradients: by the Gaussians' parameters and features, those of all traces added up.
+            parameters: what :meth:`reverse` found.
+            progress: 0 at the first iteration, 1 at the last.
+        """
+        ...
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Parameters and optimiser state, for a checkpoint; names begin with the model's and a dot."""
+        ...
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Take back what :meth:`state` gave."""
+        ...

@@ -1,0 +1,23 @@
+"""Gradients of several recordings of the same Gaussians, added up."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import numpy as np
+
+from engine.trace.protocol import GaussianGradients
+
+
+def add_gradients(parts: Sequence[GaussianGradients]) -> GaussianGradients:
+    """The sum of at least one, for all Gaussians that any of them met; a single one is returned as it is."""
+    if len(parts) == 1:
+        return parts[0]
+    ids = np.unique(np.concatenate([part.ids for part in parts]))
+    sums = {}
+    for name in (field.name for field in fields(GaussianGradients) if field.name != "ids"):
+        first = getattr(parts[0], name)
+        total = np.zeros((len(ids), *first.shape[1:]), first.dtype)
+        for part in parts:
+            total[np.searchsorted(ids, part.ids)] += getattr(part, name)
+        sums[name] = total
+    return GaussianGradients(ids=ids, **sums)

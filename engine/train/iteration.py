@@ -1,0 +1,121 @@
+"""One iteration: a batch is traced, developed and compared; gradients go back; everything takes a step.
+
+batch -> trace -> develop -> loss -> reverse -> backward -> steps of the Gaussians and of the shading
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from engine.errors import TrainingFailure
+from engine.shading.protocol import ShadingModel, Sight
+from engine.trace.protocol import GaussianGradients, Tracer
+from engine.trace.sums import add_gradients
+from engine.train.batches import Batch
+from engine.train.config import LossWeights, TrainConfig
+from engine.train.densify import Densifier
+from engine.train.losses import BatchLoss, batch_loss
+from engine.train.state import TrainState
+
+RUNNING = 0.98
+"""Weight of the past in the smoothed squared error."""
+
+
+@dataclass(frozen=True)
+class Machinery:
+    """What works on the state."""
+
+    tracer: Tracer
+    shading: ShadingModel
+    densifier: Densifier
+
+
+@dataclass(frozen=True)
+class Differentiated:
+    """A loss on one batch with its gradients.
+
+    Attributes:
+        loss: the loss on the developed colours.
+        gaussians: gradients by the Gaussians' parameters.
+        shading: gradients by the shading model's own parameters.
+        hits_per_ray: mean number of Gaussians on a ray.
+    """
+
+    loss: BatchLoss
+    gaussians: GaussianGradients
+    shading: Mapping[str, np.ndarray]
+    hits_per_ray: float
+
+
+def differentiate(
+    batch: Batch, tracer: Tracer, shading: ShadingModel, weights: LossWeights, *, progress: float
+) -> Differentiated:
+    """The loss of the Gaussians that ``tracer`` holds, and its gradients; changes nothing.
+
+    Args:
+        batch: rays and what the photographs show there.
+        tracer: built around the Gaussians.
+        shading: makes photographs of what is traced.
+        weights: of the loss terms.
+        progress: share of the training that is done.
+    """
+    seen = tracer.trace(batch.origins_world, batch.directions_world, record=True)
+    assert seen.hits is not None
+    sight = Sight(batch.origins_world, batch.directions_world, seen, tracer, batch.view, progress)
+    developed = shading.develop(sight)
+    loss = batch_loss(developed.over(batch.background_srgb), batch, weights)
+    back = shading.reverse(sight, developed, loss.gradient, loss.gradient @ batch.background_srgb)
+    by_seen = replace(back.seen, ray_errors=loss.ray_errors)
+    recorded = [(seen.hits, by_seen), *back.further]
+    return Differentiated(
+        loss=loss,
+        gaussians=add_gradients([tracer.backward(hits, by) for hits, by in recorded]),
+        shading=back.parameters,
+        hits_per_ray=float(seen.hit_counts.mean()),
+    )
+
+
+def iterate(
+    state: TrainState,
+    batch: Batch,
+    machinery: Machinery,
+    config: TrainConfig,
+    *,
+    progress: float,
+    extent: float,
+) -> Differentiated:
+    """One step downhill; changes ``state`` and tells the tracer of it.
+
+    Args:
+        state: Gaussians and their optimiser.
+        batch: what to look at.
+        machinery: the tracer, built around the state's Gaussians, and what else takes part.
+        config: rates and weights.
+        progress: 0 at the first iteration, 1 at the last.
+        extent: scene extent, world units.
+
+    Returns:
+        What was found before the step.
+
+    Raises:
+        TrainingFailure: the loss is no number.
+    """
+    tracer, shading = machinery.tracer, machinery.shading
+    found = differentiate(batch, tracer, shading, config.loss, progress=progress)
+    if not np.isfinite(found.loss.value):
+        raise TrainingFailure(
+            f"The loss became {found.loss.value} at iteration {state.iteration + 1}; lower the learning "
+            "rates (--set rates.mean=...) or look for damaged photographs. The last checkpoint is kept."
+        )
+    gradients = found.gaussians
+    moved = state.adam.step(
+        state.gaussians, gradients, config.rates, config.loss, progress=progress, extent=extent
+    )
+    shading.step(state.gaussians, gradients, found.shading, progress=progress)
+    tracer.refresh(gradients.ids)
+    machinery.densifier.observe(len(state.gaussians), gradients, moved)
+    state.iteration += 1
+    keep = min(RUNNING, 1 - 1 / state.iteration)
+    state.running_mse = keep * state.running_mse + (1 - keep) * found.loss.squared_error
+    return found

@@ -1,0 +1,124 @@
+"""Probes: fixed rays on which the state is measured now and then; what they show can end a training."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from engine.colour import composited
+from engine.errors import TrainingFailure
+from engine.events import HeldOutMeasured, Listener, Warned
+from engine.gaussians.model import FlatGaussians
+from engine.shading.protocol import ShadingModel, Sight
+from engine.trace.protocol import Tracer
+from engine.train.batches import PixelSampler, TrainingData, still_background, view_sizes_px
+from engine.train.checkpoint import load_best, save_best
+from engine.train.config import TrainConfig
+from engine.train.state import TrainState
+
+COLLAPSE_DB = 3.0
+"""The best state is taken instead of the last one when the last probe is this much worse."""
+EMPTY_ALPHA = 0.01
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Random pixels of some views, over a background."""
+
+    origins_world: Float32[np.ndarray, "r 3"]
+    directions_world: Float32[np.ndarray, "r 3"]
+    rgb_srgb: Float32[np.ndarray, "r 3"]
+    weight: Float32[np.ndarray, " r"]
+    view: Int64[np.ndarray, " r"]
+    background_srgb: Float32[np.ndarray, "3"]
+
+
+def draw_probe(
+    dataset: TrainingData, indices: Int64[np.ndarray, " v"], config: TrainConfig, rng: np.random.Generator
+) -> Probe:
+    """``config.probe_rays`` pixels of the views ``indices``."""
+    view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, config.probe_rays)
+    origins, directions = dataset.rays(view, y, x)
+    rgb, alpha, weight = dataset.pixels(view, y, x)
+    background = still_background(config)
+    return Probe(origins, directions, composited(rgb, alpha, background), weight, view, background)
+
+
+def measure(probe: Probe, tracer: Tracer, shading: ShadingModel) -> tuple[float, float]:
+    """PSNR averaged over the views, dB, and the mean accumulated alpha, all seen as new views are."""
+    seen = tracer.trace(probe.origins_world, probe.directions_world)
+    developed = shading.develop(Sight(probe.origins_world, probe.directions_world, seen, tracer))
+    render = np.clip(developed.over(probe.background_srgb), 0, 1)
+    error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
+    views, inverse = np.unique(probe.view, return_inverse=True)
+    sums = np.bincount(inverse, weights=error, minlength=len(views))
+    counts = np.bincount(inverse, weights=probe.weight, minlength=len(views))
+    used = counts > 0
+    psnr = float(np.mean([decibels(value) for value in sums[used] / counts[used]])) if used.any() else 0.0
+    return psnr, float(seen.alpha.mean())
+
+
+def decibels(mse: float) -> float:
+    """PSNR of a mean squared error of display values."""
+    return float(-10 * np.log10(max(mse, 1e-10)))
+
+
+class Judge:
+    """Refuses broken states, keeps the best one, and chooses what is exported.
+
+    Args:
+        dataset: the photographs; probes are drawn from it.
+        config: their size and seed.
+        folder: the best state goes here.
+        listener: hears of the held-out views.
+    """
+
+    def __init__(self, dataset: TrainingData, config: TrainConfig, folder: Path, listener: Listener) -> None:
+        # A generator of its own, so that measuring never changes the training.
+        rng = np.random.Generator(np.random.PCG64([config.seed, 1]))
+        self._probe = draw_probe(dataset, dataset.train_indices, config, rng)
+        self._held_out = None
+        if len(dataset.test_indices):
+            self._held_out = draw_probe(dataset, dataset.test_indices, config, rng)
+        self._folder = folder
+        self._tell = listener
+
+    def inspect(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> None:
+        """Measure a state, keep it if it is the best, and tell of the held-out views.
+
+        Raises:
+            TrainingFailure: parameters are no numbers, or nothing is left to see.
+        """
+        if not state.gaussians.is_finite():
+            raise TrainingFailure(
+                f"Parameters became not-a-number by iteration {state.iteration}; nothing is exported. "
+                "The last checkpoint is kept."
+            )
+        psnr, alpha = measure(self._probe, tracer, shading)
+        if alpha < EMPTY_ALPHA and state.iteration > 0:
+            raise TrainingFailure(
+                f"After iteration {state.iteration} the scene covers only {100 * alpha:.2f} % of the "
+                "photographs; nothing is exported. Check that poses and photographs belong together."
+            )
+        if psnr > state.best_psnr:
+            state.best_psnr, state.best_iteration = psnr, state.iteration
+            save_best(state.gaussians, shading.state(), self._folder)
+        if self._held_out is not None:
+            held_out, _ = measure(self._held_out, tracer, shading)
+            self._tell(HeldOutMeasured(state.iteration, held_out, len(state.gaussians), state.seconds))
+
+    def choose(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> FlatGaussians:
+        """The last Gaussians, or the best if those are much worse; the shading becomes theirs too."""
+        last, _ = measure(self._probe, tracer, shading)
+        if last >= state.best_psnr - COLLAPSE_DB:
+            return state.gaussians
+        self._tell(
+            Warned(
+                f"The last state ({last:.1f} dB) is worse than that of iteration {state.best_iteration} "
+                f"({state.best_psnr:.1f} dB); the better one is exported."
+            )
+        )
+        gaussians, parameters = load_best(self._folder)
+        shading.restore(parameters)
+        return gaussians

@@ -1,0 +1,87 @@
+"""When what happens in a training, and how long it has taken: no state but the clock's."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from engine.train.config import TrainConfig, iteration_count, rebuild_interval
+
+EVENT_EVERY = 10
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """What is due before and after each iteration; iterations are counted from 1, 0 is the start.
+
+    A run may stop, and goes on, only where its hierarchy is built anew in any case: so a resumed run traces
+    the same boxes as one that was never stopped.
+    """
+
+    config: TrainConfig
+    iterations: int
+
+    @classmethod
+    def of(cls, config: TrainConfig, training_pixels: int) -> "Schedule":
+        """The schedule for so many pixels in the training views."""
+        return cls(config, iteration_count(config, training_pixels))
+
+    def ends(self, done: int) -> bool:
+        """Whether all iterations are done."""
+        return done == self.iterations
+
+    def measures(self, done: int) -> bool:
+        """Whether the state after ``done`` iterations is measured and kept as a checkpoint."""
+        every = self.config.rebuild_every
+        every *= -(-self.config.checkpoint_every // every)
+        return done % every == 0 or self.ends(done)
+
+    def rebuilds(self, done: int, gaussians: int) -> bool:
+        """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
+        return self.measures(done) or done % rebuild_interval(self.config, gaussians) == 0
+
+    def tells(self, done: int) -> bool:
+        """Whether listeners hear of the progress."""
+        return done % EVENT_EVERY == 0 or self.ends(done)
+
+    def sh_degree(self, done: int) -> int:
+        """Degree of the harmonics, raised step by step."""
+        return min(self.config.sh_degree, done // self.config.sh_every)
+
+    def may_densify(self, done: int) -> bool:
+        """Whether the fitting of the first Gaussians is over."""
+        return done >= self.config.fit_iterations
+
+    def progress(self, done: int) -> float:
+        """Share of the iterations that are done."""
+        return done / self.iterations
+
+
+class Stopwatch:
+    """Training time, that of earlier processes included; stands still while a state is measured and kept.
+
+    Args:
+        before_s: what earlier processes took.
+    """
+
+    def __init__(self, before_s: float) -> None:
+        self._before_s = before_s
+        self._kept_s = before_s
+        self._since = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time so far."""
+        return self._kept_s + time.perf_counter() - self._since
+
+    @property
+    def seconds_here(self) -> float:
+        """Time in this process."""
+        return self.seconds - self._before_s
+
+    @contextmanager
+    def held(self) -> Iterator[float]:
+        """Let the watch stand still, and give the time it shows."""
+        self._kept_s = self.seconds
+        yield self._kept_s
+        self._since = time.perf_counter()

@@ -1,0 +1,55 @@
+"""The state of a training: everything that the rest of a run depends on."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from engine.gaussians.model import FlatGaussians
+from engine.train.optimiser import Adam
+
+
+@dataclass
+class TrainState:
+    """The state before iteration ``iteration`` (0 at the start).
+
+    Attributes:
+        iteration: iterations done.
+        gaussians: parameters.
+        adam: optimiser state.
+        rng: the generator that draws batches and everything else that is random.
+        densifier: what the densification strategy has observed, as of the last checkpoint.
+        shading: parameters and optimiser state of the shading model, as of the last checkpoint.
+        seconds: training time so far, evaluation left out.
+        running_mse: smoothed squared error of the training rays.
+        best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
+        best_iteration: when that was.
+    """
+
+    iteration: int
+    gaussians: FlatGaussians
+    adam: Adam
+    rng: np.random.Generator
+    densifier: dict[str, np.ndarray] = field(default_factory=dict)
+    shading: dict[str, np.ndarray] = field(default_factory=dict)
+    seconds: float = 0.0
+    running_mse: float = 0.0
+    best_psnr: float = -np.inf
+    best_iteration: int = 0
+
+    def raise_degree(self, degree: int) -> None:
+        """Give the colours harmonics up to ``degree``, zero at first, if they have less."""
+        if degree > self.gaussians.sh_degree:
+            count = (degree + 1) ** 2
+            extra = count - self.gaussians.sh.shape[1]
+            self.gaussians.sh = np.pad(self.gaussians.sh, ((0, 0), (0, extra), (0, 0)))
+            self.adam = self.adam.widen(count)
+
+
+def fresh_state(gaussians: FlatGaussians, seed: int) -> TrainState:
+    """The state before the first iteration."""
+    return TrainState(
+        iteration=0,
+        gaussians=gaussians,
+        adam=Adam.fresh(gaussians),
+        rng=np.random.Generator(np.random.PCG64([seed, 0])),
+    )

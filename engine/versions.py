@@ -1,0 +1,23 @@
+"""Versions of everything that can change a result; they stand in ``config.json`` and ``metrics.json``."""
+
+import importlib.metadata
+
+import engine
+
+PACKAGES = (
+    "embreex",  # Embree: which rays meet which boxes
+    "flip-evaluator",
+    "llvmlite",  # compiles the kernels
+    "numba",
+    "numpy",
+    "OpenImageIO",  # decodes photographs
+    "pycolmap",  # undistorts rays
+    "scipy",
+    "torch",  # shrinks photographs
+    "zstandard",  # packs some exports
+)
+
+
+def versions() -> dict[str, str]:
+    """Version of the project and of each package that it computes with, by name."""
+    return {"octasplat": engine.__version__, **{name: importlib.metadata.version(name) for name in PACKAGES}}
