@@ -83,9 +83,7 @@ def _far(
         return []
     farthest = distances[far[0]] / usual
     named = _some([names[index] for index in far], ", ")
-    which = (
-        f"{named} {farthest:,.0f}" if len(far) == 1 else f"{len(far)} images ({named}) up to {farthest:,.0f}"
-    )
+    which = named if len(far) == 1 else f"{len(far)} images ({named}) up to"
     sentence = f"The model in {folder} places {which} {farthest:,.0f} times as far from the "
     sentence += "other cameras as is usual in it"
     them = "it" if len(far) == 1 else "them"
