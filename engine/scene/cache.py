@@ -158,7 +158,7 @@ def _build(
             if name not in planes or (name == "alpha" and not transparent):
                 (folder / f"{name}.bin").unlink(missing_ok=True)
     except NoSpaceLeft as error:
-        raise NoSpaceLeft(f"{error} The pixel cache takes {sum(planes.values()) / 1e9:.2g} GB.") from error
+        raise NoSpaceLeft(f"{error} The pixel cache takes {sum(planes.values()) / 1e6:,.1f} MB.") from error
     except OSError as error:
         raise OutputError(
             f"The pixel cache cannot be written to {folder} ({error.strerror}); name another folder."
