@@ -21,6 +21,10 @@ class OutputError(OctasplatError):
     """The output folder cannot be used as asked (it holds another run, or cannot be written)."""
 
 
+class NoSpaceLeft(OutputError):
+    """A file cannot be written because its disk is full; what was there before is whole."""
+
+
 class CheckpointError(OctasplatError):
     """A checkpoint is missing, damaged or belongs to another configuration."""
 

@@ -7,12 +7,13 @@ neither torch nor numba, so that a front end can use it.
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, ClassVar
 
 from engine.errors import Cancelled
+from engine.files import telling_of_room
 
 
 @dataclass(frozen=True)
@@ -153,15 +154,22 @@ class JsonLinesListener:
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._path = path
         self._file: IO[str] = path.open("a", encoding="utf-8")
         if self._file.tell() and not path.read_bytes().endswith(b"\n"):
             self._file.write("\n")  # a kill cut the last line short; the next event begins a new one
 
     def __call__(self, event: Event) -> None:
-        """Write ``event`` and flush, so that a reader beside the run sees whole lines."""
-        self._file.write(json.dumps({"time": round(time.time(), 3), **event.as_dict()}) + "\n")
-        self._file.flush()
+        """Write ``event`` and flush, so that a reader beside the run sees whole lines.
+
+        Raises:
+            NoSpaceLeft: there is no room for it.
+        """
+        with telling_of_room(self._path):
+            self._file.write(json.dumps({"time": round(time.time(), 3), **event.as_dict()}) + "\n")
+            self._file.flush()
 
     def close(self) -> None:
         """Close the file; the listener must not be called afterwards."""
-        self._file.close()
+        with suppress(OSError):  # what could not be written was told when it was to be
+            self._file.close()

@@ -18,7 +18,7 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Int64
 
-from engine.errors import DatasetError, OutputError
+from engine.errors import DatasetError, NoSpaceLeft, OutputError
 from engine.files import replacing, write_json
 from engine.scene.image_info import ImageInfo
 from engine.scene.images import read_mask, read_photo
@@ -157,10 +157,11 @@ def _build(
         for name in ("alpha", "mask"):
             if name not in planes or (name == "alpha" and not transparent):
                 (folder / f"{name}.bin").unlink(missing_ok=True)
+    except NoSpaceLeft as error:
+        raise NoSpaceLeft(f"{error} The pixel cache takes {sum(planes.values()) / 1e6:,.1f} MB.") from error
     except OSError as error:
         raise OutputError(
-            f"The pixel cache of {sum(planes.values()) / 1e9:.2f} GB cannot be written to {folder} "
-            f"({error.strerror}); free space there or name another folder."
+            f"The pixel cache cannot be written to {folder} ({error.strerror}); name another folder."
         ) from error
     black = [view.name for view, summary in zip(scene.views, summaries, strict=True) if summary.is_masked_out]
     warnings = [f"{len(black)} masks hold no valid (white) pixel, e.g. that of {black[0]}."] if black else []

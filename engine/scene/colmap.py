@@ -14,6 +14,8 @@ from engine.errors import DatasetError
 from engine.scene.binary import check_binary_model
 from engine.scene.cameras import Camera
 from engine.scene.model import SparsePoints
+from engine.scene.pose_check import check_poses
+from engine.scene.text import fault_in_text_model
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where a scene keeps its model; the first that holds one counts."""
@@ -89,6 +91,9 @@ def read_colmap_model(root: Path) -> ColmapModel:
     try:
         reconstruction = pycolmap.Reconstruction(str(folder))
     except (ValueError, IndexError, KeyError, TypeError, RuntimeError, MemoryError, OSError) as error:
+        fault = fault_in_text_model(folder)
+        if fault is not None:
+            raise DatasetError(fault) from error
         reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         raise DatasetError(
             f"The COLMAP model in {folder} cannot be read ({reason}); copy it anew or run COLMAP again."
@@ -98,6 +103,11 @@ def read_colmap_model(root: Path) -> ColmapModel:
     images = _posed_images(reconstruction, folder, warnings)
     cameras = _cameras(reconstruction, {image.camera_id for image in images}, folder, warnings)
     points = _sparse_points(reconstruction, folder, warnings)
+    if images:
+        rotations = np.stack([image.rotation_cam_from_world for image in images])
+        translations = np.stack([image.translation_cam_from_world for image in images])
+        names = [image.name for image in images]
+        warnings += check_poses(folder, names, rotations, translations, points)
     return ColmapModel(folder, cameras, images, points, tuple(warnings))
 
 

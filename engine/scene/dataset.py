@@ -138,6 +138,11 @@ class Dataset:
             ConfigError: a setting is out of range.
         """
         scene = load_scene(root, max_side=max_side)
+        if masks == "alpha" and all(view.mask_path is None for view in scene.views):
+            raise DatasetError(
+                f"Masks are to be the alpha, but {root / 'masks'} holds none of any photograph; put them "
+                f"there (as {scene.views[0].name}.png) or leave --masks alpha out."
+            )
         split_views(
             [view.name for view in scene.views], test_every, held_out
         )  # complain before the long work

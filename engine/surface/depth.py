@@ -1,5 +1,6 @@
 """Depth maps of a scene, rendered by the tracer and kept in a temporary file."""
 
+import os
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from engine.files import telling_of_room
 from engine.render.cameras import RenderCamera
 from engine.render.renderer import RenderedImage, render_rays
 from engine.surface.options import SurfaceOptions
@@ -46,10 +48,14 @@ def render_depth_maps(
     """Render the depth maps of ``cameras`` into a file in ``folder``, 8 bytes a pixel.
 
     The file has no name, so that nothing is left of it whatever happens.
+
+    Raises:
+        NoSpaceLeft: there is no room for it.
     """
     sizes = [camera.width_px * camera.height_px for camera in cameras]
-    with tempfile.TemporaryFile(dir=folder) as handle:
-        handle.truncate(max(8, 8 * sum(sizes)))
+    with telling_of_room(folder), tempfile.TemporaryFile(dir=folder) as handle:
+        # Not a file with holes: a full disk would end the program when they are filled.
+        os.posix_fallocate(handle.fileno(), 0, max(8, 8 * sum(sizes)))
         stored = np.memmap(handle, dtype=np.float32, mode="r+", shape=(2 * sum(sizes),))
     distances, cosines, start = [], [], 0
     black = np.zeros(3, np.float32)

@@ -221,7 +221,7 @@ def test_nonsense_in_a_text_file_is_refused(tmp_path, make_scene):
     root = make_scene(tmp_path, text=True)
     path = root / "sparse/0/images.txt"
     path.write_text(path.read_text().replace("1", "x"))
-    with pytest.raises(DatasetError, match=r"sparse/0 cannot be read \("):
+    with pytest.raises(DatasetError, match=r"sparse/0/\w+\.txt holds '\S*x\S*' where a finite number"):
         load_scene(root)
 
 
@@ -255,7 +255,7 @@ def set_quaternion(root, wxyz: list[float], text: bool) -> None:
 def test_rotations_must_be_rotations(tmp_path, make_scene, wxyz, text):
     root = make_scene(tmp_path, with_rigs=False, text=text)
     set_quaternion(root, wxyz, text)
-    with pytest.raises(DatasetError, match=r"pose of view_\d\.png .*rotation|sparse/0 cannot be read"):
+    with pytest.raises(DatasetError, match=r"pose of view_\d\.png"):
         load_scene(root)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from engine.config import ReconstructionConfig
-from engine.errors import Cancelled
+from engine.errors import Cancelled, NoSpaceLeft
 from engine.events import stopping
 from engine.pipeline import reconstruct
 from workers.cli.progress import show_progress
@@ -46,6 +46,9 @@ def run_reconstruction(
         except Cancelled as error:
             message = "Stopped; the same command goes on." if resumes_by_itself else str(error)
             raise Stopped(message, should_stop.exit_code) from None
+        except NoSpaceLeft as error:
+            how = "" if resumes_by_itself else " with --resume"
+            raise NoSpaceLeft(f"{error} Then the same command{how} goes on.") from error
     if not quiet:
         for line in run_summary(output, config.exports):
             click.echo(line)

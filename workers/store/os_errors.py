@@ -1,13 +1,11 @@
 """What errors of the operating system mean for a store."""
 
-import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from engine.files import NO_ROOM
 from workers.store.errors import StorageFull, StorageUnavailable
-
-_NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 @contextmanager
@@ -21,7 +19,7 @@ def told(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _NO_ROOM:
+        if error.errno in NO_ROOM:
             raise StorageFull(f"The disk of {path} is full; delete datasets or jobs, or add room.") from error
         reason = error.strerror or str(error)
         raise StorageUnavailable(
