@@ -1,9 +1,8 @@
-"""Programs of ours in processes of their own, which import nothing from the current folder or ``PYTHONPATH``.
+"""Programs of ours in processes that import nothing from the current folder or ``PYTHONPATH``.
 
-``python -m package`` looks for the package in the current folder first, where many projects have folders named
-as ours are. What is started here runs with ``-E -P`` instead, finds the very packages that the starting process
-runs, and where somebody asked for modules by name, those. This file is also what is run; it imports nothing of
-ours.
+``python -m package`` looks in the current folder first, where many projects have folders named as ours are.
+What is started here runs with ``-E -P`` instead, finds the very packages that the starting process runs, and
+where somebody asked for modules by name, those. This file is also what is run; it imports nothing of ours.
 """
 
 import importlib.util

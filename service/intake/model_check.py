@@ -81,7 +81,7 @@ def check_model(
 def _ask(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
     # Files, not pipes: the child's limit on the length of files then bounds what it can say.
     with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as noise:
-        child = subprocess.Popen(
+        child = subprocess.Popen(  # noqa: S603 - a program of ours
             python_command("service.intake.model_child"),
             stdin=subprocess.PIPE,
             stdout=answer,

@@ -197,6 +197,9 @@ async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, 
 async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_slip: bool = False) -> None:
     """Put a job back into its queue with a new slip; the caller holds the job's lock.
 
+    A job that has a slip, as it was interrupted or not even begun, keeps its place: it goes before all that
+    were queued after it. One that was over goes last.
+
     Args:
         connection: of the transaction.
         slips: the queue.
@@ -205,7 +208,7 @@ async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_sl
     """
     if job.slip is not None and not keep_slip:
         await slips.remove(connection, job.slip)
-    slip = await slips.put(connection, job.id, job.queue, job.priority)
+    slip = await slips.put(connection, job.id, job.queue, job.priority, place_of=job.slip)
     await connection.execute(
         """
         UPDATE jobs SET state = 'queued', slip = %s, queued_at = now(), worker = NULL, seconds_left = NULL
