@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from engine.config import ReconstructionConfig
-from engine.errors import Cancelled
+from engine.errors import Cancelled, ExportFailed
 from engine.pipeline import reconstruct
 from workers.progress import show_progress, stopping
 from workers.signals import Stopped, stop_on_signals
@@ -28,6 +28,7 @@ def run_reconstruction(
 
     Raises:
         Stopped: by SIGINT or SIGTERM, after a checkpoint.
+        ExportFailed: some files could not be written; what there is was shown.
         OctasplatError: as :func:`engine.pipeline.reconstruct` does.
     """
     with stop_on_signals() as should_stop:
@@ -45,6 +46,11 @@ def run_reconstruction(
         except Cancelled as error:
             message = "Stopped; the same command goes on." if resumes_by_itself else str(error)
             raise Stopped(message, should_stop.exit_code) from None
+        except ExportFailed as error:
+            for line in run_summary(output, [name for name in config.exports if (output / name).exists()]):
+                click.echo(line)
+            again = f"Mend that or name others with --exports, and add --resume: {output} goes on from there."
+            raise ExportFailed(f"{error} {again}") from None
     if not quiet:
         for line in run_summary(output, config.exports):
             click.echo(line)

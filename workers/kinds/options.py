@@ -19,7 +19,8 @@ _TAKEN = frozenset(
 )  # fmt: skip
 
 
-def _export_name(name: str) -> str:
+def check_export_name(name: str) -> str:
+    """A file name of a result, whose format is known; raises ValueError otherwise."""
     if not _FILE_NAME.fullmatch(name) or ".." in name:
         raise ValueError("name a file such as mesh.glb: letters, digits, '.', '_' and '-'")
     if name.lower() in _TAKEN:
@@ -31,7 +32,7 @@ def _export_name(name: str) -> str:
     return name
 
 
-ExportName = Annotated[str, AfterValidator(_export_name)]
+ExportName = Annotated[str, AfterValidator(check_export_name)]
 
 
 class ReconstructOptions(ReconstructionConfig):
