@@ -60,6 +60,8 @@ def submit(api: Api, what: Submission, *, quiet: bool = False) -> dict[str, Any]
         "priority": what.priority,
     }
     job: dict[str, Any] = api.post("/v1/jobs", body)
+    for note in job.get("notes", ()):
+        click.echo(f"Note: {note}", err=True)
     return job
 
 
@@ -107,6 +109,10 @@ def submit_and_wait(api: Api, what: Submission, output: Path, *, quiet: bool = F
         click.echo(f"Queued as job {job['id']}.")
     try:
         job = wait_for(api, job["id"], quiet=quiet)
+    except JobFailed:
+        if api.get(f"/v1/jobs/{job['id']}/artifacts")["artifacts"]:
+            fetch(api, job["id"], output, quiet=quiet)  # what succeeded
+        raise
     except KeyboardInterrupt:
         click.echo(f"The job goes on without you: octasplat status {job['id']}", err=True)
         raise

@@ -125,6 +125,20 @@ def resolve_reconstruction(asked: Mapping[str, Any]) -> ReconstructOptions:
     return ReconstructOptions.model_validate({**asked, "train": merged})
 
 
+def revise_reconstruction(before: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructOptions:
+    """The options of a job with changes; another preset brings its own training settings.
+
+    Raises:
+        ValidationError: an unknown name or a value out of range.
+    """
+    another = changes.get("preset", before.get("preset")) != before.get("preset")
+    kept = {key: value for key, value in before.items() if key != "train"}
+    if another or not isinstance(changes.get("train", {}), Mapping):
+        return resolve_reconstruction({**kept, **changes})
+    train = _merged(before.get("train", {}), changes.get("train", {}))
+    return resolve_reconstruction({**kept, **changes, "train": train})
+
+
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """``base`` with the values of ``over``, section by section; a section of another kind begins anew."""
     merged = dict(base)

@@ -163,7 +163,14 @@ async def cancel_job(connection: Connection, slips: Slips, job_id: uuid.UUID) ->
         return await _existing(connection, job_id)
 
 
-async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, fresh: bool) -> Job:
+async def retry_job(
+    connection: Connection,
+    slips: Slips,
+    job_id: uuid.UUID,
+    *,
+    fresh: bool,
+    options: Mapping[str, Any] | None = None,
+) -> Job:
     """Queue a failed or cancelled job again.
 
     Args:
@@ -171,6 +178,7 @@ async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, 
         slips: the queue.
         job_id: which.
         fresh: begin from the start, not from the newest checkpoint.
+        options: complete options in the place of the job's own.
 
     Raises:
         Conflict: it is neither failed nor cancelled.
@@ -185,10 +193,16 @@ async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, 
             UPDATE jobs SET rescues = 0, error = NULL, stage = NULL, step = NULL, total_steps = NULL,
                 seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL,
                 checkpoint = CASE WHEN %(fresh)s THEN NULL ELSE checkpoint END,
-                fresh_after = CASE WHEN %(fresh)s THEN attempt ELSE fresh_after END
+                fresh_after = CASE WHEN %(forget)s THEN attempt ELSE fresh_after END,
+                options = coalesce(%(options)s, options)
             WHERE id = %(id)s
             """,
-            {"fresh": fresh, "id": job_id},
+            {
+                "fresh": fresh,
+                "forget": fresh or options is not None,
+                "options": Jsonb(dict(options)) if options is not None else None,
+                "id": job_id,
+            },
         )
         await queue_again(connection, slips, job)
         return await _existing(connection, job_id)
