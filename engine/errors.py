@@ -13,6 +13,10 @@ class SceneFileError(OctasplatError):
     """A file of Gaussians or of a mesh cannot be read or written."""
 
 
+class ExportFailed(OctasplatError):
+    """Some of the files that were asked for could not be written; everything else is there."""
+
+
 class ConfigError(OctasplatError):
     """A setting is unknown, out of range or contradicts another."""
 

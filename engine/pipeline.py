@@ -13,7 +13,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from engine.config import ReconstructionConfig, read_config
-from engine.errors import ConfigError, DamagedCheckpoint, DatasetError, OutputError
+from engine.errors import (
+    Cancelled,
+    ConfigError,
+    DamagedCheckpoint,
+    DatasetError,
+    ExportFailed,
+    OutputError,
+)
 from engine.evaluate.held_out import evaluate_held_out
 from engine.events import (
     JsonLinesListener,
@@ -26,7 +33,8 @@ from engine.events import (
     broadcast,
 )
 from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.export.registry import check_writable
+from engine.export.several import export_files
 from engine.files import write_json
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
@@ -67,7 +75,7 @@ def reconstruct(
         scene: folder with photographs and a COLMAP model, see :meth:`engine.scene.Dataset.open`.
         output: a folder that does not exist, is empty, or holds the same run if ``resume``.
         config: all settings.
-        resume: go on with the run that is in ``output``.
+        resume: go on with the run that is in ``output``; only ``exports`` may then be others than the run's.
         threads: for everything; 0 means all cores.
         listener: hears the events that also go to ``events.jsonl``.
         should_stop: asked now and then; True stops the run after a checkpoint.
@@ -76,9 +84,13 @@ def reconstruct(
         DatasetError: the photographs or the model cannot be used.
         OutputError: ``output`` holds something else or cannot be written.
         ConfigError: settings that the photographs rule out or, with ``resume``, other ones than the run's.
+        SceneFileError: a file of ``exports`` could not be written on this machine; told before the training.
         TrainingFailure: training collapsed.
+        ExportFailed: some of ``exports`` could not be written; all the rest is there.
         Cancelled: stopped as asked.
     """
+    if not (output / SCENE).exists():
+        check_writable(config.exports)
     began = time.perf_counter()
     use_threads(threads)
     is_new = _claim_output(scene, output, config, resume)
@@ -99,11 +111,21 @@ def reconstruct(
             with _stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)):
                 gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
                 write_gaussian_ply(gaussians, output / SCENE)
+        unmeasured: Exception | None = None
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
-            with _stage("evaluate", tell, len(dataset.test_indices)):
-                _evaluate(dataset, output, config, threads, tell)
+            try:
+                with _stage("evaluate", tell, len(dataset.test_indices)):
+                    _evaluate(dataset, output, config, threads, tell)
+            except Cancelled:
+                raise
+            except Exception as error:  # noqa: BLE001 - raised below, after the files are written
+                unmeasured = error
         with _stage("export", tell, len(config.exports)):
-            _export(output, config, tell)
+            failed = _export(output, config, tell)
+        if unmeasured is not None:
+            raise unmeasured
+        if failed is not None:
+            raise ExportFailed(f"{failed} Everything else is there.")
         dataset.release_pages()
         outputs = tuple(
             sorted(p.name for p in output.iterdir() if p.name != CACHE and not p.name.startswith("."))
@@ -189,12 +211,14 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
             raise OutputError(
                 f"{output} already holds a run; add --resume to go on with it, or name another folder."
             )
-        if read_config(output / CONFIG) != config:
+        before = read_config(output / CONFIG)
+        if before.model_copy(update={"exports": config.exports}) != config:
             raise ConfigError(
                 f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
                 "or name another folder."
             )
-        if run_scene(output) != scene.resolve():  # the photographs have moved
+        # The photographs have moved, or other files are wanted.
+        if run_scene(output) != scene.resolve() or before != config:
             write_json(output / CONFIG, content)
         return False
     if output.is_dir() and any(not path.name.startswith(".") for path in output.iterdir()):
@@ -296,12 +320,13 @@ def _evaluate(
     )
 
 
-def _export(output: Path, config: ReconstructionConfig, tell: Listener) -> None:
+def _export(output: Path, config: ReconstructionConfig, tell: Listener) -> str | None:
+    """Write what is missing; returns what could not be written and why."""
     missing = [name for name in config.exports if not (output / name).exists()]
     if not missing:
-        return
+        return None
     gaussians, _ = read_gaussian_ply(output / SCENE)
     options = ExportOptions(q=config.train.trace.q)
-    for done, name in enumerate(missing, start=1):
-        export_scene(gaussians, output / name, options)
-        tell(StageProgress("export", done, len(missing)))
+    return export_files(
+        gaussians, output, missing, options, lambda done: tell(StageProgress("export", done, len(missing)))
+    )

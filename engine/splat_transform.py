@@ -23,6 +23,16 @@ def converter() -> Path | None:
     return Path(found) if found else None
 
 
+def lacking() -> str | None:
+    """What to do about the program being missing, or None where it is there."""
+    if converter() is not None:
+        return None
+    return (
+        f"needs the program {PROGRAM}; install node and then it with npm install -g {PACKAGE}, "
+        f"or name it in {VARIABLE}"
+    )
+
+
 def convert(source: Path, target: Path, *options: str) -> None:
     """Convert ``source`` to ``target``, whose suffixes say the formats; no GPU is used.
 
@@ -36,10 +46,7 @@ def convert(source: Path, target: Path, *options: str) -> None:
     """
     program = converter()
     if program is None:
-        raise SceneFileError(
-            f"{target}: needs the program {PROGRAM}; install node and then it with npm install -g {PACKAGE}, "
-            f"or name it in {VARIABLE}."
-        )
+        raise SceneFileError(f"{target}: {lacking()}.")
     command = [str(program), "-q", "-w", "-g", "cpu", *options, str(source.resolve()), str(target.resolve())]
     try:
         done = subprocess.run(  # noqa: S603 - no shell, and the paths are absolute

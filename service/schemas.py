@@ -1,6 +1,7 @@
 """What the API takes and gives, with examples."""
 
 import uuid
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, Literal
 
@@ -165,13 +166,22 @@ class JobChange(Strict):
 
 
 class RetryRequest(Strict):
-    """Where a retried job begins."""
+    """Where a retried job begins, and what is to be different."""
 
     model_config = ConfigDict(
-        extra="forbid", populate_by_name=True, json_schema_extra={"examples": [{"from": "checkpoint"}]}
+        extra="forbid",
+        populate_by_name=True,
+        json_schema_extra={
+            "examples": [{"from": "checkpoint"}, {"options": {"exports": ["mesh.glb"]}}],
+        },
     )
 
     start: Literal["checkpoint", "start"] = Field("checkpoint", alias="from")
+    options: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Settings in the place of the job's own. What changes the training needs `from: start`; "
+        "a reconstruction goes on with other `exports`.",
+    )
 
 
 class JobError(BaseModel):
@@ -216,6 +226,7 @@ class JobView(BaseModel):
                     "psnr": 25.1,
                     "worker": "host-4711",
                     "queue_position": None,
+                    "notes": [],
                     "error": None,
                     "checkpoint": {"stage": "train", "step": 250},
                     "preview": None,
@@ -249,6 +260,9 @@ class JobView(BaseModel):
     psnr: float | None = Field(description="Of the training so far, dB.")
     worker: str | None
     queue_position: int | None = Field(description="Jobs that go before it.")
+    notes: list[str] = Field(
+        description="What its owner should know while it waits, e.g. for want of a worker."
+    )
     error: JobError | None
     checkpoint: CheckpointView | None
     preview: dict[str, Any] | None = Field(description="`step` and `view` of GET /v1/jobs/{id}/preview.")
@@ -260,11 +274,13 @@ class JobView(BaseModel):
     expires_at: datetime | None
 
     @classmethod
-    def of(cls, row: Job, stages: list[str], queue_position: int | None = None) -> "JobView":
+    def of(
+        cls, row: Job, stages: list[str], queue_position: int | None = None, notes: Sequence[str] = ()
+    ) -> "JobView":
         """From its row."""
-        names = {name for name in cls.model_fields if name not in ("stages", "queue_position")}
+        names = {name for name in cls.model_fields if name not in ("stages", "queue_position", "notes")}
         values = {name: getattr(row, name) for name in names}
-        return cls(**values, stages=stages, queue_position=queue_position)
+        return cls(**values, stages=stages, queue_position=queue_position, notes=list(notes))
 
 
 class JobPage(BaseModel):

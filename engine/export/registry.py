@@ -1,9 +1,10 @@
 """Which format writes a path: every module of this package that calls `register` is found by itself."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from engine.errors import SceneFileError
 from engine.export.options import ExportOptions
 from engine.formats import FormatTable
 from engine.gaussians.model import FlatGaussians
@@ -21,12 +22,14 @@ class Exporter:
             with more literal characters wins.
         description: one line for help texts.
         write: writes the Gaussians to the path and returns every file written, the path itself first.
+        lacking: what is missing on this machine to write it, to be read after the file's name, or None.
     """
 
     name: str
     patterns: tuple[str, ...]
     description: str
     write: Writer
+    lacking: Callable[[], str | None] = lambda: None
 
 
 _TABLE: FormatTable[Exporter] = FormatTable(__name__.rpartition(".")[0], "export")
@@ -54,6 +57,23 @@ def exporter_for(path: Path, format: str | None = None) -> Exporter:
     if format is not None:
         return _TABLE.named(format, path)
     return _TABLE.by_file_name(path, "no export format takes this file name")
+
+
+def writable_formats() -> tuple[str, ...]:
+    """Names of the formats that this machine can write, as of now."""
+    return tuple(exporter.name for exporter in exporters() if exporter.lacking() is None)
+
+
+def check_writable(names: Iterable[str]) -> None:
+    """Make sure that files of these names can be written on this machine, before any long work.
+
+    Raises:
+        SceneFileError: no format takes a name, or what its format needs is missing; the text says what to do.
+    """
+    for name in names:
+        lacking = exporter_for(Path(name)).lacking()
+        if lacking is not None:
+            raise SceneFileError(f"{name}: {lacking}.")
 
 
 def export_scene(

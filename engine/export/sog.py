@@ -10,7 +10,7 @@ from engine.export.selection import selected
 from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import write_gaussian_ply
-from engine.splat_transform import convert
+from engine.splat_transform import convert, lacking
 
 
 def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
@@ -34,4 +34,6 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
-register(Exporter("sog", ("*.sog",), "SOG of PlayCanvas, the smallest; needs splat-transform", write))
+register(
+    Exporter("sog", ("*.sog",), "SOG of PlayCanvas, the smallest; needs splat-transform", write, lacking)
+)

@@ -5,6 +5,8 @@ axis; the scale along it has no meaning and is the flat 1e-5. The data are turne
 usd-core (the extra ``usd``).
 """
 
+import importlib.metadata
+import importlib.util
 import tempfile
 from pathlib import Path
 from types import ModuleType
@@ -61,13 +63,23 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     return (path,)
 
 
+def lacking() -> str | None:
+    """What is missing to write USD, without loading it; whether an old copy will do shows when it is used."""
+    if importlib.util.find_spec("pxr") is None:
+        return "needs the package usd-core; install it with pip install 'usd-core>=26.5'"
+    try:
+        version = importlib.metadata.version("usd-core")
+    except importlib.metadata.PackageNotFoundError:  # USD of another package
+        return None
+    numbers = tuple(int(part) for part in version.split(".")[:2] if part.isdigit())
+    return None if numbers >= (26, 5) else f"usd-core {version} is too old; install usd-core 26.5 or later"
+
+
 def _usd(path: Path) -> dict[str, ModuleType]:
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
     except ImportError as error:
-        raise SceneFileError(
-            f"{path}: needs the package usd-core; install it with pip install 'usd-core>=26.5'."
-        ) from error
+        raise SceneFileError(f"{path}: {lacking() or error}.") from error
     if not hasattr(UsdVol, "ParticleField"):
         raise SceneFileError(f"{path}: this usd-core has no ParticleField; install usd-core 26.5 or later.")
     return {
@@ -122,5 +134,6 @@ register(
         ("*.usdz", "*.usdc", "*.usda", "*.usd"),
         "USD ParticleField with the surflet kernel; needs usd-core",
         write,
+        lacking,
     )
 )

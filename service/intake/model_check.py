@@ -4,7 +4,6 @@ import logging
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -13,6 +12,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from engine.isolated_python import python_command
 from service.intake.faults import Fault
 from service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
 from workers.store.protocol import Storage
@@ -81,13 +81,14 @@ def check_model(
 def _ask(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
     # Files, not pipes: the child's limit on the length of files then bounds what it can say.
     with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as noise:
-        child = subprocess.Popen(
-            [sys.executable, "-I", "-m", "service.intake.model_child"],
+        child = subprocess.Popen(  # noqa: S603 - a program of ours
+            python_command("service.intake.model_child"),
             stdin=subprocess.PIPE,
             stdout=answer,
             stderr=noise,
             env=child_environment(),
             start_new_session=True,
+            cwd="/",
         )
         try:
             child.communicate(request.model_dump_json().encode(), timeout=limits.seconds)

@@ -1,6 +1,6 @@
 """The child process that parses a COLMAP model from somebody who may mean harm.
 
-    python -I -m service.intake.model_child < request.json > answer.json
+    python -P -m service.intake.model_child < request.json > answer.json
 
 It limits its own memory, time and output before it imports anything that parses. Only this module's ``main``
 imports pycolmap. The parent is :mod:`service.intake.model_check`; what it sends and receives is defined here.

@@ -1,7 +1,8 @@
 """Jobs: accepted, listed, read, cancelled, retried, deleted."""
 
 import uuid
-from typing import Annotated
+from contextlib import suppress
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ValidationError
@@ -12,6 +13,7 @@ from service.etags import check_precondition, matches
 from service.idempotency import IdempotencyKey, fingerprint, once
 from service.paging import Cursor, Limit, link_next, read_id_cursor, write_cursor
 from service.problems import Problem, not_found, refused_options
+from service.queue_facts import check_writable, waiting_notes, workers_of
 from service.routes import problems
 from service.schemas import JobChange, JobPage, JobView, NewJob, RetryRequest
 from service.state import Service, ServiceDep
@@ -46,6 +48,8 @@ async def create_job(
         async def make() -> uuid.UUID:
             await check_new_job(connection, who.owner, service.settings.quota)
             dataset_id, source_id, options = await _inputs(connection, who, kind, new)
+            workers = await workers_of(connection, new.queue, service.settings.stale_seconds)
+            check_writable(kind, options, new.queue, workers)
             made = rows.NewJob(
                 owner=who.owner,
                 kind=kind.name,
@@ -72,7 +76,7 @@ async def create_job(
         named = fingerprint("job", new.model_dump(mode="json"))
         job_id, _ = await once(connection, who, key, named, make)
         job = await owned_job(connection, who, job_id)
-        view = await _view(connection, job)
+        view = await job_view(connection, service, job)
     response.headers["Location"] = f"/v1/jobs/{job_id}"
     _say_when(response, view)
     return view
@@ -113,7 +117,7 @@ async def get_job(
     """A job. Polling with `If-None-Match` costs next to nothing."""
     async with service.pool.connection() as connection:
         job = await owned_job(connection, who, job_id)
-        view = await _view(connection, job)
+        view = await job_view(connection, service, job)
     etag = _etag(job, view)
     headers = {"ETag": etag, "Cache-Control": "no-cache"}
     if matches(request.headers.get("if-none-match"), etag):
@@ -131,7 +135,7 @@ async def change_job(
     """Rename a job, or keep it whatever its age."""
     async with service.pool.connection() as connection, connection.transaction():
         job = await owned_job(connection, who, job_id, lock=True)
-        check_precondition(request, _etag(job, await _view(connection, job)))
+        check_precondition(request, _etag(job, await job_view(connection, service, job)))
         given = change.model_dump(exclude_unset=True)
         job = await rows.change_job(
             connection,
@@ -139,7 +143,7 @@ async def change_job(
             label=given.get("label", job.label),
             pinned=bool(given["pinned"]) if given.get("pinned") is not None else job.pinned,
         )
-        return await _view(connection, job)
+        return await job_view(connection, service, job)
 
 
 @router.post("/{job_id}/cancel", status_code=202, responses=problems(404, 409))
@@ -148,7 +152,7 @@ async def cancel_job(job_id: uuid.UUID, who: Writer, service: ServiceDep, respon
     async with service.pool.connection() as connection:
         await owned_job(connection, who, job_id)
         job = await rows.cancel_job(connection, service.slips, job_id)
-        view = await _view(connection, job)
+        view = await job_view(connection, service, job)
     response.headers["Location"] = f"/v1/jobs/{job_id}"
     _say_when(response, view)
     return view
@@ -159,18 +163,30 @@ async def retry_job(
     job_id: uuid.UUID, who: Writer, service: ServiceDep, response: Response,
     retry: RetryRequest | None = None, key: IdempotencyKey = None,
 ) -> JobView:  # fmt: skip
-    """Queue a failed or cancelled job again, from its newest checkpoint or from the start."""
-    start = retry.start if retry is not None else "checkpoint"
+    """Queue a failed or cancelled job again, from its newest checkpoint or from the start.
+
+    With other options if some are given: a reconstruction whose files could not be written goes on from its
+    trained scene with other `exports`.
+    """
+    asked = retry or RetryRequest(start="checkpoint")
     async with service.pool.connection() as connection, connection.transaction():
         owner = (await owned_job(connection, who, job_id)).owner
 
         async def make() -> uuid.UUID:
             await check_new_job(connection, owner, service.settings.quota)
-            await rows.retry_job(connection, service.slips, job_id, fresh=start == "start")
+            job = await owned_job(connection, who, job_id, lock=True)
+            await rows.retry_job(
+                connection,
+                service.slips,
+                job_id,
+                fresh=asked.start == "start",
+                options=await _revised(connection, service, job, asked),
+            )
             return job_id
 
-        await once(connection, who, key, fingerprint("retry", str(job_id), start), make)
-        view = await _view(connection, await owned_job(connection, who, job_id))
+        named = fingerprint("retry", str(job_id), asked.start, *([asked.options] if asked.options else []))
+        await once(connection, who, key, named, make)
+        view = await job_view(connection, service, await owned_job(connection, who, job_id))
     response.headers["Location"] = f"/v1/jobs/{job_id}"
     _say_when(response, view)
     return view
@@ -244,9 +260,9 @@ async def _inputs(
         source = await rows.get_job(connection, new.source_id, lock=True)
         if source is None or not who.owns(source.owner):
             raise _input_problem("source_id", "There is no such job.")
-        if source.state != "succeeded":
-            raise Problem(409, "source", f"The job in source_id is {source.state} and has no results.")
         names = {artifact.name for artifact in await rows.artifacts_of(connection, source.id)}
+        if source.state != "succeeded" and not (source.state == "failed" and names):
+            raise Problem(409, "source", f"The job in source_id is {source.state} and has no results.")
         if kind.source_files and kind.source_files[0] not in names:
             raise _input_problem("source_id", f"The job in source_id has no {kind.source_files[0]}.")
         return source.dataset_id, source.id, options
@@ -267,12 +283,48 @@ def _input_problem(name: str, detail: str) -> Problem:
     return Problem(422, "input", detail, errors=[{"pointer": f"#/{name}", "detail": detail}])
 
 
-async def _view(connection: Connection, job: Job) -> JobView:
-    return JobView.of(job, stages_of(job), await rows.queue_position(connection, job))
+async def _revised(
+    connection: Connection, service: Service, job: Job, asked: RetryRequest
+) -> dict[str, Any] | None:
+    """The options of a job that is tried again, checked; None leaves them as they are."""
+    workers = await workers_of(connection, job.queue, service.settings.stale_seconds)
+    try:
+        kind = kind_named(job.kind)
+        before = kind.options.model_validate(job.options)
+    except (ConfigError, ValidationError):
+        if not asked.options:
+            return None
+        detail = "The job is of another version, so its options cannot be changed; make a new one."
+        raise Problem(409, "version", detail) from None
+    try:
+        options = kind.revised(job.options, asked.options) if asked.options else before
+    except ValidationError as error:
+        raise refused_options(error) from None
+    check_writable(kind, options, job.queue, workers)
+    if not asked.options:
+        return None
+    if kind.needs == "dataset" and job.dataset_id is not None:
+        dataset = await get_dataset(connection, job.dataset_id)
+        options = kind.settle(options, dataset is not None and dataset.has_poses)
+    if asked.start == "checkpoint" and job.checkpoint is not None and not kind.goes_on(before, options):
+        detail = "With these options the work begins anew; ask for that with from: start."
+        raise Problem(422, "other-work", detail, errors=[{"pointer": "#/options", "detail": detail}])
+    return options.model_dump(mode="json")
+
+
+async def job_view(connection: Connection, service: Service, job: Job) -> JobView:
+    """A job as it is shown alone: with its place in the queue, and what to know while it waits."""
+    notes: list[str] = []
+    if job.state == "queued":
+        with suppress(ConfigError, ValidationError):  # of another version
+            kind = kind_named(job.kind)
+            workers = await workers_of(connection, job.queue, service.settings.stale_seconds)
+            notes = waiting_notes(kind, kind.options.model_validate(job.options), job.queue, workers)
+    return JobView.of(job, stages_of(job), await rows.queue_position(connection, job), notes)
 
 
 def _etag(job: Job, view: JobView) -> str:
-    place = "" if view.queue_position is None else f".{view.queue_position}"
+    place = "" if view.queue_position is None else f".{view.queue_position}.{len(view.notes)}"
     return f'"{job.version}{place}"'
 
 

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -62,10 +62,11 @@ _ATTRIBUTE = re.compile(r"^ {0,8}(\w+): (.*)$")
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several values: what is sent and what is shown."""
+    """One of several values: what is sent, what is shown, and whether nobody can do it."""
 
     value: str
     text: str
+    lacking: bool = False
 
 
 @dataclass(frozen=True)
@@ -120,13 +121,14 @@ class OptionsForm:
     more: list[Section]
 
 
-def options_form(kind: JobKind) -> OptionsForm:
-    """The form of a kind of job."""
+def options_form(kind: JobKind, unwritable: Collection[str] = ()) -> OptionsForm:
+    """The form of a kind of job; files of the formats ``unwritable`` are marked and cannot be chosen."""
     schema = kind.options.model_json_schema()
     presets = _preset_values(schema)
     # The schema has the docstring of the class alone, not those that it inherits from.
     docstring = "\n".join(cls.__doc__ or "" for cls in reversed(kind.options.__mro__[:-1]))
-    fields = list(_walk(schema, {**schema, "description": docstring}, "", presets))
+    walked = _walk(schema, {**schema, "description": docstring}, "", presets)
+    fields = [_marked(item, unwritable) for item in walked]
     names = [*_FIRST, *_FIRST_OF_TRAINING] if presets else [f.path for f in fields]
     by_path = {f.path: f for f in fields}
     first = [by_path[name] for name in names if name in by_path]
@@ -138,6 +140,15 @@ def options_form(kind: JobKind) -> OptionsForm:
         sections.setdefault(title, Section(_section_title(title))).fields.append(item)
     return OptionsForm(
         kind.name, _TITLES.get(kind.name, kind.title), first, [sections[name] for name in sorted(sections)]
+    )
+
+
+def _marked(item: Field, unwritable: Collection[str]) -> Field:
+    if item.control != "files" or not unwritable:
+        return item
+    lacking = {_WORTH_OFFERING[name] for name in unwritable if name in _WORTH_OFFERING}
+    return replace(
+        item, choices=tuple(replace(choice, lacking=choice.value in lacking) for choice in item.choices)
     )
 
 

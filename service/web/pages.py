@@ -13,6 +13,7 @@ from service.auth import Principal, Reader, Writer
 from service.downloads import send_blob
 from service.paging import read_id_cursor, write_cursor
 from service.problems import not_found
+from service.queue_facts import unwritable_formats
 from service.routes import jobs as api
 from service.schemas import JobChange, RetryRequest
 from service.state import Service, ServiceDep
@@ -78,6 +79,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     async with service.pool.connection() as connection:
         artifacts = await artifacts_of(connection, job_id)
         photographs = await _photographs(connection, detail)
+        unwritable = unwritable_formats(await live_workers(connection, service.settings.stale_seconds))
     by_name = {row.name: row for row in artifacts}
     metrics, config = await asyncio.to_thread(
         lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)]
@@ -98,7 +100,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         q=_octagon_q(config),
         background=config.get("reconstruction", {}).get("evaluate_background", "black"),
         photograph=shown if any(file.path == shown for file in photographs) else None,
-        further=[options_form(kind) for kind in extra] if who.may("write") else [],
+        further=[options_form(kind, unwritable) for kind in extra] if who.may("write") else [],
     )
 
 
@@ -151,7 +153,7 @@ async def show_new(
         request,
         "new.html",
         who,
-        form=options_form(kind_named("reconstruct")),
+        form=options_form(kind_named("reconstruct"), unwritable_formats(workers)),
         datasets=[row for row in datasets if row.state == "committed"],
         chosen=dataset,
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),

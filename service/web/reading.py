@@ -3,13 +3,13 @@
 import asyncio
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from psycopg.rows import class_row
 
 from service.auth import Principal
-from service.routes.jobs import owned_job, stages_of
+from service.routes.jobs import job_view, owned_job, stages_of
 from service.schemas import JobView
 from service.state import Service
 from service.web.results import METRICS, mean_psnr, read_json
@@ -105,6 +105,7 @@ async def job_detail(service: Service, who: Principal, job_id: uuid.UUID) -> Job
     async with service.pool.connection() as connection:
         job = await owned_job(connection, who, job_id)
         [line] = await _lines(service, connection, [job])
+        line = replace(line, job=await job_view(connection, service, job))
         dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
         async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
             await cursor.execute(

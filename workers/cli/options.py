@@ -7,6 +7,8 @@ from typing import Any, TypeVar
 
 import click
 
+from engine.errors import ConfigError
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -54,6 +56,34 @@ def report_option(command: F) -> F:
     """``--report``."""
     return click.option(
         "--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write all counts there."
+    )(command)
+
+
+def export_names(text: str | None) -> tuple[str, ...] | None:
+    """``mesh.glb,scene.spz`` as names of files; None where nothing was said.
+
+    Raises:
+        ConfigError: one of them is no name of a result.
+    """
+    from workers.work.kinds.options import check_export_name
+
+    if text is None:
+        return None
+    names = tuple(dict.fromkeys(filter(None, (part.strip() for part in text.split(",")))))
+    for name in names:
+        try:
+            check_export_name(name)
+        except ValueError as error:
+            raise ConfigError(f"--exports {name}: {error}.") from None
+    return names
+
+
+def exports_option(command: F) -> F:
+    """``--exports``."""
+    return click.option(
+        "--exports",
+        metavar="NAMES",
+        help="Files to write besides scene.ply, e.g. mesh.glb,scene.spz; see octasplat export --help.",
     )(command)
 
 

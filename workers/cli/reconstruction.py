@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from engine.config import ReconstructionConfig
-from engine.errors import Cancelled, NoSpaceLeft
+from engine.errors import Cancelled, ExportFailed, NoSpaceLeft
 from engine.events import stopping
 from engine.pipeline import reconstruct
 from workers.cli.progress import show_progress
@@ -29,6 +29,7 @@ def run_reconstruction(
 
     Raises:
         Stopped: by SIGINT or SIGTERM, after a checkpoint.
+        ExportFailed: some files could not be written; what there is was shown.
         OctasplatError: as :func:`engine.pipeline.reconstruct` does.
     """
     with stop_on_signals() as should_stop:
@@ -49,6 +50,11 @@ def run_reconstruction(
         except NoSpaceLeft as error:
             how = "" if resumes_by_itself else " with --resume"
             raise NoSpaceLeft(f"{error} Then the same command{how} goes on.") from error
+        except ExportFailed as error:
+            for line in run_summary(output, [name for name in config.exports if (output / name).exists()]):
+                click.echo(line)
+            again = f"Mend that or name others with --exports, and add --resume: {output} goes on from there."
+            raise ExportFailed(f"{error} {again}") from None
     if not quiet:
         for line in run_summary(output, config.exports):
             click.echo(line)

@@ -10,7 +10,7 @@ from workers.cli.progress import show_progress
 from workers.cli.wording import run_summary
 from workers.client import submission
 from workers.client.api import TOKEN, Api
-from workers.client.submission import Submission
+from workers.client.submission import JobFailed, Submission
 
 DEMO_OUTPUT = Path("octasplat-demo")
 
@@ -18,7 +18,10 @@ DEMO_OUTPUT = Path("octasplat-demo")
 def submit(api: Api, what: Submission, *, quiet: bool = False) -> dict[str, Any]:
     """Upload what is missing and queue the job; returns the job."""
     with show_progress(quiet=quiet) as listener:
-        return submission.submit(api, what, listener)
+        job = submission.submit(api, what, listener)
+    for note in job.get("notes", ()):
+        click.echo(f"Note: {note}", err=True)
+    return job
 
 
 def wait_for(api: Api, job_id: str, *, quiet: bool = False) -> dict[str, Any]:
@@ -42,6 +45,10 @@ def submit_and_wait(api: Api, what: Submission, output: Path, *, quiet: bool = F
         click.echo(f"Queued as job {job['id']}.")
     try:
         job = wait_for(api, job["id"], quiet=quiet)
+    except JobFailed:
+        if api.get(f"/v1/jobs/{job['id']}/artifacts")["artifacts"]:
+            fetch(api, job["id"], output, quiet=quiet)  # what succeeded
+        raise
     except KeyboardInterrupt:
         click.echo(f"The job goes on without you: octasplat status {job['id']}", err=True)
         raise

@@ -116,22 +116,16 @@ class Attempt:
             await add_event(connection, job.id, job.attempt, "preview", preview)
 
     async def succeed(self, results: Sequence[Result]) -> None:
-        """Publish the results and end the job; the one place where results become visible."""
+        """Publish the results and end the job."""
         async with self._fenced() as (connection, job):
-            async with connection.cursor() as cursor:
-                await cursor.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
-                await cursor.executemany(
-                    """
-                    INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type)
-                    VALUES (%s, %s, %s, %s, %s)
-                    """,
-                    [(job.id, r.name, r.sha256, r.size_bytes, r.media_type) for r in results],
-                )
+            await _show(connection, job, results)
             await end_job(connection, job, "succeeded", None)
 
-    async def fail(self, error: Mapping[str, Any]) -> None:
-        """End the job for a reason that another try would meet again."""
+    async def fail(self, error: Mapping[str, Any], results: Sequence[Result] = ()) -> None:
+        """End the job for a reason that another try would meet again, with the results there are so far."""
         async with self._fenced() as (connection, job):
+            if results:
+                await _show(connection, job, results)
             await end_job(connection, job, "failed", error)
 
     async def cancel(self) -> None:
@@ -148,10 +142,15 @@ class Attempt:
             await add_event(connection, job.id, job.attempt, "handed_back", {"reason": reason})
             await queue_again(connection, slips, job, keep_slip=True)
 
-    async def lose(self, slips: Slips, error: Mapping[str, Any]) -> None:
-        """The attempt was lost without its worker's intent: another try, or the end if there were enough."""
+    async def lose(self, slips: Slips, error: Mapping[str, Any], results: Sequence[Result] = ()) -> None:
+        """The attempt was lost without its worker's intent: another try, or the end if there were enough.
+
+        At the end ``results`` are those that there are.
+        """
         async with self._fenced() as (connection, job):
-            await rescue(connection, slips, job, error, keep_slip=True)
+            failed = await rescue(connection, slips, job, error, keep_slip=True)
+            if failed and results:
+                await _show(connection, job, results)
 
     @asynccontextmanager
     async def _fenced(self) -> AsyncIterator[tuple[Connection, Job]]:
@@ -189,11 +188,14 @@ async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attemp
 
 async def rescue(
     connection: Connection, slips: Slips, job: Job, error: Mapping[str, Any], *, keep_slip: bool = False
-) -> None:
+) -> bool:
     """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
 
     A job that was to be cancelled is cancelled. One that was lost too often without getting any further is
     failed with ``error``. With ``keep_slip`` the slip is still being delivered and goes by itself.
+
+    Returns:
+        Whether it failed.
     """
     if job.slip is not None and not keep_slip:
         await slips.remove(connection, job.slip)
@@ -202,11 +204,26 @@ async def rescue(
     elif job.rescues >= MAX_RESCUES:
         message = f"{error['message']} This happened {job.rescues + 1} times without getting any further."
         await end_job(connection, job, "failed", {**error, "message": message, "rescues": job.rescues})
+        return True
     else:
         await connection.execute("UPDATE jobs SET rescues = rescues + 1 WHERE id = %s", [job.id])
         data = {"reason": error["message"], "rescues": job.rescues + 1}
         await add_event(connection, job.id, job.attempt, "rescued", data)
         await queue_again(connection, slips, job, keep_slip=keep_slip)
+    return False
+
+
+async def _show(connection: Connection, job: Job, results: Sequence[Result]) -> None:
+    """Put results into the place of earlier ones; the one place where they become visible."""
+    async with connection.cursor() as cursor:
+        await cursor.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
+        await cursor.executemany(
+            """
+            INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type)
+            VALUES (%s, %s, %s, %s, %s)
+            """,
+            [(job.id, r.name, r.sha256, r.size_bytes, r.media_type) for r in results],
+        )
 
 
 async def end_job(connection: Connection, job: Job, state: str, error: Mapping[str, Any] | None) -> None:

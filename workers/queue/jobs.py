@@ -159,7 +159,14 @@ async def cancel_job(connection: Connection, slips: Slips, job_id: uuid.UUID) ->
         return await _existing(connection, job_id)
 
 
-async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, fresh: bool) -> Job:
+async def retry_job(
+    connection: Connection,
+    slips: Slips,
+    job_id: uuid.UUID,
+    *,
+    fresh: bool,
+    options: Mapping[str, Any] | None = None,
+) -> Job:
     """Queue a failed or cancelled job again.
 
     Args:
@@ -167,6 +174,7 @@ async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, 
         slips: the queue.
         job_id: which.
         fresh: begin from the start, not from the newest checkpoint.
+        options: complete options in the place of the job's own.
 
     Raises:
         Conflict: it is neither failed nor cancelled.
@@ -181,10 +189,16 @@ async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, 
             UPDATE jobs SET rescues = 0, error = NULL, stage = NULL, step = NULL, total_steps = NULL,
                 seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL,
                 checkpoint = CASE WHEN %(fresh)s THEN NULL ELSE checkpoint END,
-                fresh_after = CASE WHEN %(fresh)s THEN attempt ELSE fresh_after END
+                fresh_after = CASE WHEN %(forget)s THEN attempt ELSE fresh_after END,
+                options = coalesce(%(options)s, options)
             WHERE id = %(id)s
             """,
-            {"fresh": fresh, "id": job_id},
+            {
+                "fresh": fresh,
+                "forget": fresh or options is not None,
+                "options": Jsonb(dict(options)) if options is not None else None,
+                "id": job_id,
+            },
         )
         await queue_again(connection, slips, job)
         return await _existing(connection, job_id)
@@ -192,6 +206,9 @@ async def retry_job(connection: Connection, slips: Slips, job_id: uuid.UUID, *, 
 
 async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_slip: bool = False) -> None:
     """Put a job back into its queue with a new slip; the caller holds the job's lock.
+
+    A job that has a slip, as it was interrupted or not even begun, keeps its place: it goes before all that
+    were queued after it. One that was over goes last.
 
     Args:
         connection: of the transaction.
@@ -201,7 +218,7 @@ async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_sl
     """
     if job.slip is not None and not keep_slip:
         await slips.remove(connection, job.slip)
-    slip = await slips.put(connection, job.id, job.queue, job.priority)
+    slip = await slips.put(connection, job.id, job.queue, job.priority, place_of=job.slip)
     await connection.execute(
         """
         UPDATE jobs SET state = 'queued', slip = %s, queued_at = now(), worker = NULL, seconds_left = NULL

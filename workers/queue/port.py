@@ -28,8 +28,28 @@ class QueueDepth:
 class Slips(Protocol):
     """A queue of slips."""
 
-    async def put(self, connection: Connection, job_id: uuid.UUID, queue: str, priority: int) -> int:
-        """Queue a slip for a job within the transaction of ``connection``; returns its number."""
+    async def put(
+        self,
+        connection: Connection,
+        job_id: uuid.UUID,
+        queue: str,
+        priority: int,
+        *,
+        place_of: int | None = None,
+    ) -> int:
+        """Queue a slip for a job within the transaction of ``connection``.
+
+        Args:
+            connection: of the transaction.
+            job_id: which job.
+            queue: who may take it.
+            priority: higher goes first; where it is the same, the smaller number does.
+            place_of: an earlier slip of the job whose place in the queue the new one takes: before all that
+                were queued after it. None queues it last.
+
+        Returns:
+            The slip's number, which no slip of this job had.
+        """
         ...
 
     async def remove(self, connection: Connection, slip: int) -> None:

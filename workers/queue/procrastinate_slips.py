@@ -12,6 +12,8 @@ from workers.queue.port import Deliver
 from workers.records.database import Connection, Pool
 
 TASK = "octasplat.run_job"
+_RETURNS = 4096
+_FIRST_RETURN = -(1 << 62)
 
 
 class ProcrastinateSlips:
@@ -43,8 +45,18 @@ class ProcrastinateSlips:
         self._workers: set[Worker] = set()
         self._stopped = False
 
-    async def put(self, connection: Connection, job_id: uuid.UUID, queue: str, priority: int) -> int:
+    async def put(
+        self,
+        connection: Connection,
+        job_id: uuid.UUID,
+        queue: str,
+        priority: int,
+        *,
+        place_of: int | None = None,
+    ) -> int:
         """Queue a slip; see the port."""
+        if place_of is not None:
+            return await _put_back(connection, job_id, queue, priority, place_of)
         job = procrastinate.jobs.Job(
             queue=queue,
             priority=priority,
@@ -114,3 +126,33 @@ class ProcrastinateSlips:
         self._stopped = True
         for worker in self._workers:
             worker.stop()  # type: ignore[no-untyped-call]
+
+
+async def _put_back(
+    connection: Connection, job_id: uuid.UUID, queue: str, priority: int, place_of: int
+) -> int:
+    """Queue a slip in the place of an earlier one; Procrastinate's own way numbers them all anew."""
+    cursor = await connection.execute(
+        """
+        INSERT INTO procrastinate_jobs (id, queue_name, task_name, priority, args)
+        VALUES (%s, %s, %s, %s, jsonb_build_object('job_id', %s::text)) RETURNING id
+        """,
+        [returned_number(place_of), queue, TASK, priority, str(job_id)],
+    )
+    row = await cursor.fetchone()
+    assert row is not None
+    return int(row["id"])
+
+
+def returned_number(slip: int) -> int:
+    """The number of a slip that takes the place of ``slip``.
+
+    Numbers below zero are for slips that came back: they go before all that never were delivered, and among
+    themselves in the order of the numbers that they had at first. What is counted besides tells the slips of
+    one job apart.
+    """
+    if slip < 0:
+        first, returns = divmod(slip - _FIRST_RETURN, _RETURNS)
+    else:
+        first, returns = slip, -1
+    return _FIRST_RETURN + first * _RETURNS + (returns + 1) % _RETURNS

@@ -75,7 +75,8 @@ class Job:
         slip: its current slip in the queue; others are stale.
         state: where it is in its life; the last three never change again except by a retry.
         attempt: counts starts; every write of a worker carries the number it began with.
-        fresh_after: attempts up to this one are forgotten: no checkpoint or result of theirs is used.
+        fresh_after: attempts up to this one had other options or are to be forgotten: what they published
+            without getting to say so is not taken for the result.
         rescues: how often its worker was lost since it was last accepted.
         stage: what is being done.
         step: steps of the stage that are done.

@@ -5,10 +5,10 @@ import contextlib
 import logging
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable, Mapping
 
+from engine.isolated_python import without_python_variables
 from workers.parent import PARENT
 
 logger = logging.getLogger(__name__)
@@ -24,7 +24,7 @@ class KeptChild:
 
     Args:
         name: for the log.
-        arguments: of this Python.
+        command: the program with its arguments.
         environment: added to this process's own.
         on_line: told each line of its stdout; None leaves stdout as it is.
     """
@@ -32,13 +32,14 @@ class KeptChild:
     def __init__(
         self,
         name: str,
-        arguments: tuple[str, ...],
+        command: tuple[str, ...],
         environment: Mapping[str, str],
         on_line: Callable[[str], None] | None = None,
     ) -> None:
         self.name = name
-        self._arguments = arguments
-        self._environment = {**os.environ, **environment, PARENT: str(os.getpid())}
+        self._command = command
+        kept = without_python_variables(os.environ)
+        self._environment = {**kept, **environment, PARENT: str(os.getpid())}
         self._on_line = on_line
         self._process: asyncio.subprocess.Process | None = None
         self._stopping = asyncio.Event()
@@ -80,9 +81,9 @@ class KeptChild:
     async def _run_once(self) -> int:
         self.starts += 1
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            *self._arguments,
+            *self._command,
             env=self._environment,
+            cwd="/",  # nothing that lies where the user stands is to be found by chance
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE if self._on_line is not None else None,
             start_new_session=True,

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import fcntl
 import logging
+import os
 import signal
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ from pathlib import Path
 
 from engine.errors import OctasplatError, OutputError
 from engine.files import write_json
+from engine.isolated_python import python_command
+from engine.splat_transform import VARIABLE as SPLAT_TRANSFORM
 from workers.postgres.embedded import EmbeddedPostgres
 from workers.records.migrate import migrate
 from workers.serve.children import KeptChild
@@ -84,11 +87,11 @@ async def _run(
                 # Whoever talks to the front end finds it there again after a restart.
                 api.change_environment(f"{PREFIX}PORT", line.rpartition(":")[2])
 
-    environment = {"DATABASE_URL": conninfo, f"{PREFIX}DATA": str(plan.settings.data.absolute())}
+    environment = {"DATABASE_URL": conninfo, **_places(plan.settings)}
     listen = {"HOST": plan.host, "PORT": None if plan.port is None else str(plan.port)}
     front = {f"{PREFIX}{name}": value for name, value in listen.items() if value is not None}
-    api = KeptChild("front end", ("-m", "service"), {**environment, **front}, hear)
-    command = ("-m", "workers", "worker", "--queues")
+    api = KeptChild("front end", _program(plan, "service"), {**environment, **front}, hear)
+    command = _program(plan, "workers", "worker", "--queues")
     children = [api, KeptChild("maintenance", (*command, "", "--name", "maintenance"), environment)]
     if plan.queues:
         queues = ",".join(f"{name}={slots}" for name, slots in plan.queues.items())
@@ -128,6 +131,23 @@ async def _run(
         for child in reversed(children):
             child.stop()
         await asyncio.gather(*kept, guard, stopped, return_exceptions=True)
+
+
+def _program(plan: Plan, module: str, *arguments: str) -> tuple[str, ...]:
+    return python_command(module, *arguments, further_modules=plan.settings.kind_modules)
+
+
+def _places(settings: WorkerSettings) -> dict[str, str]:
+    """Variables that name folders and programs, so that they mean the same wherever a process stands."""
+    places = {
+        f"{PREFIX}DATA": str(settings.data.absolute()),
+        f"{PREFIX}WORK": str(settings.work_folder),
+    }
+    if settings.storage is not None and "://" not in settings.storage:
+        places[f"{PREFIX}STORAGE"] = str(Path(settings.storage).absolute())
+    if named := os.environ.get(SPLAT_TRANSFORM):
+        places[SPLAT_TRANSFORM] = str(Path(named).absolute())
+    return places
 
 
 async def _until_ready(api: KeptChild, address: "asyncio.Future[str]", stopped: "asyncio.Task[bool]") -> None:

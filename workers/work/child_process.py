@@ -6,21 +6,24 @@ import json
 import os
 import re
 import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import psutil
+
+from engine.isolated_python import python_command
+from engine.splat_transform import VARIABLE as SPLAT_TRANSFORM
 
 MAX_LINE_BYTES = 1 << 20
 LAST_WORDS = 20
 _READ_BYTES = 1 << 16
 _PASSED_ON = re.compile(
-    r"PATH|HOME|USER|LOGNAME|SHELL|LANG|LC_\w+|TZ|TMPDIR|TEMP|TMP|VIRTUAL_ENV|PYTHON\w*|LD_LIBRARY_PATH|"
+    r"PATH|HOME|USER|LOGNAME|SHELL|LANG|LC_\w+|TZ|TMPDIR|TEMP|TMP|VIRTUAL_ENV|LD_LIBRARY_PATH|"
     r"DYLD_LIBRARY_PATH|XDG_CACHE_HOME|CUDA_\w+|NVIDIA_\w+|NUMBA_\w+|OMP_\w+|MKL_\w+|OPENBLAS_\w+|"
-    r"OCTASPLAT_DEBUG"
+    r"OCTASPLAT_DEBUG|OCTASPLAT_SPLAT_TRANSFORM"
 )
 
 
@@ -30,6 +33,12 @@ def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
     # Threads that wait for each other sleep instead of spinning, as in the command line.
     passed.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     return passed
+
+
+def _absolute(environment: dict[str, str]) -> dict[str, str]:
+    """The same for a process in another folder."""
+    named = environment.get(SPLAT_TRANSFORM)
+    return environment if not named else {**environment, SPLAT_TRANSFORM: str(Path(named).absolute())}
 
 
 class ChildProcess:
@@ -68,14 +77,13 @@ class ChildProcess:
     ) -> "ChildProcess":
         """Start a child with its task, see :mod:`workers.work.child`."""
         process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "workers.work.child",
+            *python_command("workers.work.child", further_modules=task["kind_modules"]),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
             start_new_session=True,
-            env=child_environment(os.environ),
+            env=_absolute(child_environment(os.environ)),
+            cwd=task["folder"],
             limit=MAX_LINE_BYTES,
         )
         child = cls(process, on_event, on_log)

@@ -17,6 +17,7 @@ import psutil
 from procrastinate.exceptions import ConnectorException
 
 import engine
+from engine.export.registry import writable_formats
 from workers.parent import die_with_server
 from workers.queue.attempts import claim
 from workers.queue.jobs import get_job, queue_again
@@ -275,6 +276,7 @@ def _facts() -> dict[str, Any]:
         "version": engine.__version__,
         "python": platform.python_version(),
         "cores": os.cpu_count(),
+        "formats": list(writable_formats()),
         "memory_bytes": memory.total,
         "memory_free_bytes": memory.available,
     }

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from engine.config import read_config
-from engine.events import StageProgress, broadcast, staged, stopping
+from engine.errors import ExportFailed
+from engine.events import Event, StageFinished, StageProgress, broadcast, staged, stopping
 from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.export.several import export_files
 from engine.files import write_json
 from engine.gaussians.ply import read_gaussian_ply
 from engine.pipeline import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
@@ -28,15 +29,30 @@ def reconstruct(task: Task) -> None:
     config = options.config()
     scene = _scene(task, options.poses)
     previews = Previews(scene, task.run, config, task.listener)
-    reconstruct_scene(
-        scene,
-        task.run,
-        config,
-        resume=True,
-        threads=task.threads,
-        listener=stopping(broadcast([task.listener, previews]), task.should_stop),
-        should_stop=task.should_stop,
-    )
+
+    def publish_finished(event: Event) -> None:
+        # Whatever becomes of the rest, even if this process is killed.
+        if isinstance(event, StageFinished) or (isinstance(event, StageProgress) and event.stage == "export"):
+            _publish_run(task)
+
+    try:
+        reconstruct_scene(
+            scene,
+            task.run,
+            config,
+            resume=True,
+            threads=task.threads,
+            listener=stopping(broadcast([task.listener, previews, publish_finished]), task.should_stop),
+            should_stop=task.should_stop,
+        )
+    finally:
+        _publish_run(task)
+
+
+def _publish_run(task: Task) -> None:
+    """Put all that a run has finished among the results; nothing before there is a scene."""
+    if not (task.run / SCENE).exists():
+        return
     for path in sorted(task.run.rglob("*")):
         name = path.relative_to(task.run)
         hidden = any(part.startswith(".") for part in name.parts)
@@ -67,10 +83,17 @@ def export(task: Task) -> None:
     q = options.q if options.q is not None else read_config(task.run / CONFIG).train.trace.q
     settings = ExportOptions(q=q, min_opacity=options.min_opacity, sh_pad_degree=options.sh_pad_degree)
     tell = stopping(task.listener, task.should_stop)
-    with staged("export", tell, len(options.files)):
-        for done, name in enumerate(options.files, start=1):
-            export_scene(gaussians, task.results / name, settings)
-            tell(StageProgress("export", done, len(options.files)))
+    count = len(options.files)
+    with staged("export", tell, count):
+        failed = export_files(
+            gaussians,
+            task.results,
+            options.files,
+            settings,
+            lambda done: tell(StageProgress("export", done, count)),
+        )
+    if failed is not None:
+        raise ExportFailed(failed)
 
 
 def render(task: Task) -> None:

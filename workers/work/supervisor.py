@@ -1,10 +1,11 @@
 """One attempt at a job: the child at work, the heartbeat beside it, and a verdict at the end."""
 
 import asyncio
+import contextlib
 import logging
 import math
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import Enum
@@ -12,7 +13,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from engine.errors import OctasplatError
-from workers.queue.attempts import Attempt, Fenced
+from workers.queue.attempts import MAX_RESCUES, Attempt, Fenced, Result
 from workers.queue.jobs import artifacts_of
 from workers.queue.port import Slips
 from workers.records.datasets import files_of, get_dataset
@@ -196,11 +197,29 @@ class Supervisor:
             return
         await self._said(lambda: self._attempt.succeed(results))
 
-    async def _let_go(self, error: dict[str, Any]) -> None:
+    async def _fail(self, error: dict[str, Any]) -> None:
+        """End the job with what its program has finished."""
+        try:
+            results = await asyncio.to_thread(self._workspace.store_results)
+        except StorageError as storage_error:
+            described = {"type": type(storage_error).__name__, "message": str(storage_error)}
+            await self._said(lambda: self._let_go(described))
+            return
+        await self._said(lambda: self._attempt.fail(error, results))
+
+    async def _lose(self, error: dict[str, Any]) -> None:
+        """Let go of the job, which may end it: then with what its program has finished."""
+        results: list[Result] = []
+        if self._job.rescues >= MAX_RESCUES:
+            with contextlib.suppress(StorageError):
+                results = await asyncio.to_thread(self._workspace.store_results)
+        await self._said(lambda: self._let_go(error, results))
+
+    async def _let_go(self, error: dict[str, Any], results: Sequence[Result] = ()) -> None:
         """Put the job back for a reason that may pass; where room is lacking, that is no fault of the job."""
         lacking = await self._around.lacking_room()
         if lacking is None:
-            await self._attempt.lose(self._around.slips, error)
+            await self._attempt.lose(self._around.slips, error, results)
         else:
             await self._attempt.hand_back(self._around.slips, f"{error['message']} {lacking}")
 
@@ -216,23 +235,23 @@ class Supervisor:
         elif end is End.SILENT:
             seconds = self._settings.silent_seconds
             message = f"The job's program said nothing for {seconds:g} s and was stopped."
-            await self._said(
-                lambda: self._attempt.lose(self._around.slips, {"type": "silent", "message": message})
-            )
+            await self._lose({"type": "silent", "message": message})
         else:
             limit = (self._settings.memory_limit_bytes or 0) / 2**30
             message = (
                 f"The job needed more than the {limit:.1f} GB of memory that it may use; "
                 "use fewer Gaussians, smaller photographs, or a machine with more."
             )
-            await self._said(lambda: self._attempt.fail({"type": "memory_limit", "message": message}))
+            await self._fail({"type": "memory_limit", "message": message})
 
     async def _after_exit(self, child: ChildProcess, code: int) -> None:
         if code in (EXIT_REFUSED, EXIT_UNEXPECTED) and child.error is not None:
             error = child.error
             # What fails on a full disk may well succeed on another.
-            full = await self._around.lacking_room() is not None
-            await self._said(lambda: self._let_go(error) if full else self._attempt.fail(error))
+            if await self._around.lacking_room() is not None:
+                await self._said(lambda: self._let_go(error))
+            else:
+                await self._fail(error)
         elif code == EXIT_STOPPED:
             # Somebody else asked the child to stop; it wrote what is needed to go on.
             await self._said(lambda: self._attempt.hand_back(self._around.slips, "its program was stopped"))
@@ -240,7 +259,7 @@ class Supervisor:
             how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
             last = f" Its last words: {child.last_words[-1]}" if child.last_words else ""
             message = f"The job's program ended {how}.{last}"
-            await self._said(lambda: self._let_go({"type": "crashed", "message": message}))
+            await self._lose({"type": "crashed", "message": message})
 
     async def _wait_for_child(self, child: ChildProcess) -> int:
         """Wait for the child's end, which is brought about if anything asks for it."""

@@ -161,6 +161,11 @@ class Workspace:
             raise StorageError("Another result was published for this attempt; ask for a retry.")
         return _results(manifest)
 
+    def store_results(self) -> list[Result]:
+        """Store what results there are of a program that failed; its job's row shows them, nothing else."""
+        folder = self.folder / RESULTS
+        return _results(store_tree(self._storage, folder)) if folder.is_dir() else []
+
     def published_before(self) -> list[Result] | None:
         """Results that an earlier attempt published without getting to say so."""
         for attempt in range(self._job.attempt - 1, self._job.fresh_after, -1):

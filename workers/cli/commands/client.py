@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from engine.errors import ConfigError
-from workers.cli.options import quiet_option
+from workers.cli.options import export_names, exports_option, quiet_option
 
 if TYPE_CHECKING:
     from workers.client.api import Api
@@ -26,6 +26,17 @@ def server_option(command: F) -> F:
         "--server",
         metavar="URL",
         help="The service.  [default: OCTASPLAT_SERVER, or octasplat serve of this machine]",
+    )(command)
+
+
+def set_option(command: F) -> F:
+    """``--set``."""
+    return click.option(
+        "--set",
+        "assignments",
+        multiple=True,
+        metavar="NAME=VALUE",
+        help="Any setting, e.g. test_every=10 or train.rates.quat=0.02; may be repeated.",
     )(command)
 
 
@@ -54,10 +65,8 @@ def connected(server: str | None) -> Iterator["Api"]:
 @click.option(
     "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
 )
-@click.option(
-    "--set", "assignments", multiple=True, metavar="NAME=VALUE",
-    help="Any setting, e.g. test_every=10 or train.rates.quat=0.02; may be repeated.",
-)  # fmt: skip
+@exports_option
+@set_option
 @click.option("--label", help="What to call the job.")
 @click.option("--queue", default="cpu", show_default=True, help="Which workers.")
 @click.option("--priority", type=click.IntRange(-100, 100), default=0, help="Higher goes first.")
@@ -114,6 +123,8 @@ def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bo
         click.echo(json.dumps(job, indent=2))
         return
     click.echo(f"{job['kind']} {job['id']}: {job['state']} {_where(job)}".rstrip())
+    for note in job.get("notes", ()):
+        click.echo(note)
     if job["error"]:
         click.echo(job["error"]["message"])
 
@@ -154,13 +165,23 @@ def cancel(job_id: str, server: str | None) -> None:
 @click.command(short_help="Queue a failed or cancelled job again.")
 @click.argument("job_id", metavar="JOB")
 @click.option("--from-start", is_flag=True, help="Not from its checkpoint.")
+@exports_option
+@set_option
 @server_option
-def retry(job_id: str, from_start: bool, server: str | None) -> None:
-    """Queue JOB again; it goes on from its checkpoint."""
-    body = {"from": "start" if from_start else "checkpoint"}
+def retry(job_id: str, from_start: bool, server: str | None, **given: Any) -> None:
+    """Queue JOB again; it goes on from its checkpoint.
+
+    With --exports it writes other files from the scene that is trained; other settings of the training need
+    --from-start.
+    """
+    body: dict[str, Any] = {"from": "start" if from_start else "checkpoint"}
+    if options := _options(given):
+        body["options"] = options
     with connected(server) as api:
         job = api.post(f"/v1/jobs/{_job(api, job_id)['id']}/retry", body)
     click.echo(f"{job['id']}: {job['state']}")
+    for note in job.get("notes", ()):
+        click.echo(f"Note: {note}", err=True)
 
 
 @click.command(short_help="Save the results of a job.")
@@ -183,9 +204,12 @@ def download(
 def _options(given: dict[str, Any]) -> dict[str, Any]:
     """The options of the job."""
     options: dict[str, Any] = {
-        name: given[name] for name in ("preset", "poses", "max_side") if given[name] is not None
+        name: given[name] for name in ("preset", "poses", "max_side") if given.get(name) is not None
     }
-    if given["iterations"] is not None:
+    exports = export_names(given["exports"])
+    if exports is not None:
+        options["exports"] = list(exports)
+    if given.get("iterations") is not None:
         options["train"] = {"iterations": given["iterations"]}
     for assignment in given["assignments"]:
         name, equals, text = assignment.partition("=")

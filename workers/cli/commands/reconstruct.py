@@ -5,13 +5,19 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from workers.cli.options import background_option, quiet_option, threads_option
+from workers.cli.options import (
+    background_option,
+    export_names,
+    exports_option,
+    quiet_option,
+    threads_option,
+)
 
 if TYPE_CHECKING:
     from engine.config import ReconstructionConfig
 
 PRESETS = ("fast", "standard", "paper")
-_NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet")
+_NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
 
 
 @click.command(short_help="Photographs to a scene, its meshes, and measurements.")
@@ -45,6 +51,7 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet")
     help="Leave masked pixels out, or take the mask as the object's alpha.  [default: ignore]",
 )
 @background_option("Behind renders and photographs with alpha in the evaluation.  [default: black]")
+@exports_option
 @click.option("--seed", type=int, metavar="N", help="Seed of everything random.  [default: 0]")
 @click.option(
     "--set",
@@ -80,8 +87,10 @@ def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
     from engine.config import read_config, resolve_config
 
     given = any(value not in (None, ()) for name, value in options.items() if name not in _NOT_SETTINGS)
+    exports = export_names(options["exports"])
     if options["resume"] and not given and (output / "config.json").exists():
-        return read_config(output / "config.json")
+        config = read_config(output / "config.json")
+        return config if exports is None else config.model_copy(update={"exports": exports})
     direct = ("iterations", "rays", "max_gaussians", "sh_degree", "seed")
     assignments = [f"{name}={options[name]}" for name in direct if options[name] is not None]
     return resolve_config(
@@ -92,6 +101,7 @@ def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
             "held_out": options["held_out"] or None,
             "masks": options["masks"],
             "evaluate_background": options["background"],
+            "exports": exports,
         },
         assignments=[*assignments, *options["assignments"]],
     )

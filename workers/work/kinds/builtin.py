@@ -10,6 +10,7 @@ from workers.work.kinds.options import (
     ReconstructOptions,
     RenderJobOptions,
     resolve_reconstruction,
+    revise_reconstruction,
 )
 from workers.work.kinds.table import JobKind, register, validated
 
@@ -29,6 +30,10 @@ def register_all() -> None:
             resolve=resolve_reconstruction,
             needs_poses=lambda options: cast(ReconstructOptions, options).poses == "given",
             settle=_settled_poses,
+            revise=revise_reconstruction,
+            goes_on=_same_training,
+            writes=lambda options: cast(ReconstructOptions, options).exports,
+            writes_at="exports",
         )
     )
     register(
@@ -53,6 +58,8 @@ def register_all() -> None:
             program="workers.work.programs:export",
             stages=lambda _options: ("export",),
             resolve=validated(ExportJobOptions),
+            writes=lambda options: cast(ExportJobOptions, options).files,
+            writes_at="files",
             source_files=("scene.ply", "config.json"),
         )
     )
@@ -82,3 +89,8 @@ def _settled_poses(options: BaseModel, has_poses: bool) -> BaseModel:
     if cast(ReconstructOptions, options).poses != "missing":
         return options
     return options.model_copy(update={"poses": "given" if has_poses else "auto"})
+
+
+def _same_training(before: BaseModel, after: BaseModel) -> bool:
+    """Files are written after everything else, so that others can be asked for at any time."""
+    return before.model_copy(update={"exports": cast(ReconstructOptions, after).exports}) == after

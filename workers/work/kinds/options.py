@@ -19,7 +19,8 @@ _TAKEN = frozenset(
 )  # fmt: skip
 
 
-def _export_name(name: str) -> str:
+def check_export_name(name: str) -> str:
+    """A file name of a result, whose format is known; raises ValueError otherwise."""
     if not _FILE_NAME.fullmatch(name) or ".." in name:
         raise ValueError("name a file such as mesh.glb: letters, digits, '.', '_' and '-'")
     if name.lower() in _TAKEN:
@@ -31,7 +32,7 @@ def _export_name(name: str) -> str:
     return name
 
 
-ExportName = Annotated[str, AfterValidator(_export_name)]
+ExportName = Annotated[str, AfterValidator(check_export_name)]
 
 
 class ReconstructOptions(ReconstructionConfig):
@@ -122,6 +123,20 @@ def resolve_reconstruction(asked: Mapping[str, Any]) -> ReconstructOptions:
     train = asked.get("train")
     merged = _merged(base, train) if isinstance(train, Mapping) else base if train is None else train
     return ReconstructOptions.model_validate({**asked, "train": merged})
+
+
+def revise_reconstruction(before: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructOptions:
+    """The options of a job with changes; another preset brings its own training settings.
+
+    Raises:
+        ValidationError: an unknown name or a value out of range.
+    """
+    another = changes.get("preset", before.get("preset")) != before.get("preset")
+    kept = {key: value for key, value in before.items() if key != "train"}
+    if another or not isinstance(changes.get("train", {}), Mapping):
+        return resolve_reconstruction({**kept, **changes})
+    train = _merged(before.get("train", {}), changes.get("train", {}))
+    return resolve_reconstruction({**kept, **changes, "train": train})
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,6 +27,10 @@ class JobKind:
         needs_photographs: whether it reads the photographs of the source job as well.
         needs_poses: whether its dataset must hold a COLMAP model, given the options.
         settle: the options as they are kept, given whether the dataset holds a COLMAP model.
+        revise: complete options from those of a job and what a user changes of them.
+        goes_on: whether the work that was done with the first options can be gone on with under the second.
+        writes: names of the files that it writes in formats of their own, given the options.
+        writes_at: where the options name those files.
     """
 
     name: str
@@ -40,6 +44,14 @@ class JobKind:
     needs_photographs: Callable[[BaseModel], bool] = lambda _options: False
     needs_poses: Callable[[BaseModel], bool] = lambda _options: False
     settle: Callable[[BaseModel, bool], BaseModel] = lambda options, _has_poses: options
+    revise: Callable[[Mapping[str, Any], Mapping[str, Any]], BaseModel] | None = None
+    goes_on: Callable[[BaseModel, BaseModel], bool] = lambda before, after: before == after
+    writes: Callable[[BaseModel], tuple[str, ...]] = lambda _options: ()
+    writes_at: str = ""
+
+    def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> BaseModel:
+        """Complete options of a job that is tried again with changes; raises pydantic's ValidationError."""
+        return self.resolve({**before, **changes}) if self.revise is None else self.revise(before, changes)
 
 
 _KINDS: dict[str, JobKind] = {}

@@ -1,0 +1,64 @@
+"""What the workers that live can do for a job, and what its owner should know about that."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from engine.export.registry import exporter_for, exporters
+from service.problems import Problem
+from workers.records.database import Connection
+from workers.records.rows import WorkerRow
+from workers.records.workers import live_workers
+from workers.work.kinds import JobKind
+
+
+async def workers_of(connection: Connection, queue: str, stale_seconds: float) -> list[WorkerRow]:
+    """The living workers that take jobs from a queue."""
+    return [row for row in await live_workers(connection, stale_seconds) if queue in row.queues]
+
+
+def unwritable_formats(workers: Sequence[WorkerRow]) -> dict[str, str]:
+    """Formats that none of ``workers`` can write, with what they need.
+
+    Without workers there are none: nobody can say what those that come will be able to write.
+    """
+    if not workers:
+        return {}
+    able = {str(name) for row in workers for name in row.facts.get("formats", _ALL)}
+    return {exporter.name: exporter.description for exporter in exporters() if exporter.name not in able}
+
+
+def check_writable(kind: JobKind, options: BaseModel, queue: str, workers: Sequence[WorkerRow]) -> None:
+    """Refuse files that no living worker of the queue can write.
+
+    Raises:
+        Problem: 422, with the place of each such file.
+    """
+    lacking = unwritable_formats(workers)
+    faults = [
+        {
+            "pointer": f"#/options/{kind.writes_at}/{place}",
+            "detail": f"No worker of the queue {queue} can write {name}: {lacking[form]}.",
+        }
+        for place, name in enumerate(kind.writes(options))
+        if (form := exporter_for(Path(name)).name) in lacking
+    ]
+    if faults:
+        detail = f"{faults[0]['detail']} Ask for other files, or have it installed where the workers run."
+        raise Problem(422, "unwritable", detail, errors=faults)
+
+
+def waiting_notes(kind: JobKind, options: BaseModel, queue: str, workers: Sequence[WorkerRow]) -> list[str]:
+    """What the owner of a job that waits should know, in sentences."""
+    if workers:
+        return []
+    notes = [f"No worker takes jobs from the queue {queue} now; the job waits for one."]
+    needy = [name for name in kind.writes(options) if "needs" in exporter_for(Path(name)).description]
+    if needy:
+        notes.append(f"Whether {' and '.join(needy)} can be written is not known before a worker is there.")
+    return notes
+
+
+_ALL = tuple(exporter.name for exporter in exporters())
+"""What a worker of an earlier version, which does not say, is taken to write."""
