@@ -25,6 +25,7 @@ from workers.storage.errors import (
     StorageUnavailable,
     TooLarge,
 )
+from workers.storage.os_errors import MAKE_ROOM
 
 MEDIA_TYPE = "application/problem+json"
 TYPES = "urn:octasplat:problem:"
@@ -216,4 +217,4 @@ def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
 
 def _without_paths(detail: str) -> str:
     """Where things lie on the server is not for users."""
-    return "There is no room left for this." if "/" in detail else detail
+    return f"There is no room left for this; {MAKE_ROOM}." if "/" in detail else detail

@@ -17,6 +17,7 @@ from workers.queue.jobs import get_job, queue_again
 from workers.queue.journal import add_event, add_log_lines
 from workers.queue.port import Slips
 from workers.queue.rows import Job
+from workers.queue.storing import Note
 
 MAX_RESCUES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
@@ -95,9 +96,17 @@ class Attempt:
             if event is not None:
                 await add_event(connection, job.id, job.attempt, "progress", event)
 
-    async def keep_checkpoint(self, manifest: Mapping[str, Any], *, advances: bool) -> None:
-        """Record a stored checkpoint; one that advances forgives the job the workers it has lost."""
+    async def keep_checkpoint(
+        self, manifest: Mapping[str, Any], *, advances: bool, note: Note | None = None
+    ) -> None:
+        """Record a stored checkpoint; one that advances forgives the job the workers it has lost.
+
+        Raises:
+            StorageUnavailable: ``note``, under which it was stored, was given up.
+        """
         async with self._fenced() as (connection, job):
+            if note is not None:
+                await note.confirm(connection)
             await connection.execute(
                 """
                 UPDATE jobs SET checkpoint = %s, rescues = CASE WHEN %s THEN 0 ELSE rescues END WHERE id = %s
@@ -107,9 +116,11 @@ class Attempt:
             event = {key: manifest[key] for key in ("stage", "step") if key in manifest}
             await add_event(connection, job.id, job.attempt, "checkpoint", event)
 
-    async def keep_preview(self, preview: Mapping[str, Any]) -> None:
-        """Record the newest preview picture: ``sha256``, ``step`` and ``view``."""
+    async def keep_preview(self, preview: Mapping[str, Any], note: Note | None = None) -> None:
+        """Record the newest preview picture: ``sha256``, ``step`` and ``view``; ``note`` as above."""
         async with self._fenced() as (connection, job):
+            if note is not None:
+                await note.confirm(connection)
             await connection.execute(
                 "UPDATE jobs SET preview = %s WHERE id = %s", [Jsonb(dict(preview)), job.id]
             )

@@ -19,7 +19,8 @@ from typing import Any, NoReturn
 from engine.errors import Cancelled, OctasplatError
 from engine.events import Event
 from workers.parent import die_with
-from workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, Task
+from workers.storage.os_errors import lacks_room
+from workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE, Task
 
 _OOM_SCORE = 800
 
@@ -80,7 +81,8 @@ def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
         lines.write({"kind": "stopped", "message": str(error)})
         return EXIT_STOPPED
     except OctasplatError as error:
-        lines.write({"kind": "error", "type": _snake(type(error).__name__), "message": str(error)})
+        kind = NO_SPACE if lacks_room(error) else _snake(type(error).__name__)
+        lines.write({"kind": "error", "type": kind, "message": str(error)})
         return EXIT_REFUSED
     except MemoryError:
         lines.write({"kind": "error", "type": "out_of_memory", "message": "The job ran out of memory."})
@@ -88,7 +90,9 @@ def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
     except Exception as error:  # noqa: BLE001 - told to the worker, which tells the user
         traceback.print_exc()
         message = f"{type(error).__name__}: {error}"
-        lines.write({"kind": "error", "type": "unexpected", "message": message})
+        lines.write(
+            {"kind": "error", "type": NO_SPACE if lacks_room(error) else "unexpected", "message": message}
+        )
         return EXIT_UNEXPECTED
     lines.write({"kind": "done"})
     return 0

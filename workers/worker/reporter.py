@@ -16,6 +16,7 @@ import psycopg
 from psycopg_pool import PoolTimeout
 
 from workers.queue.attempts import Attempt, Fenced
+from workers.queue.storing import storing
 from workers.storage.errors import StorageError
 from workers.worker.task import RUN
 from workers.worker.workspace import Checkpoint, Workspace
@@ -183,9 +184,10 @@ class Reporter:
             if wanted is not None:
                 await self._keep_checkpoint(*wanted)
             if preview is not None:
-                sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN}/{preview['path']}")
-                row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
-                await self._attempt.keep_preview(row)
+                async with storing(self._attempt.pool) as note:
+                    sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN}/{preview['path']}")
+                    row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
+                    await self._attempt.keep_preview(row, note)
         except asyncio.CancelledError:
             self._wanted, self._preview = self._wanted or wanted, self._preview or preview
             raise
@@ -195,8 +197,10 @@ class Reporter:
             self._wanted = self._wanted or wanted
 
     async def _keep_checkpoint(self, stage: str, step: int) -> None:
-        checkpoint = await asyncio.to_thread(self._workspace.keep, stage, step)
-        if checkpoint is not None:
+        async with storing(self._attempt.pool) as note:
+            checkpoint = await asyncio.to_thread(self._workspace.keep, stage, step)
+            if checkpoint is None:
+                return
             advances = checkpoint.is_beyond(self._kept)
-            await self._attempt.keep_checkpoint(checkpoint.as_row(), advances=advances)
+            await self._attempt.keep_checkpoint(checkpoint.as_row(), advances=advances, note=note)
             self._kept = checkpoint

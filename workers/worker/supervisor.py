@@ -13,18 +13,20 @@ from typing import Any, TypeVar
 
 from engine.errors import OctasplatError
 from workers.kinds import JobKind, kind_named
-from workers.queue.attempts import Attempt, Fenced
+from workers.queue.attempts import Attempt, Fenced, Result
 from workers.queue.datasets import files_of, get_dataset
 from workers.queue.jobs import artifacts_of
 from workers.queue.port import Slips
+from workers.queue.storing import storing
 from workers.settings import WorkerSettings
 from workers.storage.errors import BlobMissing, DigestMismatch, StorageError
+from workers.storage.os_errors import lacks_room
 from workers.storage.protocol import Storage
 from workers.storage.room import Room
 from workers.worker.child_process import ChildProcess
 from workers.worker.contact import DATABASE_ERRORS, Contact
 from workers.worker.reporter import Reporter
-from workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED
+from workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE
 from workers.worker.workspace import Checkpoint, Workspace
 
 logger = logging.getLogger(__name__)
@@ -67,6 +69,13 @@ class Surroundings:
         except StorageError as error:
             return str(error)
 
+    async def free_bytes(self) -> int:
+        """Room for jobs; 0 where that cannot be said."""
+        try:
+            return await asyncio.to_thread(self.room.free_bytes)
+        except StorageError:
+            return 0
+
 
 class Supervisor:
     """Runs one attempt.
@@ -75,6 +84,9 @@ class Supervisor:
         attempt: the claimed job.
         around: the worker.
         since: when the claim was asked for, by ``time.monotonic()``.
+
+    Attributes:
+        lacked_room: whether the job was handed back because a disk was full.
     """
 
     def __init__(self, attempt: Attempt, around: Surroundings, since: float) -> None:
@@ -84,6 +96,7 @@ class Supervisor:
         self._job = attempt.job
         self._workspace = Workspace(around.settings.work_folder, attempt.job, around.storage)
         self._reporter = Reporter(attempt, self._workspace)
+        self.lacked_room = False
         self._child: ChildProcess | None = None
         self._end: End | None = None
         self._kill_at = math.inf
@@ -181,7 +194,7 @@ class Supervisor:
         await self._attempt.tell("resumed", data)
 
     async def _give_up_preparing(self, error: OctasplatError) -> None:
-        described = {"type": type(error).__name__, "message": str(error)}
+        described = _described(error)
         if isinstance(error, StorageError) and not isinstance(error, BlobMissing | DigestMismatch):
             await self._let_go(described)
         else:
@@ -189,20 +202,35 @@ class Supervisor:
 
     async def _publish(self) -> None:
         try:
-            results = await asyncio.to_thread(self._workspace.publish)
+            results = await self._store_results()
         except StorageError as error:
-            described = {"type": type(error).__name__, "message": str(error)}
+            described = _described(error)
             await self._said(lambda: self._let_go(described))
             return
         await self._said(lambda: self._attempt.succeed(results))
 
+    async def _store_results(self) -> list[Result]:
+        """Store the results and publish their manifest, again and again while the job is surely ours."""
+        while True:
+            try:
+                async with storing(self._attempt.pool) as note:
+                    manifest = await asyncio.to_thread(self._workspace.store_results)
+                    async with self._attempt.pool.connection() as connection:
+                        await note.confirm(connection)
+                        return await asyncio.to_thread(self._workspace.publish, manifest)
+            except DATABASE_ERRORS as error:
+                if self._contact.is_lost:
+                    raise LostDatabase(str(error)) from error
+                await asyncio.sleep(self._settings.poll_seconds)
+
     async def _let_go(self, error: dict[str, Any]) -> None:
         """Put the job back for a reason that may pass; where room is lacking, that is no fault of the job."""
         lacking = await self._around.lacking_room()
-        if lacking is None:
+        if lacking is None and error["type"] != NO_SPACE:
             await self._attempt.lose(self._around.slips, error)
         else:
-            await self._attempt.hand_back(self._around.slips, f"{error['message']} {lacking}")
+            self.lacked_room = True
+            await self._attempt.hand_back(self._around.slips, f"{error['message']} {lacking or ''}".strip())
 
     async def _after_stop(self, end: End) -> None:
         if end is End.FENCED:
@@ -231,7 +259,7 @@ class Supervisor:
         if code in (EXIT_REFUSED, EXIT_UNEXPECTED) and child.error is not None:
             error = child.error
             # What fails on a full disk may well succeed on another.
-            full = await self._around.lacking_room() is not None
+            full = error["type"] == NO_SPACE or await self._around.lacking_room() is not None
             await self._said(lambda: self._let_go(error) if full else self._attempt.fail(error))
         elif code == EXIT_STOPPED:
             # Somebody else asked the child to stop; it wrote what is needed to go on.
@@ -321,3 +349,7 @@ class Supervisor:
                 if self._contact.is_lost:
                     raise LostDatabase(str(error)) from error
                 await asyncio.sleep(self._settings.poll_seconds)
+
+
+def _described(error: OctasplatError) -> dict[str, Any]:
+    return {"type": NO_SPACE if lacks_room(error) else type(error).__name__, "message": str(error)}
