@@ -5,7 +5,7 @@ whatever it still wants to write is refused with :class:`Fenced`.
 """
 
 import uuid
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -14,13 +14,16 @@ from psycopg.types.json import Jsonb
 
 from workers.queue.database import Connection, Pool
 from workers.queue.jobs import get_job, queue_again
-from workers.queue.journal import add_event, add_log_lines
+from workers.queue.journal import add_event, add_log_lines, trim_log
 from workers.queue.port import Slips
 from workers.queue.rows import Job
 from workers.queue.storing import Note
 
 MAX_RESCUES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
+
+KEPT_LOG_LINES = 20_000
+"""Lines of the attempts before that stay in the log when a new one begins."""
 
 
 class Fenced(Exception):
@@ -44,10 +47,12 @@ class Attempt:
     Args:
         pool: connections.
         job: the row as it was when the attempt began; ``job.attempt`` is the number that fences.
+        shown: a JSON value as its texts may be shown to users; everything that is written goes through it.
     """
 
     pool: Pool
     job: Job
+    shown: Callable[[Any], Any] = lambda value: value
 
     async def beat(self) -> str:
         """Say that the worker lives; returns the state, ``running`` or ``canceling``."""
@@ -66,12 +71,12 @@ class Attempt:
     async def tell(self, kind: str, data: Mapping[str, Any]) -> None:
         """Add an event to the journal."""
         async with self._fenced() as (connection, job):
-            await add_event(connection, job.id, job.attempt, kind, data)
+            await add_event(connection, job.id, job.attempt, kind, self.shown(dict(data)))
 
     async def log(self, lines: Sequence[str]) -> None:
         """Add lines to the log."""
         async with self._fenced() as (connection, job):
-            await add_log_lines(connection, job.id, job.attempt, lines)
+            await add_log_lines(connection, job.id, job.attempt, self.shown(list(lines)))
 
     async def progress(
         self,
@@ -143,7 +148,7 @@ class Attempt:
     async def fail(self, error: Mapping[str, Any]) -> None:
         """End the job for a reason that another try would meet again."""
         async with self._fenced() as (connection, job):
-            await end_job(connection, job, "failed", error)
+            await end_job(connection, job, "failed", self.shown(dict(error)))
 
     async def cancel(self) -> None:
         """End the job as its owner asked."""
@@ -156,13 +161,15 @@ class Attempt:
             if job.state == "canceling":
                 await end_job(connection, job, "canceled", None)
                 return
+            reason = self.shown(reason)
             await add_event(connection, job.id, job.attempt, "handed_back", {"reason": reason})
+            await add_log_lines(connection, job.id, job.attempt, [f"Handed back to the queue: {reason}"])
             await queue_again(connection, slips, job, keep_slip=True)
 
     async def lose(self, slips: Slips, error: Mapping[str, Any]) -> None:
         """The attempt was lost without its worker's intent: another try, or the end if there were enough."""
         async with self._fenced() as (connection, job):
-            await rescue(connection, slips, job, error, keep_slip=True)
+            await rescue(connection, slips, job, self.shown(dict(error)), keep_slip=True)
 
     @asynccontextmanager
     async def _fenced(self) -> AsyncIterator[tuple[Connection, Job]]:
@@ -193,6 +200,8 @@ async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attemp
             [worker, job_id],
         )
         await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
+        await trim_log(connection, job_id, KEPT_LOG_LINES)
+        await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1} on {worker}"])
         claimed = await get_job(connection, job_id)
     assert claimed is not None
     return Attempt(pool, claimed)
@@ -217,6 +226,8 @@ async def rescue(
         await connection.execute("UPDATE jobs SET rescues = rescues + 1 WHERE id = %s", [job.id])
         data = {"reason": error["message"], "rescues": job.rescues + 1}
         await add_event(connection, job.id, job.attempt, "rescued", data)
+        lost = f"Lost, and queued again: {error['message']}"
+        await add_log_lines(connection, job.id, job.attempt, [lost])
         await queue_again(connection, slips, job, keep_slip=keep_slip)
 
 
@@ -234,3 +245,7 @@ async def end_job(connection: Connection, job: Job, state: str, error: Mapping[s
     if error is not None:
         data["error"] = dict(error)
     await add_event(connection, job.id, job.attempt, "state", data)
+    line = {"succeeded": "Succeeded", "canceled": "Cancelled"}.get(state, "Failed")
+    if error is not None:
+        line += f": {error['message']}"
+    await add_log_lines(connection, job.id, job.attempt, [line])

@@ -6,9 +6,10 @@ import math
 import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 from engine.errors import OctasplatError
@@ -25,6 +26,7 @@ from workers.storage.protocol import Storage
 from workers.storage.room import Room
 from workers.worker.child_process import ChildProcess
 from workers.worker.contact import DATABASE_ERRORS, Contact
+from workers.worker.places import Places, shown_in
 from workers.worker.reporter import Reporter
 from workers.worker.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE
 from workers.worker.workspace import Checkpoint, Workspace
@@ -90,11 +92,13 @@ class Supervisor:
     """
 
     def __init__(self, attempt: Attempt, around: Surroundings, since: float) -> None:
-        self._attempt = attempt
+        self._workspace = Workspace(around.settings.work_folder, attempt.job, around.storage)
+        others = (Path(around.settings.storage_address), around.settings.data)
+        places = Places(self._workspace.folder, around.settings.work_folder, others)
+        self._attempt = attempt = replace(attempt, shown=lambda value: shown_in(value, places))
         self._around = around
         self._settings = around.settings
         self._job = attempt.job
-        self._workspace = Workspace(around.settings.work_folder, attempt.job, around.storage)
         self._reporter = Reporter(attempt, self._workspace)
         self.lacked_room = False
         self._child: ChildProcess | None = None
@@ -187,7 +191,7 @@ class Supervisor:
             await asyncio.to_thread(self._workspace.restore, checkpoint)
         except (BlobMissing, DigestMismatch) as error:
             await asyncio.to_thread(self._workspace.discard_run)
-            self._reporter.log(f"The checkpoint cannot be used, so the job begins anew: {error}")
+            self._reporter.note(f"Warning: the checkpoint cannot be used, so the job begins anew: {error}")
             return
         self._reporter.resumed_from(checkpoint)
         data = {"stage": checkpoint.stage, "step": checkpoint.step, "attempt": checkpoint.attempt}
