@@ -11,6 +11,7 @@ import engine
 from engine.errors import OctasplatError
 from service.guards import BodyGuard, HostGuard, OriginGuard, SafeHeaders
 from service.hub import EventHub
+from service.making_room import RoomMaker
 from service.problems import ProblemDocument, add_problem_handlers
 from service.routes import artifacts, datasets, jobs, journal, metrics, system, webhooks
 from service.settings import ServiceSettings
@@ -106,9 +107,11 @@ async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
             settings.check_public(await any_token(connection))
         hub = EventHub(conninfo, listen=settings.listen)
         listening = asyncio.create_task(hub.run())
+        room = RoomMaker(pool, storage)
         try:
-            yield Service(settings, pool, ProcrastinateSlips(), storage, hub)
+            yield Service(settings, pool, ProcrastinateSlips(), storage, hub, room)
         finally:
+            await room.close()
             hub.close()
             listening.cancel()
             await asyncio.gather(listening, return_exceptions=True)

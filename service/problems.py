@@ -25,6 +25,7 @@ from workers.store.errors import (
     StorageUnavailable,
     TooLarge,
 )
+from workers.work.places import without_paths
 
 MEDIA_TYPE = "application/problem+json"
 TYPES = "urn:octasplat:problem:"
@@ -140,7 +141,7 @@ def problem_of(error: OctasplatError) -> Problem:
     if isinstance(error, Conflict):
         return Problem(409, "conflict", detail)
     if isinstance(error, StorageFull):
-        return Problem(507, "storage-full", _without_paths(detail), headers=again)
+        return Problem(507, "storage-full", without_paths(detail), headers=again)
     if isinstance(error, TooLarge):
         return Problem(413, "too-large", detail)
     if isinstance(error, DigestMismatch):
@@ -150,7 +151,7 @@ def problem_of(error: OctasplatError) -> Problem:
     if isinstance(error, StorageUnavailable | StorageError):
         logger.warning("the store: %s", error)
         return Problem(503, "storage", "The store does not answer; try again later.", headers=again)
-    return Problem(422, "refused", detail)
+    return Problem(422, "refused", without_paths(detail))
 
 
 async def _on_problem(_request: Request, error: Exception) -> JSONResponse:
@@ -212,8 +213,3 @@ def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
     pointer = "#" + prefix + "".join(f"/{part}" for part in escaped)
     named = {"pointer": pointer} if where == "body" else {"parameter": "/".join(str(p) for p in path)}
     return {"code": str(fault["type"]), "detail": str(fault["msg"]), **named}
-
-
-def _without_paths(detail: str) -> str:
-    """Where things lie on the server is not for users."""
-    return "There is no room left for this." if "/" in detail else detail

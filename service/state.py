@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from service.hub import EventHub
+from service.making_room import RoomMaker
 from service.metrics import Metrics
 from service.settings import ServiceSettings
 from workers.queue.port import Slips
@@ -24,6 +25,7 @@ class Service:
         slips: the queue.
         storage: the store.
         hub: tells of events.
+        room: makes room in the store.
         metrics: counts what this process does.
         has_tokens: whether anybody has a token, as of ``tokens_seen``.
         tokens_seen: monotonic time.
@@ -36,6 +38,7 @@ class Service:
     slips: Slips
     storage: Storage
     hub: EventHub
+    room: RoomMaker
     metrics: Metrics = field(default_factory=Metrics)
     has_tokens: bool = True
     tokens_seen: float = -1e9

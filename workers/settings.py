@@ -69,8 +69,8 @@ class WorkerSettings(BaseSettings):
         keep_jobs_hours_by_kind: the same for single kinds of jobs, e.g. ``{"render": 24}``.
         keep_datasets_hours: the same for datasets of which there are no jobs any more.
         keep_open_datasets_hours: the same for datasets that were never committed.
-        keep_unused_hours: contents of the store that nothing names are removed after this time, which must be
-            longer than any upload takes.
+        keep_unused_hours: contents of the store that nothing names are removed after this time; at once, but
+            for what is being stored, where room is short.
         collect_seconds: how often they are looked for.
     """
 

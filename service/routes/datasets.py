@@ -108,6 +108,7 @@ async def delete_dataset(dataset_id: uuid.UUID, who: Writer, service: ServiceDep
     async with service.pool.connection() as connection:
         await _owned(connection, who, dataset_id)
         await rows.delete_dataset(connection, dataset_id)
+    service.room.after_deletion()
 
 
 @router.get("/{dataset_id}/files", responses=problems(404))
@@ -151,23 +152,25 @@ async def put_file(
         return FileView.of(known)
     if left is not None and known is not None:
         left += known.size_bytes  # it will be replaced
-    received = await _received(
-        lambda: receive_file(
-            service.storage,
-            path,
-            request.stream(),
-            sha256=sha256,
-            size_bytes=_length(request),
-            limits=service.settings.upload_limits(),
-            max_bytes=left,
-        ),
-        left,
-    )
-    service.metrics.upload_bytes.inc(received.blob.size_bytes)
-    async with service.pool.connection() as connection, connection.transaction():
-        blob = received.blob
-        row = await rows.put_file(connection, dataset_id, path, blob.sha256, blob.size_bytes, received.facts)
-        await check_bytes(connection, dataset.owner, service.settings.quota)
+    async with service.room.upload(_length(request)) as note:
+        received = await _received(
+            lambda: receive_file(
+                service.storage,
+                path,
+                request.stream(),
+                sha256=sha256,
+                size_bytes=_length(request),
+                limits=service.settings.upload_limits(),
+                max_bytes=left,
+            ),
+            left,
+        )
+        service.metrics.upload_bytes.inc(received.blob.size_bytes)
+        async with service.pool.connection() as connection, connection.transaction():
+            blob, facts = received.blob, received.facts
+            await note.confirm(connection)
+            row = await rows.put_file(connection, dataset_id, path, blob.sha256, blob.size_bytes, facts)
+            await check_bytes(connection, dataset.owner, service.settings.quota)
     return FileView.of(row)
 
 
@@ -197,6 +200,7 @@ async def delete_file(dataset_id: uuid.UUID, path: FilePath, who: Writer, servic
         await _open(connection, who, dataset_id)
         if "\0" in path or not await rows.remove_file(connection, dataset_id, path):
             raise not_found("file")
+    service.room.after_deletion()
 
 
 @router.put(
@@ -213,25 +217,27 @@ async def put_archive(
     async with service.pool.connection() as connection:
         dataset = await _open(connection, who, dataset_id)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
-    received = await _received(
-        lambda: receive_archive(
-            service.storage,
-            request.stream(),
-            service.settings.work_folder / "archives",
-            sha256=sha256,
-            size_bytes=_length(request),
-            limits=service.settings.upload_limits(),
-            max_bytes=left,
-        ),
-        left,
-    )
-    service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received.files))
-    async with service.pool.connection() as connection, connection.transaction():
-        files = [
-            await rows.put_file(connection, dataset_id, f.path, f.blob.sha256, f.blob.size_bytes, f.facts)
-            for f in received.files
-        ]
-        await check_bytes(connection, dataset.owner, service.settings.quota)
+    async with service.room.upload(_length(request)) as note:
+        received = await _received(
+            lambda: receive_archive(
+                service.storage,
+                request.stream(),
+                service.settings.work_folder / "archives",
+                sha256=sha256,
+                size_bytes=_length(request),
+                limits=service.settings.upload_limits(),
+                max_bytes=left,
+            ),
+            left,
+        )
+        service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received.files))
+        async with service.pool.connection() as connection, connection.transaction():
+            await note.confirm(connection)
+            files = [
+                await rows.put_file(connection, dataset_id, f.path, f.blob.sha256, f.blob.size_bytes, f.facts)
+                for f in received.files
+            ]
+            await check_bytes(connection, dataset.owner, service.settings.quota)
     return ArchiveView(files=[FileView.of(row) for row in files], left_out=list(received.left_out))
 
 

@@ -207,6 +207,7 @@ async def delete_job(
                 headers = {"Retry-After": str(_BUSY_SECONDS)}
                 raise Problem(409, "stopping", detail, headers=headers)
         await rows.delete_job(connection, job_id)
+    service.room.after_deletion()
 
 
 async def owned_job(connection: Connection, who: Principal, job_id: uuid.UUID, *, lock: bool = False) -> Job:

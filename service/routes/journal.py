@@ -33,7 +33,7 @@ async def read_log(
     job_id: uuid.UUID, who: Reader, service: ServiceDep, after: After = 0,
     limit: Annotated[int, Query(ge=1, le=5000)] = 1000,
 ) -> LogPage:  # fmt: skip
-    """What the job's program wrote."""
+    """What the job did when: stages, pace, warnings, errors with their cause, and what its program wrote."""
     await read_job(service, who, job_id)
     async with service.pool.connection() as connection:
         lines = await log_after(connection, job_id, after, limit)

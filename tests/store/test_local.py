@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from small_disk import small_disk
 
 from engine.errors import ConfigError
 from workers.store import StorageFull, StorageUnavailable, open_storage
@@ -41,19 +42,13 @@ def test_the_floor_is_kept(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A folder on a disk of 8 MB; only root can make one."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)]
-    if os.geteuid() != 0 or subprocess.run(command, capture_output=True, check=False).returncode != 0:
-        pytest.skip("a small disk cannot be mounted here")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", 8) as folder:
+        yield folder
 
 
-def test_a_full_disk_is_told_and_can_be_emptied(small_disk: Path) -> None:
-    storage = LocalStorage(small_disk / "store", floor_bytes=0)
+def test_a_full_disk_is_told_and_can_be_emptied(disk: Path) -> None:
+    storage = LocalStorage(disk / "store", floor_bytes=0)
     try:
         first = put(storage, bytes(3 << 20))
         with storage.begin() as writer, pytest.raises(StorageFull):
@@ -62,8 +57,8 @@ def test_a_full_disk_is_told_and_can_be_emptied(small_disk: Path) -> None:
         assert storage.sweep(-60) == 0
         assert [entry.blob.sha256 for entry in storage.blobs()] == [first]
         with pytest.raises(StorageFull, match="full"):
-            storage.materialise(put(storage, b"1" * (3 << 20)), small_disk / "copy", writable=True)
-        assert not (small_disk / "copy").exists()
+            storage.materialise(put(storage, b"1" * (3 << 20)), disk / "copy", writable=True)
+        assert not (disk / "copy").exists()
         storage.delete(first)
         put(storage, bytes(4 << 20))
     finally:

@@ -1,45 +1,30 @@
 """A full disk pauses the queue and loses nothing; room starts it again."""
 
-import os
-import subprocess
 import time
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from small_disk import fill, small_disk
 from worker_bench import PATIENCE_SECONDS, Bench
+
+from workers.store.local import LocalStorage
 
 MIB = 1 << 20
 
 
 @pytest.fixture
 def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    """Workers whose store and work lie on a disk of 16 MB; only root can make one."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(disk)]
-    if os.geteuid() != 0 or subprocess.run(command, capture_output=True, check=False).returncode != 0:
-        pytest.skip("a small disk cannot be mounted here")
-    bench = Bench(conninfo, disk)
-    yield bench
-    bench.close()
-    subprocess.run(["umount", str(disk)], check=True)
-
-
-def fill(bench: Bench, leave_bytes: int) -> Path:
-    """Take room on the disk until so much is left."""
-    ballast = bench.folder / "ballast"
-    facts = os.statvfs(bench.folder)
-    with ballast.open("wb") as handle:
-        try:
-            handle.write(bytes(max(0, facts.f_bavail * facts.f_frsize - leave_bytes)))
-        except OSError:
-            assert leave_bytes == 0
-    return ballast
+    """Workers whose store and work lie on a disk of 16 MB."""
+    with small_disk(tmp_path / "disk", 16) as disk:
+        bench = Bench(conninfo, disk)
+        yield bench
+        bench.close()
 
 
 def test_below_the_floor_jobs_wait(bench: Bench) -> None:
-    ballast = fill(bench, 2 * MIB)
+    ballast = fill(bench.folder, 2 * MIB)
     bench.worker(FLOOR_BYTES=str(4 * MIB))
     job_id = bench.submit(options={"steps": 3})
     deadline = time.monotonic() + PATIENCE_SECONDS
@@ -55,11 +40,12 @@ def test_below_the_floor_jobs_wait(bench: Bench) -> None:
     assert "has room again" in bench.worker_logs()
 
 
-def test_a_job_that_meets_a_full_disk_goes_on_from_its_checkpoint(bench: Bench) -> None:
-    bench.worker(FLOOR_BYTES=str(4 * MIB))
+@pytest.mark.parametrize("floor_bytes", [4 * MIB, 0])
+def test_a_job_that_meets_a_full_disk_goes_on_from_its_checkpoint(bench: Bench, floor_bytes: int) -> None:
+    bench.worker(FLOOR_BYTES=str(floor_bytes))
     job_id = bench.submit(options=bench.held())
     bench.wait_at_gate(job_id)
-    ballast = fill(bench, 0)
+    ballast = fill(bench.folder, 0)
     bench.open_gate()
     job = bench.wait(job_id, lambda job: job.state == "queued")
     assert job.error is None and job.rescues == 0
@@ -73,3 +59,19 @@ def test_a_job_that_meets_a_full_disk_goes_on_from_its_checkpoint(bench: Bench) 
     assert [int(line) for line in results["history.txt"].split()] == [0, 30]
     reasons = [event.data["reason"] for event in bench.events(job_id) if event.kind == "handed_back"]
     assert len(reasons) == 1 and "lacks" in reasons[0]
+
+
+def test_what_nothing_names_makes_room_for_jobs(bench: Bench) -> None:
+    storage = LocalStorage(bench.folder / "store", floor_bytes=0)
+    with storage.begin() as writer:
+        writer.write(bytes(6 * MIB))
+        sha256 = writer.commit().sha256
+    # As a worker leaves it: photographs of a dataset that is gone are links to the same content.
+    left = bench.folder / "work-w" / "datasets" / str(uuid.uuid4()) / "scene" / "images"
+    storage.materialise(sha256, left / "a.jpg")
+    fill(bench.folder, 2 * MIB)
+    bench.worker(FLOOR_BYTES=str(4 * MIB))
+    job = bench.over(bench.submit(options={"steps": 3}))
+    assert (job.state, job.attempt, job.rescues) == ("succeeded", 1, 0), job
+    assert "unused contents of" in bench.worker_logs() and not left.exists()
+    assert sha256 not in {entry.blob.sha256 for entry in storage.blobs()}

@@ -48,3 +48,41 @@ def test_an_end_in_the_middle_of_writing_loses_and_repeats_nothing(monkeypatch: 
         for what in ("started", "finished")
     ]
     assert asyncio.run(job()) == [*stages, "run_finished"]
+
+
+def test_the_log_says_now_and_then_how_far_the_job_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reporter, "PACE_SECONDS", 0.0)
+
+    class Log(SlowJournal):
+        def __init__(self) -> None:
+            super().__init__()
+            self.lines: list[str] = []
+
+        async def log(self, lines: tuple[str, ...]) -> None:
+            self.lines += lines
+
+    async def job() -> list[str]:
+        journal = Log()
+        child = Reporter(journal, workspace=None)  # type: ignore[arg-type]
+        child.hear({"kind": "stage_started", "stage": "train", "total_steps": 900})
+        progress = {
+            "iteration": 450, "total_iterations": 900, "loss": 0.1, "psnr": 24.13, "gaussians": 32000,
+            "rays_per_second": 310_400, "hits_per_ray": 5.0, "seconds": 41.0, "seconds_left": 41.0,
+        }  # fmt: skip
+        measured = {"iteration": 450, "psnr": 23.04, "gaussians": 32000, "seconds": 41.0}
+        child.hear({"kind": "held_out_measured", **measured})
+        child.hear({"kind": "training_progress", **progress})
+        child.hear({"kind": "warning", "message": "It rains."})
+        for number in range(3 * reporter.MAX_LOG_LINES):
+            child.log(f"noise {number}")
+        child.hear({"kind": "error", "type": "x", "message": "x", "cause": ["Caused by rain"]})
+        await child.finish()
+        return [line for line in journal.lines if "noise" not in line and "(More" not in line]
+
+    state = "24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s"
+    assert asyncio.run(job()) == [
+        "Training",
+        f"  450/900: {state}, 0:41 left",
+        "Warning: It rains.",
+        "Caused by rain",
+    ]

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import psutil
 import psycopg
 import pytest
-from worker_bench import Bench, alive, child_pids, wait_for_end
+from worker_bench import ROOT, Bench, alive, child_pids, wait_for_end
 
 TAKEN_OVER_SECONDS = 20.0
 """After 2.4 s a worker is missed; the rest is for a machine that is busy."""
@@ -235,6 +236,32 @@ def test_priority_and_queues(bench: Bench) -> None:
     assert bench.over(elsewhere).worker == "gpu"
 
 
+def test_the_log_tells_the_stages_and_the_cause_without_paths(bench: Bench) -> None:
+    bench.worker()
+    job_id = bench.submit(options={"tell_paths": True})
+    job = bench.over(job_id)
+    assert job.error == {"type": "dataset_error", "message": "cache/pixels.bin cannot be read."}
+    lines = bench.log(job_id).splitlines()
+    print_ = "[x.cc:12] Cannot open:cache/pixels.bin, cache/pixels.bin; see https://example.org/home/x"
+    lines.remove(print_)  # comes by another way, so perhaps a moment later
+    assert lines == [
+        "Attempt 1 on w",
+        "Loading",
+        "Warning: images/a b.jpg is dark; …/worker/toy_kind.py says so.",
+        "Loaded in 2.0 s",
+        "Caused by FileNotFoundError: [Errno 2] No such file or directory: 'cache/pixels.bin'",
+        "Failed: cache/pixels.bin cannot be read.",
+    ]
+    told = repr([event.data for event in bench.events(job_id)])
+    assert "images/a b.jpg is dark" in told and str(bench.folder) not in told
+
+    fault = bench.submit(options={"fault": True})
+    bench.over(fault)
+    log = bench.log(fault)
+    assert 'File "…/worker/toy_kind.py"' in log and "RuntimeError: a fault of the program" in log
+    assert str(ROOT) not in log and str(bench.folder) not in log and sys.prefix not in log
+
+
 def test_flood_of_log_lines_is_cut(bench: Bench) -> None:
     worker = bench.worker()
     bench.up("w")
@@ -243,6 +270,9 @@ def test_flood_of_log_lines_is_cut(bench: Bench) -> None:
     assert bench.over(job_id).state == "succeeded"
     lines = bench.log(job_id).splitlines()
     assert len(lines) <= 20_001 and any("the rest is left out" in line for line in lines)
+    assert [line for line in lines if "library" not in line and "(More" not in line] == [
+        "Attempt 1 on w", "the toy begins at 0", "Training", "Trained 2 iterations in 1.0 s", "Succeeded"
+    ]  # fmt: skip
     assert psutil.Process(worker.pid).memory_info().rss - before < 40 << 20
 
 

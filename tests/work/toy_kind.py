@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from engine.errors import Cancelled, DatasetError
-from engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
+from engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted, Warned
 from workers.work.kinds import JobKind, register
 from workers.work.kinds.table import validated
 from workers.work.task import Task
@@ -32,6 +32,8 @@ class ToyOptions(BaseModel):
     hog_behind_gate_bytes: int = 0
     silent_behind_gate: bool = False
     deaf: bool = False
+    tell_paths: bool = False
+    """Fails over a file, with paths in everything it says."""
 
 
 def _hold(task: Task, options: ToyOptions, hog: bytearray) -> None:
@@ -54,6 +56,16 @@ def run(task: Task) -> None:
     options = ToyOptions.model_validate(task.options)
     if options.refuse:
         raise DatasetError("The toy refuses this scene; send another.")
+    if options.tell_paths:
+        inner, sheet = task.run / "cache" / "pixels.bin", task.folder / "posed" / "fox" / "images" / "a b.jpg"
+        print(f"[x.cc:12] Cannot open:{inner}, file://{inner}; see https://example.org/home/x")  # noqa: T201
+        task.listener(StageStarted("load", 3))
+        task.listener(Warned(f"{sheet} is dark; {__file__} says so."))
+        task.listener(StageFinished("load", 2.0))
+        try:
+            inner.open("rb")
+        except OSError as error:
+            raise DatasetError(f"{inner} cannot be read.") from error
     if options.fault:
         raise RuntimeError("a fault of the program")
     checkpoints = task.run / "checkpoints"

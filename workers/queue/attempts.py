@@ -5,7 +5,7 @@ whatever it still wants to write is refused with :class:`Fenced`.
 """
 
 import uuid
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -14,12 +14,16 @@ from psycopg.types.json import Jsonb
 
 from workers.queue.jobs import get_job, queue_again
 from workers.queue.port import Slips
+from workers.queue.storing import Note
 from workers.records.database import Connection, Pool
-from workers.records.journal import add_event, add_log_lines
+from workers.records.journal import add_event, add_log_lines, trim_log
 from workers.records.rows import Job
 
 MAX_RESCUES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
+
+KEPT_LOG_LINES = 20_000
+"""Lines of the attempts before that stay in the log when a new one begins."""
 
 
 class Fenced(Exception):
@@ -43,10 +47,12 @@ class Attempt:
     Args:
         pool: connections.
         job: the row as it was when the attempt began; ``job.attempt`` is the number that fences.
+        shown: a JSON value as its texts may be shown to users; everything that is written goes through it.
     """
 
     pool: Pool
     job: Job
+    shown: Callable[[Any], Any] = lambda value: value
 
     async def beat(self) -> str:
         """Say that the worker lives; returns the state, ``running`` or ``canceling``."""
@@ -65,12 +71,12 @@ class Attempt:
     async def tell(self, kind: str, data: Mapping[str, Any]) -> None:
         """Add an event to the journal."""
         async with self._fenced() as (connection, job):
-            await add_event(connection, job.id, job.attempt, kind, data)
+            await add_event(connection, job.id, job.attempt, kind, self.shown(dict(data)))
 
     async def log(self, lines: Sequence[str]) -> None:
         """Add lines to the log."""
         async with self._fenced() as (connection, job):
-            await add_log_lines(connection, job.id, job.attempt, lines)
+            await add_log_lines(connection, job.id, job.attempt, self.shown(list(lines)))
 
     async def progress(
         self,
@@ -95,9 +101,17 @@ class Attempt:
             if event is not None:
                 await add_event(connection, job.id, job.attempt, "progress", event)
 
-    async def keep_checkpoint(self, manifest: Mapping[str, Any], *, advances: bool) -> None:
-        """Record a stored checkpoint; one that advances forgives the job the workers it has lost."""
+    async def keep_checkpoint(
+        self, manifest: Mapping[str, Any], *, advances: bool, note: Note | None = None
+    ) -> None:
+        """Record a stored checkpoint; one that advances forgives the job the workers it has lost.
+
+        Raises:
+            StorageUnavailable: ``note``, under which it was stored, was given up.
+        """
         async with self._fenced() as (connection, job):
+            if note is not None:
+                await note.confirm(connection)
             await connection.execute(
                 """
                 UPDATE jobs SET checkpoint = %s, rescues = CASE WHEN %s THEN 0 ELSE rescues END WHERE id = %s
@@ -107,9 +121,11 @@ class Attempt:
             event = {key: manifest[key] for key in ("stage", "step") if key in manifest}
             await add_event(connection, job.id, job.attempt, "checkpoint", event)
 
-    async def keep_preview(self, preview: Mapping[str, Any]) -> None:
-        """Record the newest preview picture: ``sha256``, ``step`` and ``view``."""
+    async def keep_preview(self, preview: Mapping[str, Any], note: Note | None = None) -> None:
+        """Record the newest preview picture: ``sha256``, ``step`` and ``view``; ``note`` as above."""
         async with self._fenced() as (connection, job):
+            if note is not None:
+                await note.confirm(connection)
             await connection.execute(
                 "UPDATE jobs SET preview = %s WHERE id = %s", [Jsonb(dict(preview)), job.id]
             )
@@ -121,12 +137,18 @@ class Attempt:
             await _show(connection, job, results)
             await end_job(connection, job, "succeeded", None)
 
-    async def fail(self, error: Mapping[str, Any], results: Sequence[Result] = ()) -> None:
-        """End the job for a reason that another try would meet again, with the results there are so far."""
+    async def fail(
+        self, error: Mapping[str, Any], results: Sequence[Result] = (), note: Note | None = None
+    ) -> None:
+        """End the job for a reason that another try would meet again, with the results there are so far.
+
+        Raises:
+            StorageUnavailable: ``note``, under which they were stored, was given up.
+        """
         async with self._fenced() as (connection, job):
             if results:
-                await _show(connection, job, results)
-            await end_job(connection, job, "failed", error)
+                await _show(connection, job, results, note)
+            await end_job(connection, job, "failed", self.shown(dict(error)))
 
     async def cancel(self) -> None:
         """End the job as its owner asked."""
@@ -139,18 +161,26 @@ class Attempt:
             if job.state == "canceling":
                 await end_job(connection, job, "canceled", None)
                 return
+            reason = self.shown(reason)
             await add_event(connection, job.id, job.attempt, "handed_back", {"reason": reason})
+            await add_log_lines(connection, job.id, job.attempt, [f"Handed back to the queue: {reason}"])
             await queue_again(connection, slips, job, keep_slip=True)
 
-    async def lose(self, slips: Slips, error: Mapping[str, Any], results: Sequence[Result] = ()) -> None:
+    async def lose(
+        self,
+        slips: Slips,
+        error: Mapping[str, Any],
+        results: Sequence[Result] = (),
+        note: Note | None = None,
+    ) -> None:
         """The attempt was lost without its worker's intent: another try, or the end if there were enough.
 
-        At the end ``results`` are those that there are.
+        At the end ``results`` are those that there are, ``note`` as in :meth:`fail`.
         """
         async with self._fenced() as (connection, job):
-            failed = await rescue(connection, slips, job, error, keep_slip=True)
+            failed = await rescue(connection, slips, job, self.shown(dict(error)), keep_slip=True)
             if failed and results:
-                await _show(connection, job, results)
+                await _show(connection, job, results, note)
 
     @asynccontextmanager
     async def _fenced(self) -> AsyncIterator[tuple[Connection, Job]]:
@@ -181,6 +211,8 @@ async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attemp
             [worker, job_id],
         )
         await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
+        await trim_log(connection, job_id, KEPT_LOG_LINES)
+        await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1} on {worker}"])
         claimed = await get_job(connection, job_id)
     assert claimed is not None
     return Attempt(pool, claimed)
@@ -209,12 +241,18 @@ async def rescue(
         await connection.execute("UPDATE jobs SET rescues = rescues + 1 WHERE id = %s", [job.id])
         data = {"reason": error["message"], "rescues": job.rescues + 1}
         await add_event(connection, job.id, job.attempt, "rescued", data)
+        lost = f"Lost, and queued again: {error['message']}"
+        await add_log_lines(connection, job.id, job.attempt, [lost])
         await queue_again(connection, slips, job, keep_slip=keep_slip)
     return False
 
 
-async def _show(connection: Connection, job: Job, results: Sequence[Result]) -> None:
+async def _show(
+    connection: Connection, job: Job, results: Sequence[Result], note: Note | None = None
+) -> None:
     """Put results into the place of earlier ones; the one place where they become visible."""
+    if note is not None:
+        await note.confirm(connection)
     async with connection.cursor() as cursor:
         await cursor.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
         await cursor.executemany(
@@ -240,3 +278,7 @@ async def end_job(connection: Connection, job: Job, state: str, error: Mapping[s
     if error is not None:
         data["error"] = dict(error)
     await add_event(connection, job.id, job.attempt, "state", data)
+    line = {"succeeded": "Succeeded", "canceled": "Cancelled"}.get(state, "Failed")
+    if error is not None:
+        line += f": {error['message']}"
+    await add_log_lines(connection, job.id, job.attempt, [line])

@@ -35,6 +35,18 @@ async def add_log_lines(
         )
 
 
+async def trim_log(connection: Connection, job_id: uuid.UUID, keep: int) -> None:
+    """Forget all but the newest ``keep`` lines of a job's log."""
+    await connection.execute(
+        """
+        DELETE FROM job_logs WHERE job_id = %(job)s AND id <= (
+            SELECT id FROM job_logs WHERE job_id = %(job)s ORDER BY id DESC OFFSET %(keep)s LIMIT 1
+        )
+        """,
+        {"job": job_id, "keep": keep},
+    )
+
+
 async def events_after(
     connection: Connection, job_id: uuid.UUID, after: int = 0, limit: int = 500
 ) -> list[JobEvent]:

@@ -1,9 +1,10 @@
 """Removing contents that nothing names. Whoever calls this knows all that is named."""
 
-from collections.abc import Set
+import math
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 
-from workers.store.protocol import Storage
+from workers.store.protocol import Storage, StoredBlob
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,39 @@ def collect_unused(
         if sha256 in named or entry.modified_unix >= limit:
             continue
         if storage.delete_older(sha256, limit):
+            count += 1
+            size_bytes += entry.blob.size_bytes
+    return Collected(count, size_bytes)
+
+
+def unnamed(storage: Storage, named: Set[str]) -> list[StoredBlob]:
+    """Contents that are not named, as they are now.
+
+    Raises:
+        StorageError: the store cannot be listed.
+    """
+    return [entry for entry in storage.blobs() if entry.blob.sha256 not in named]
+
+
+def remove_unchanged(
+    storage: Storage, found: Sequence[StoredBlob], named: Set[str], *, before_unix: float
+) -> Collected:
+    """Remove contents that are still not named and were not stored once more since they were listed.
+
+    Args:
+        storage: the store.
+        found: what :func:`unnamed` listed before ``named`` was gathered.
+        named: digests that must stay.
+        before_unix: only what was written before this time goes, s.
+
+    Raises:
+        StorageError: the store cannot be changed.
+    """
+    count = size_bytes = 0
+    for entry in found:
+        if entry.blob.sha256 in named or entry.modified_unix >= before_unix:
+            continue
+        if storage.delete_older(entry.blob.sha256, math.nextafter(entry.modified_unix, math.inf)):
             count += 1
             size_bytes += entry.blob.size_bytes
     return Collected(count, size_bytes)

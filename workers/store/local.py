@@ -24,7 +24,7 @@ from typing import BinaryIO
 from workers.store.copying import copy_verified
 from workers.store.counting import CountingWriter
 from workers.store.errors import BlobMissing, StorageFull
-from workers.store.os_errors import told
+from workers.store.os_errors import MAKE_ROOM, told
 from workers.store.protocol import (
     MAX_DOCUMENT_BYTES,
     SHA256,
@@ -234,8 +234,8 @@ class LocalStorage:
         free = self.free_bytes()
         if size_bytes > free:
             raise StorageFull(
-                f"The disk of {self.root} has {max(0, free)} bytes left to use ({self.floor_bytes} more are "
-                f"kept free) but {size_bytes} are needed; delete datasets or jobs, or add room."
+                f"The disk of the store has {max(0, free)} bytes left to use ({self.floor_bytes} more are "
+                f"kept free) but {size_bytes} are needed; {MAKE_ROOM}."
             )
 
     def sweep(self, older_than_seconds: float) -> int:

@@ -7,6 +7,19 @@ from pathlib import Path
 from engine.files import NO_ROOM
 from workers.store.errors import StorageFull, StorageUnavailable
 
+MAKE_ROOM = "delete datasets or jobs, whose contents then go at once, or add room"
+
+
+def lacks_room(error: BaseException | None) -> bool:
+    """Whether an error, or what it came from, is that there was no room on a disk."""
+    for _ in range(20):
+        if error is None:
+            return False
+        if isinstance(error, StorageFull) or (isinstance(error, OSError) and error.errno in NO_ROOM):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
 
 @contextmanager
 def told(path: Path) -> Iterator[None]:
@@ -20,7 +33,7 @@ def told(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in NO_ROOM:
-            raise StorageFull(f"The disk of {path} is full; delete datasets or jobs, or add room.") from error
+            raise StorageFull(f"The disk of {path} is full; {MAKE_ROOM}.") from error
         reason = error.strerror or str(error)
         raise StorageUnavailable(
             f"{path} cannot be used ({reason}); check its disk and its access."

@@ -4,8 +4,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from workers.store.os_errors import told
+from workers.store.os_errors import MAKE_ROOM, told
 from workers.store.protocol import Storage
+
+LEAST_BYTES = 1 << 20
+"""With less than this a disk is full, also where nothing is to be kept free."""
 
 
 @dataclass(frozen=True)
@@ -31,18 +34,30 @@ class Room:
         Raises:
             StorageUnavailable: a disk does not answer.
         """
-        stored = self.storage.free_bytes()
-        if stored is not None and stored < self.above_bytes:
-            lacking = self.above_bytes - stored
-            return f"The store lacks {lacking} bytes of the room that is kept free; delete datasets or jobs."
+        stored, least = self.storage.free_bytes(), max(self.above_bytes, LEAST_BYTES)
+        if stored is not None and stored < least:
+            return f"The store lacks {least - stored} bytes of the room that is kept free; {MAKE_ROOM}."
+        free, least = self._free_for_work(), max(self.floor_bytes, LEAST_BYTES)
+        if free < least:
+            return (
+                f"The disk of {self.work} has {free} bytes free where {least} are kept; "
+                f"if the store is on it, {MAKE_ROOM}."
+            )
+        return None
+
+    def free_bytes(self) -> int:
+        """Room for jobs on the fuller of the disks.
+
+        Raises:
+            StorageUnavailable: a disk does not answer.
+        """
+        stored, free = self.storage.free_bytes(), self._free_for_work()
+        return free if stored is None else min(free, stored)
+
+    def _free_for_work(self) -> int:
         with told(self.work):
             place = self.work.absolute()
             while not place.exists():
                 place = place.parent
             facts = os.statvfs(place)
-        free = facts.f_bavail * facts.f_frsize
-        if free < self.floor_bytes:
-            return (
-                f"The disk of {self.work} has {free} bytes free where {self.floor_bytes} are kept; make room."
-            )
-        return None
+        return facts.f_bavail * facts.f_frsize

@@ -25,7 +25,7 @@ from botocore.exceptions import BotoCoreError, ClientError
 from workers.store.copying import copy_verified
 from workers.store.counting import CountingWriter
 from workers.store.errors import BlobMissing, StorageFull, StorageUnavailable
-from workers.store.os_errors import told
+from workers.store.os_errors import MAKE_ROOM, told
 from workers.store.protocol import (
     MAX_DOCUMENT_BYTES,
     SHA256,
@@ -260,7 +260,7 @@ class S3Storage:
             if code in _ABSENT:
                 raise BlobMissing(f"The bucket {self.bucket} does not hold {what}.") from error
             if code in _NO_ROOM:
-                raise StorageFull(f"The bucket {self.bucket} is full; delete datasets or jobs.") from error
+                raise StorageFull(f"The bucket {self.bucket} is full; {MAKE_ROOM}.") from error
             raise StorageUnavailable(
                 f"The bucket {self.bucket} refuses the service ({code}); check its name and the credentials."
             ) from error

@@ -1,7 +1,7 @@
 """Collecting what deleted, replaced and abandoned things have left in the store.
 
-What stays: everything in the tables (so all results, whether pinned or not), and the published results of
-attempts that did not get to enter them, as the next attempt will.
+What stays: everything in the tables (so all results, whether pinned or not), the published results of
+attempts that did not get to enter them, as the next attempt will, and what somebody stores at the moment.
 """
 
 import asyncio
@@ -9,10 +9,13 @@ import logging
 import re
 import time
 import uuid
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
+from workers.queue.storing import give_up_silent, oldest_note
 from workers.records.database import Connection, Pool
 from workers.records.references import references
-from workers.store.collect import Collected, collect_unused
+from workers.store.collect import Collected, collect_unused, remove_unchanged, unnamed
 from workers.store.protocol import Storage
 from workers.store.trees import read_manifest
 
@@ -20,6 +23,11 @@ logger = logging.getLogger(__name__)
 
 REPLACED_SECONDS = 600.0
 """How long a replaced checkpoint stays for those who still read it."""
+AT_ONCE_SECONDS = 3.0
+"""How often contents are collected at once, at most."""
+CLOCK_SECONDS = 60.0
+"""By how much the clocks of the store and the database may differ."""
+_SETTLED_SECONDS = 2.0
 INSTALLATION = "installation"
 _RESULTS = re.compile(r"results/([0-9a-f-]{36})/\d+")
 
@@ -48,33 +56,72 @@ async def collect(
     Raises:
         StorageError: the store does not do as asked.
     """
+    async with _turn(pool, storage, every_seconds) as ours:
+        return await _collect(pool, storage, unused_seconds, replaced_seconds) if ours else None
+
+
+async def collect_at_once(
+    pool: Pool, storage: Storage, *, every_seconds: float = AT_ONCE_SECONDS
+) -> Collected | None:
+    """Remove everything that nothing names, whatever its age, because room is short.
+
+    Contents that somebody stores at the moment and has yet to name are spared, see
+    :mod:`workers.queue.storing`.
+
+    Args:
+        pool: connections.
+        storage: the store.
+        every_seconds: does nothing if the last time was less than this ago.
+
+    Returns:
+        What was removed; None as by :func:`collect`.
+
+    Raises:
+        StorageError: the store does not do as asked.
+    """
+    async with _turn(pool, storage, every_seconds) as ours:
+        return await _collect_at_once(pool, storage) if ours else None
+
+
+@asynccontextmanager
+async def _turn(pool: Pool, storage: Storage, every_seconds: float) -> AsyncIterator[bool]:
+    """Whether it is time and nobody else collects, which then holds for as long as the block runs."""
     async with pool.connection() as connection, connection.transaction():
         cursor = await connection.execute(
             """
-            SELECT id FROM installation WHERE collected_at <= now() - make_interval(secs => %s)
+            SELECT id FROM installation
+            WHERE collected_at <= clock_timestamp() - make_interval(secs => %s)
             FOR UPDATE SKIP LOCKED
             """,
             [every_seconds],
         )
         row = await cursor.fetchone()
         if row is None:
-            return None
-        # A store that is nobody's becomes this database's.
-        if not await asyncio.to_thread(storage.publish, INSTALLATION, str(row["id"]).encode()):
+            yield False
+            return
+        if not await asyncio.to_thread(_is_ours, storage, str(row["id"]).encode()):
             logger.warning("the store is another database's, so nothing in it is collected")
-            return None
-        await connection.execute("UPDATE installation SET collected_at = now()")
-        return await _collect(pool, storage, unused_seconds, replaced_seconds)
+            yield False
+            return
+        yield True
+        await connection.execute("UPDATE installation SET collected_at = clock_timestamp()")
+
+
+def _is_ours(storage: Storage, installation: bytes) -> bool:
+    """Whether the store is this database's; one that is nobody's becomes so."""
+    # Read first, as a full store takes not even this.
+    known = storage.document(INSTALLATION)
+    return storage.publish(INSTALLATION, installation) if known is None else known == installation
 
 
 async def _collect(pool: Pool, storage: Storage, unused_seconds: float, replaced_seconds: float) -> Collected:
     now = time.time()
     async with pool.connection() as connection:
+        await _give_up_silent(connection)
         async with connection.transaction():
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
-            named = {reference.sha256 async for reference in references(connection)}
-            cursor = await connection.execute("SELECT id FROM jobs WHERE state = 'succeeded'")
-            entered = {row["id"] for row in await cursor.fetchall()}
+            began_unix = await _oldest_unix(connection)
+            named, entered = await _named(connection)
             cursor = await connection.execute(
                 "SELECT sha256 FROM replaced_contents WHERE replaced_at < now() - make_interval(secs => %s)",
                 [replaced_seconds],
@@ -86,13 +133,55 @@ async def _collect(pool: Pool, storage: Storage, unused_seconds: float, replaced
             storage,
             named,
             replaced,
-            unused_before_unix=now - unused_seconds,
-            replaced_before_unix=now - replaced_seconds,
+            unused_before_unix=min(now - unused_seconds, began_unix),
+            replaced_before_unix=min(now - replaced_seconds, began_unix),
         )
         await connection.execute("DELETE FROM replaced_contents WHERE sha256 = ANY(%s)", [list(replaced)])
+    _tell_of(removed)
+    return removed
+
+
+async def _collect_at_once(pool: Pool, storage: Storage) -> Collected:
+    now = time.time()
+    async with pool.connection() as connection:
+        await _give_up_silent(connection)
+        async with connection.transaction():
+            named, _ = await _named(connection)
+        # Listed before the notes and names that count are read: whoever makes a note later and stores one of
+        # these again makes it younger than it was in the list.
+        found = await asyncio.to_thread(unnamed, storage, named)
+        async with connection.transaction():
+            await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
+            began_unix = await _oldest_unix(connection)
+            named, entered = await _named(connection)
+        named |= await _published(connection, storage, entered)
+        limit_unix = min(now - _SETTLED_SECONDS, began_unix)
+        removed = await asyncio.to_thread(remove_unchanged, storage, found, named, before_unix=limit_unix)
+    _tell_of(removed)
+    return removed
+
+
+async def _give_up_silent(connection: Connection) -> None:
+    async with connection.transaction():
+        await give_up_silent(connection)
+
+
+async def _oldest_unix(connection: Connection) -> float:
+    """Before when, by the clock of the store, nothing was stored that is about to be named; s."""
+    began_at = await oldest_note(connection)
+    return began_at.timestamp() - CLOCK_SECONDS if began_at is not None else float("inf")
+
+
+async def _named(connection: Connection) -> tuple[set[str], set[uuid.UUID]]:
+    """Contents that the tables name, and the jobs whose results are among them."""
+    named = {reference.sha256 async for reference in references(connection)}
+    cursor = await connection.execute("SELECT id FROM jobs WHERE state = 'succeeded'")
+    return named, {row["id"] for row in await cursor.fetchall()}
+
+
+def _tell_of(removed: Collected) -> None:
     if removed.blobs:
         logger.info("%d unused contents of %d bytes were removed", removed.blobs, removed.size_bytes)
-    return removed
 
 
 async def _published(connection: Connection, storage: Storage, entered: set[uuid.UUID]) -> set[str]:

@@ -19,9 +19,11 @@ from typing import Any, NoReturn
 from engine.errors import Cancelled, OctasplatError
 from engine.events import Event
 from workers.parent import die_with
-from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, Task
+from workers.store.os_errors import lacks_room
+from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE, Task
 
 _OOM_SCORE = 800
+MAX_CAUSE_LINES = 60
 
 
 class _Lines:
@@ -80,18 +82,32 @@ def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
         lines.write({"kind": "stopped", "message": str(error)})
         return EXIT_STOPPED
     except OctasplatError as error:
-        lines.write({"kind": "error", "type": _snake(type(error).__name__), "message": str(error)})
+        kind = NO_SPACE if lacks_room(error) else _snake(type(error).__name__)
+        lines.write({"kind": "error", "type": kind, "message": str(error), "cause": _cause(error)})
         return EXIT_REFUSED
     except MemoryError:
         lines.write({"kind": "error", "type": "out_of_memory", "message": "The job ran out of memory."})
         return EXIT_REFUSED
     except Exception as error:  # noqa: BLE001 - told to the worker, which tells the user
-        traceback.print_exc()
+        kind = NO_SPACE if lacks_room(error) else "unexpected"
         message = f"{type(error).__name__}: {error}"
-        lines.write({"kind": "error", "type": "unexpected", "message": message})
+        cause = "".join(traceback.format_exception(error)).splitlines()[-MAX_CAUSE_LINES:]
+        lines.write({"kind": "error", "type": kind, "message": message, "cause": cause})
         return EXIT_UNEXPECTED
     lines.write({"kind": "done"})
     return 0
+
+
+def _cause(error: BaseException) -> list[str]:
+    """What an error came from, a line each."""
+    found: list[str] = []
+    while len(found) < MAX_CAUSE_LINES:
+        inner = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+        if inner is None:
+            break
+        found.append(f"Caused by {type(inner).__name__}: {' '.join(str(inner).split())[:2000]}")
+        error = inner
+    return found
 
 
 def _watch_stdin(stop: threading.Event) -> None:

@@ -30,8 +30,8 @@ from workers.records.workers import forget_lost_workers, forget_worker, see_work
 from workers.settings import WorkerSettings
 from workers.store.errors import StorageError
 from workers.store.opening import open_storage
-from workers.store.room import Room
-from workers.upkeep.collecting import collect
+from workers.store.room import LEAST_BYTES, Room
+from workers.upkeep.collecting import collect, collect_at_once
 from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries
 from workers.upkeep.webhooks.outbox import forget_old
 from workers.upkeep.webhooks.sending import send_due
@@ -46,6 +46,9 @@ STORE_SWEEP_SECONDS = 3600.0
 ABANDONED_SECONDS = 86_400.0
 ROOM_SECONDS = 60.0
 """How long a worker without room keeps a job from others that may have some."""
+ROOM_LOOK_SECONDS = 5.0
+CRAMPED_SECONDS = 300.0
+"""A job that met a full disk is tried again after this time, or as soon as there is more room."""
 EXIT_LOST_DATABASE = 69
 
 
@@ -115,6 +118,7 @@ class _Worker:
         self._id = new_id()
         self._lost = False
         self._told_of_room = False
+        self._cramped: dict[uuid.UUID, tuple[int, float]] = {}
 
     async def run(self) -> int:
         loop = asyncio.get_running_loop()
@@ -130,6 +134,7 @@ class _Worker:
             asyncio.create_task(self._regularly(settings.poll_seconds, self._send_webhooks)),
             asyncio.create_task(self._regularly(SWEEP_SECONDS, self._forget)),
             asyncio.create_task(self._regularly(settings.collect_seconds, self._collect)),
+            asyncio.create_task(self._regularly(ROOM_LOOK_SECONDS, self._keep_room)),
         ]
         takers = [
             asyncio.create_task(self._around.slips.work(queue, slots, self._deliver))
@@ -166,27 +171,31 @@ class _Worker:
         if self._around.leaving.is_set():
             await self._refuse(job_id, slip)
             return
-        if not await self._room_comes():
+        if not await self._room_comes(job_id):
             await self._refuse(job_id, slip)
             return
         since = time.monotonic()
         attempt = await claim(self._pool, job_id, slip, self._name)
         if attempt is None:
             return
+        supervisor = Supervisor(attempt, self._around, since)
         try:
-            await Supervisor(attempt, self._around, since).run()
+            await supervisor.run()
         except LostDatabase as error:
             logger.warning("job %s was let go: %s", job_id, error)
             self._lost = True
             self._around.slips.stop()
+        if supervisor.lacked_room:
+            self._cramped[job_id] = await self._around.free_bytes(), time.monotonic()
 
-    async def _room_comes(self) -> bool:
+    async def _room_comes(self, job_id: uuid.UUID) -> bool:
         """Wait a while for room where there is none; jobs stay queued meanwhile."""
         deadline = time.monotonic() + ROOM_SECONDS
-        while (lacking := await self._around.lacking_room()) is not None:
+        while (lacking := await self._lacking_room(job_id)) is not None:
             if not self._told_of_room:
                 logger.warning("worker %s takes no jobs: %s", self._name, lacking)
             self._told_of_room = True
+            await self._make_room()
             if time.monotonic() > deadline or self._around.leaving.is_set():
                 return False
             await asyncio.sleep(self._settings.poll_seconds)
@@ -194,6 +203,30 @@ class _Worker:
             logger.info("worker %s has room again", self._name)
         self._told_of_room = False
         return True
+
+    async def _lacking_room(self, job_id: uuid.UUID) -> str | None:
+        """What lacks room for a job, in a sentence, or None."""
+        if (lacking := await self._around.lacking_room()) is not None:
+            return lacking
+        if job_id in self._cramped:
+            left_bytes, at = self._cramped[job_id]
+            more = await self._around.free_bytes() > 1.05 * max(0, left_bytes) + LEAST_BYTES
+            if not more and time.monotonic() - at < CRAMPED_SECONDS:
+                return f"A disk was full when the job was tried, and {left_bytes} bytes were left after it."
+            del self._cramped[job_id]
+        return None
+
+    async def _keep_room(self) -> None:
+        if await self._around.lacking_room() is not None:
+            await self._make_room()
+
+    async def _make_room(self) -> None:
+        """Remove what nobody names, and photographs that can be had from the store again."""
+        try:
+            await asyncio.to_thread(sweep_workspaces, self._settings.work_folder, 0.0)
+            await collect_at_once(self._pool, self._around.storage)
+        except (StorageError, *DATABASE_ERRORS) as error:
+            logger.info("unused contents were not collected: %s", error)
 
     async def _refuse(self, job_id: uuid.UUID, slip: int) -> None:
         """Leave a job to other workers whose slip came too late to this one."""

@@ -17,9 +17,11 @@ from engine.pipeline import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
 from workers.work.kinds.options import ExportJobOptions, ReconstructOptions, RenderJobOptions
+from workers.work.places import Places
 from workers.work.preview import Previews
 from workers.work.task import POSES, Task
 
+REPORT = "report.html"
 _MODEL_SUFFIXES = (".bin", ".txt")
 
 
@@ -169,6 +171,10 @@ def _has_model(scene: Path) -> bool:
     )
 
 
+def _places(task: Task) -> Places:
+    return Places(task.folder, task.scene.parents[2] if task.scene is not None else task.folder)
+
+
 def _publish(task: Task, path: Path, name: str) -> None:
     """Put a file among the results, without a copy."""
     target = task.results / name
@@ -177,7 +183,7 @@ def _publish(task: Task, path: Path, name: str) -> None:
     if name == CONFIG:  # where the photographs lay on this machine is nobody's business
         content = json.loads(path.read_text(encoding="utf-8"))
         write_json(target, {**content, "scene": task.title})
-    elif name == EVENTS:
-        shutil.copy2(path, target)
+    elif name in (EVENTS, REPORT):
+        target.write_text(_places(task).named(path.read_text(encoding="utf-8")), encoding="utf-8")
     else:
         os.link(path, target)

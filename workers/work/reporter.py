@@ -15,15 +15,24 @@ from typing import Any
 import psycopg
 from psycopg_pool import PoolTimeout
 
+from engine.events import Warned
+from workers.cli.progress import PlainLines
 from workers.queue.attempts import Attempt, Fenced
+from workers.queue.storing import storing
 from workers.store.errors import StorageError
+from workers.told_events import told_event
 from workers.work.task import RUN
 from workers.work.workspace import Checkpoint, Workspace
 
 logger = logging.getLogger(__name__)
 
 FLUSH_SECONDS = 0.5
-MAX_LOG_LINES = 20_000
+MAX_LOG_LINES = 15_000
+"""Lines of an attempt's libraries."""
+MAX_TOLD_LINES = 4_000
+"""Lines of an attempt on its stages, pace, warnings and errors."""
+PACE_SECONDS = 30.0
+"""How often the log says how far the job is."""
 _WAITING_LINES = 2_000
 _WAITING_EVENTS = 1_000
 _STORED_KINDS = ("stage_started", "stage_finished", "held_out_measured", "warning", "run_finished")
@@ -42,8 +51,10 @@ class Reporter:
         self._attempt = attempt
         self._workspace = workspace
         self._events: deque[tuple[str, dict[str, Any]]] = deque(maxlen=_WAITING_EVENTS)
-        self._lines: deque[str] = deque(maxlen=_WAITING_LINES)
+        self._lines: list[str] = []
         self._lines_seen = 0
+        self._lines_told = 0
+        self._pace = PlainLines(self.note, PACE_SECONDS)
         self._progress: dict[str, Any] | None = None
         self._stage = ""
         self._stages: tuple[str, ...] = ()
@@ -65,18 +76,34 @@ class Reporter:
     def resumed_from(self, checkpoint: Checkpoint) -> None:
         """Say what the attempt goes on from; only what is beyond it is progress."""
         self._kept = checkpoint
+        self.note(f"Goes on from step {checkpoint.step} of {checkpoint.stage}")
 
     def log(self, line: str) -> None:
-        """Take a line of the child's log."""
+        """Take a line that the child's libraries wrote."""
         self._lines_seen += 1
         if self._lines_seen <= MAX_LOG_LINES:
-            self._lines.append(line)
+            if len(self._lines) < _WAITING_LINES:
+                self._lines.append(line)
         elif self._lines_seen == MAX_LOG_LINES + 1:
             self._lines.append(f"(More than {MAX_LOG_LINES} lines; the rest is left out.)")
+
+    def note(self, line: str) -> None:
+        """Put a line into the log that is not lost among those of libraries."""
+        self._lines_told += 1
+        if self._lines_told <= MAX_TOLD_LINES:
+            self._lines.append(line)
 
     def hear(self, event: dict[str, Any]) -> None:
         """Take an event of the child."""
         kind = event["kind"]
+        told = told_event(kind, event)
+        if isinstance(told, Warned):
+            self.note(f"Warning: {told.message}")
+        elif told is not None:
+            self._pace(told)
+        elif kind == "error":
+            for line in event.get("cause", ()):
+                self.note(str(line))
         if kind == "stage_started":
             self._stage, self._stage_began, self._first_step = event["stage"], time.monotonic(), None
             self._steps = int(event["total_steps"])
@@ -103,8 +130,6 @@ class Reporter:
         elif kind == "preview_written":
             self._preview = event
             self._wake.set()
-        if kind == "warning":
-            self.log(f"Warning: {event['message']}")
         if kind in _STORED_KINDS:
             self._events.append((kind, {key: value for key, value in event.items() if key != "kind"}))
 
@@ -158,7 +183,7 @@ class Reporter:
     async def _flush(self) -> None:
         progress, self._progress = self._progress, None
         events, self._events = tuple(self._events), deque(maxlen=_WAITING_EVENTS)
-        lines, self._lines = tuple(self._lines), deque(maxlen=_WAITING_LINES)
+        lines, self._lines = tuple(self._lines), []
         for kind, data in events:
             await self._attempt.tell(kind, data)
         if progress is not None:
@@ -183,20 +208,23 @@ class Reporter:
             if wanted is not None:
                 await self._keep_checkpoint(*wanted)
             if preview is not None:
-                sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN}/{preview['path']}")
-                row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
-                await self._attempt.keep_preview(row)
+                async with storing(self._attempt.pool) as note:
+                    sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN}/{preview['path']}")
+                    row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
+                    await self._attempt.keep_preview(row, note)
         except asyncio.CancelledError:
             self._wanted, self._preview = self._wanted or wanted, self._preview or preview
             raise
         except (StorageError, *_IGNORED) as error:
             logger.warning("checkpoint of job %s was not stored: %s", self._attempt.job.id, error)
-            self.log(f"A checkpoint could not be stored: {error}")
+            self.note(f"Warning: a checkpoint could not be stored: {error}")
             self._wanted = self._wanted or wanted
 
     async def _keep_checkpoint(self, stage: str, step: int) -> None:
-        checkpoint = await asyncio.to_thread(self._workspace.keep, stage, step)
-        if checkpoint is not None:
+        async with storing(self._attempt.pool) as note:
+            checkpoint = await asyncio.to_thread(self._workspace.keep, stage, step)
+            if checkpoint is None:
+                return
             advances = checkpoint.is_beyond(self._kept)
-            await self._attempt.keep_checkpoint(checkpoint.as_row(), advances=advances)
+            await self._attempt.keep_checkpoint(checkpoint.as_row(), advances=advances, note=note)
             self._kept = checkpoint

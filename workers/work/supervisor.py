@@ -1,31 +1,34 @@
 """One attempt at a job: the child at work, the heartbeat beside it, and a verdict at the end."""
 
 import asyncio
-import contextlib
 import logging
 import math
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 from engine.errors import OctasplatError
 from workers.queue.attempts import MAX_RESCUES, Attempt, Fenced, Result
 from workers.queue.jobs import artifacts_of
 from workers.queue.port import Slips
+from workers.queue.storing import Note, storing
 from workers.records.datasets import files_of, get_dataset
 from workers.settings import WorkerSettings
 from workers.store.errors import BlobMissing, DigestMismatch, StorageError
+from workers.store.os_errors import lacks_room
 from workers.store.protocol import Storage
 from workers.store.room import Room
 from workers.work.child_process import ChildProcess
 from workers.work.contact import DATABASE_ERRORS, Contact
 from workers.work.kinds import JobKind, kind_named
+from workers.work.places import Places, shown_in
 from workers.work.reporter import Reporter
-from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED
+from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE
 from workers.work.workspace import Checkpoint, Workspace
 
 logger = logging.getLogger(__name__)
@@ -68,6 +71,13 @@ class Surroundings:
         except StorageError as error:
             return str(error)
 
+    async def free_bytes(self) -> int:
+        """Room for jobs; 0 where that cannot be said."""
+        try:
+            return await asyncio.to_thread(self.room.free_bytes)
+        except StorageError:
+            return 0
+
 
 class Supervisor:
     """Runs one attempt.
@@ -76,15 +86,21 @@ class Supervisor:
         attempt: the claimed job.
         around: the worker.
         since: when the claim was asked for, by ``time.monotonic()``.
+
+    Attributes:
+        lacked_room: whether the job was handed back because a disk was full.
     """
 
     def __init__(self, attempt: Attempt, around: Surroundings, since: float) -> None:
-        self._attempt = attempt
+        self._workspace = Workspace(around.settings.work_folder, attempt.job, around.storage)
+        others = (Path(around.settings.storage_address), around.settings.data)
+        places = Places(self._workspace.folder, around.settings.work_folder, others)
+        self._attempt = attempt = replace(attempt, shown=lambda value: shown_in(value, places))
         self._around = around
         self._settings = around.settings
         self._job = attempt.job
-        self._workspace = Workspace(around.settings.work_folder, attempt.job, around.storage)
         self._reporter = Reporter(attempt, self._workspace)
+        self.lacked_room = False
         self._child: ChildProcess | None = None
         self._end: End | None = None
         self._kill_at = math.inf
@@ -175,14 +191,14 @@ class Supervisor:
             await asyncio.to_thread(self._workspace.restore, checkpoint)
         except (BlobMissing, DigestMismatch) as error:
             await asyncio.to_thread(self._workspace.discard_run)
-            self._reporter.log(f"The checkpoint cannot be used, so the job begins anew: {error}")
+            self._reporter.note(f"Warning: the checkpoint cannot be used, so the job begins anew: {error}")
             return
         self._reporter.resumed_from(checkpoint)
         data = {"stage": checkpoint.stage, "step": checkpoint.step, "attempt": checkpoint.attempt}
         await self._attempt.tell("resumed", data)
 
     async def _give_up_preparing(self, error: OctasplatError) -> None:
-        described = {"type": type(error).__name__, "message": str(error)}
+        described = _described(error)
         if isinstance(error, StorageError) and not isinstance(error, BlobMissing | DigestMismatch):
             await self._let_go(described)
         else:
@@ -190,38 +206,68 @@ class Supervisor:
 
     async def _publish(self) -> None:
         try:
-            results = await asyncio.to_thread(self._workspace.publish)
+            results = await self._store_results()
         except StorageError as error:
-            described = {"type": type(error).__name__, "message": str(error)}
+            described = _described(error)
             await self._said(lambda: self._let_go(described))
             return
         await self._said(lambda: self._attempt.succeed(results))
 
+    async def _store_results(self) -> list[Result]:
+        """Store the results and publish their manifest, again and again while the job is surely ours."""
+        while True:
+            try:
+                async with storing(self._attempt.pool) as note:
+                    manifest = await asyncio.to_thread(self._workspace.store_results)
+                    async with self._attempt.pool.connection() as connection:
+                        await note.confirm(connection)
+                        return await asyncio.to_thread(self._workspace.publish, manifest)
+            except DATABASE_ERRORS as error:
+                if self._contact.is_lost:
+                    raise LostDatabase(str(error)) from error
+                await asyncio.sleep(self._settings.poll_seconds)
+
     async def _fail(self, error: dict[str, Any]) -> None:
         """End the job with what its program has finished."""
         try:
-            results = await asyncio.to_thread(self._workspace.store_results)
+            await self._with_partial_results(lambda results, note: self._attempt.fail(error, results, note))
         except StorageError as storage_error:
-            described = {"type": type(storage_error).__name__, "message": str(storage_error)}
+            described = _described(storage_error)
             await self._said(lambda: self._let_go(described))
-            return
-        await self._said(lambda: self._attempt.fail(error, results))
 
     async def _lose(self, error: dict[str, Any]) -> None:
         """Let go of the job, which may end it: then with what its program has finished."""
-        results: list[Result] = []
         if self._job.rescues >= MAX_RESCUES:
-            with contextlib.suppress(StorageError):
-                results = await asyncio.to_thread(self._workspace.store_results)
-        await self._said(lambda: self._let_go(error, results))
+            try:
+                await self._with_partial_results(lambda results, note: self._let_go(error, results, note))
+                return
+            except StorageError as storage_error:
+                logger.warning("the results there are could not be stored: %s", storage_error)
+        await self._said(lambda: self._let_go(error))
 
-    async def _let_go(self, error: dict[str, Any], results: Sequence[Result] = ()) -> None:
+    async def _with_partial_results(self, say: Callable[[list[Result], Note], Awaitable[None]]) -> None:
+        """Store what a program has finished and say so, again and again while the job is surely ours."""
+        while True:
+            try:
+                async with storing(self._attempt.pool) as note:
+                    results = await asyncio.to_thread(self._workspace.store_partial_results)
+                    await say(results, note)
+                    return
+            except DATABASE_ERRORS as error:
+                if self._contact.is_lost:
+                    raise LostDatabase(str(error)) from error
+                await asyncio.sleep(self._settings.poll_seconds)
+
+    async def _let_go(
+        self, error: dict[str, Any], results: Sequence[Result] = (), note: Note | None = None
+    ) -> None:
         """Put the job back for a reason that may pass; where room is lacking, that is no fault of the job."""
         lacking = await self._around.lacking_room()
-        if lacking is None:
-            await self._attempt.lose(self._around.slips, error, results)
+        if lacking is None and error["type"] != NO_SPACE:
+            await self._attempt.lose(self._around.slips, error, results, note)
         else:
-            await self._attempt.hand_back(self._around.slips, f"{error['message']} {lacking}")
+            self.lacked_room = True
+            await self._attempt.hand_back(self._around.slips, f"{error['message']} {lacking or ''}".strip())
 
     async def _after_stop(self, end: End) -> None:
         if end is End.FENCED:
@@ -248,7 +294,7 @@ class Supervisor:
         if code in (EXIT_REFUSED, EXIT_UNEXPECTED) and child.error is not None:
             error = child.error
             # What fails on a full disk may well succeed on another.
-            if await self._around.lacking_room() is not None:
+            if error["type"] == NO_SPACE or await self._around.lacking_room() is not None:
                 await self._said(lambda: self._let_go(error))
             else:
                 await self._fail(error)
@@ -340,3 +386,7 @@ class Supervisor:
                 if self._contact.is_lost:
                     raise LostDatabase(str(error)) from error
                 await asyncio.sleep(self._settings.poll_seconds)
+
+
+def _described(error: OctasplatError) -> dict[str, Any]:
+    return {"type": NO_SPACE if lacks_room(error) else type(error).__name__, "message": str(error)}

@@ -10,6 +10,8 @@ from engine.events import Listener, ignore
 RUN, POSES, RESULTS, SCENE = "run", "poses", "results", "scene"
 """Folders of an attempt: the engine's output, found poses, what is to be published, the photographs."""
 
+NO_SPACE = "no_space"
+"""Type of the error of a job that met a full disk, which is no fault of its own."""
 EXIT_REFUSED = 1
 """The job cannot be done and another try would end the same way; the last line says why."""
 EXIT_UNEXPECTED = 70

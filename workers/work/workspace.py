@@ -76,6 +76,7 @@ class Workspace:
         self._storage = storage
         self.folder = root / "attempts" / f"{job.id}.{job.attempt}"
         self._lock: IO[bytes] | None = None
+        self._dataset_lock: IO[bytes] | None = None
 
     def open(self) -> None:
         """Make the folder, anew if there is one of that name."""
@@ -89,10 +90,14 @@ class Workspace:
         if self._lock is not None:
             self._lock.close()
             self._lock = None
+        if self._dataset_lock is not None:
+            self._dataset_lock.close()
+            self._dataset_lock = None
 
     def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
         """A folder with the photographs for all attempts on this machine; its files must not be changed."""
         folder = self._root / "datasets" / str(dataset_id)
+        self._dataset_lock = _held(folder)
         place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
         if not place.exists():
             partial = folder / f".{uuid.uuid4().hex}.partial"
@@ -150,18 +155,21 @@ class Workspace:
             return Checkpoint(self._job.attempt, stage, step, files)
         return None
 
-    def publish(self) -> list[Result]:
-        """Store the results and publish their manifest; the job's row makes them visible."""
-        manifest = store_tree(
+    def store_results(self) -> Manifest:
+        """Store the results, which belong to nothing yet."""
+        return store_tree(
             self._storage,
             self.folder / RESULTS,
             about={"job": str(self._job.id), "attempt": self._job.attempt, "kind": self._job.kind},
         )
+
+    def publish(self, manifest: Manifest) -> list[Result]:
+        """Publish the manifest of the stored results; the job's row makes them visible."""
         if not publish_manifest(self._storage, _document(self._job, self._job.attempt), manifest):
             raise StorageError("Another result was published for this attempt; ask for a retry.")
         return _results(manifest)
 
-    def store_results(self) -> list[Result]:
+    def store_partial_results(self) -> list[Result]:
         """Store what results there are of a program that failed; its job's row shows them, nothing else."""
         folder = self.folder / RESULTS
         return _results(store_tree(self._storage, folder)) if folder.is_dir() else []
@@ -198,6 +206,10 @@ class Workspace:
 def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
     """Remove the folders of attempts whose worker is gone, and photographs not used for a while.
 
+    Args:
+        root: folder of all work on this machine.
+        dataset_seconds: how long photographs stay that no attempt uses.
+
     Returns:
         Number of folders removed.
     """
@@ -216,8 +228,12 @@ def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
                 shutil.rmtree(folder, ignore_errors=True)
         removed += 1
     for folder in (root / "datasets").glob("*"):
-        if time.time() - folder.stat().st_mtime > dataset_seconds:
-            shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):  # in use, or gone already
+            if time.time() - folder.stat().st_mtime < dataset_seconds:
+                continue
+            with (folder / _LOCK).open("ab") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
             removed += 1
     return removed
 
@@ -239,3 +255,16 @@ def _locked(path: Path, *, create: bool = True) -> IO[bytes]:
         handle.close()
         raise
     return handle
+
+
+def _held(folder: Path) -> IO[bytes]:
+    """Make a folder of photographs and keep it from being swept for as long as the file is open."""
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # swept this moment
+            handle = (folder / _LOCK).open("ab")
+            fcntl.flock(handle, fcntl.LOCK_SH)
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(handle.fileno()), (folder / _LOCK).stat()):
+                    return handle
+            handle.close()

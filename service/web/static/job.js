@@ -131,7 +131,7 @@ async function followLog() {
                 const page = await response.json();
                 after = page.next;
                 const atEnd = log.scrollTop + log.clientHeight >= log.scrollHeight - 30;
-                log.append(...page.lines.map(({ text }) => document.createTextNode(`${text}\n`)));
+                log.append(...page.lines.map(({ text, at }) => document.createTextNode(`${new Date(at).toLocaleTimeString("en-GB")}  ${text}\n`)));
                 while (log.childNodes.length > MAX_LINES) log.firstChild.remove();
                 if (page.lines.length && atEnd) log.scrollTop = log.scrollHeight;
                 if (page.lines.length === 2000) continue;

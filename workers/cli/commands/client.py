@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -134,7 +135,7 @@ def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bo
 @click.option("-f", "--follow", is_flag=True, help="Go on until the job is over.")
 @server_option
 def logs(job_id: str, follow: bool, server: str | None) -> None:
-    """Show what the program of JOB wrote."""
+    """Show what JOB did when, and what its program wrote; times are this machine's."""
     with connected(server) as api:
         job = _job(api, job_id)
         after = 0
@@ -142,7 +143,7 @@ def logs(job_id: str, follow: bool, server: str | None) -> None:
             over = job["state"] in ("succeeded", "failed", "canceled")
             page = api.get(f"/v1/jobs/{job['id']}/logs", after=after)
             for line in page["lines"]:
-                click.echo(line["text"])
+                click.echo(f"{_clock(line['at'])}  {line['text']}")
             after = page["next"]
             if page["lines"]:
                 continue
@@ -238,6 +239,11 @@ def _job(api: "Api", job_id: str) -> dict[str, Any]:
         raise ConfigError("There are no jobs.")
     first: dict[str, Any] = newest[0]
     return first
+
+
+def _clock(at: str) -> str:
+    """A time of the service as this machine's clock shows it."""
+    return datetime.fromisoformat(at).astimezone().strftime("%H:%M:%S")
 
 
 def _where(job: dict[str, Any]) -> str:

@@ -1,0 +1,170 @@
+"""What is deleted makes room at once where room is short, and nothing goes that somebody is about to name."""
+
+import asyncio
+import hashlib
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+from service_bench import running
+from small_disk import small_disk
+
+sys.path.append(str(Path(__file__).parents[1] / "intake"))
+from model_builder import photograph
+from zip_builder import Member, build
+
+from service.state import Service
+from workers.store.errors import StorageUnavailable
+from workers.upkeep import collecting, storing
+from workers.upkeep.collecting import collect_at_once
+
+MIB = 1 << 20
+PATIENCE_SECONDS = 60.0
+
+
+def picture(size_bytes: int, name: str) -> bytes:
+    """A PNG with so much behind its end."""
+    return photograph() + (hashlib.sha256(name.encode()).digest() * (size_bytes // 32))
+
+
+def held(service: Service) -> set[str]:
+    return {entry.blob.sha256 for entry in service.storage.blobs()}
+
+
+async def new_dataset(http: httpx.AsyncClient) -> str:
+    return str((await http.post("/v1/datasets", json={"name": "d"})).headers["Location"])
+
+
+async def until_taken(http: httpx.AsyncClient, address: str, content: bytes) -> None:
+    """Send a file as a client does, again while the answer is that there is no room."""
+    deadline = time.monotonic() + PATIENCE_SECONDS
+    while (answer := await http.put(address, content=content)).status_code == 507:
+        assert time.monotonic() < deadline, answer.text
+        await asyncio.sleep(0.5)
+    assert answer.status_code == 201, answer.text
+
+
+def test_deleting_makes_room_for_the_next_upload(conninfo: str, tmp_path: Path) -> None:
+    async def story(folder: Path) -> None:
+        async with running(conninfo, tmp_path, storage=str(folder / "store")) as (http, service):
+            first, second, third = [await new_dataset(http) for _ in range(3)]
+            files = {name: picture(6 * MIB, name) for name in ("a", "b", "c")}
+            for dataset, name in ((first, "a"), (second, "b")):
+                answer = await http.put(f"{dataset}/files/images/{name}.png", content=files[name])
+                assert answer.status_code == 201, answer.text
+            answer = await http.put(f"{third}/files/images/c.png", content=files["c"])
+            problem = answer.json()
+            assert (answer.status_code, problem["type"]) == (507, "urn:octasplat:problem:storage-full")
+            assert "delete datasets or jobs, whose contents then go at once" in problem["detail"]
+            assert (await http.delete(first)).status_code == 204
+            await until_taken(http, f"{third}/files/images/c.png", files["c"])
+            assert held(service) == {hashlib.sha256(files[name]).hexdigest() for name in ("b", "c")}
+
+    with small_disk(tmp_path / "disk", 16) as folder:
+        asyncio.run(story(folder))
+
+
+def test_deleting_empties_a_disk_below_its_floor(conninfo: str, tmp_path: Path) -> None:
+    """Nobody uploads anything, and what an archive that broke off has left goes as well."""
+
+    async def story(folder: Path) -> None:
+        settings = {"storage": str(folder / "store"), "floor_bytes": 4 * MIB}
+        async with running(conninfo, tmp_path, **settings) as (http, service):
+            dataset = await new_dataset(http)
+            for name in ("a", "b"):
+                address = f"{dataset}/files/images/{name}.png"
+                assert (await http.put(address, content=picture(5 * MIB, name))).status_code == 201
+            with service.storage.begin() as writer:
+                writer.write(b"named by nobody")
+                writer.commit()
+            await asyncio.sleep(collecting._SETTLED_SECONDS + collecting.AT_ONCE_SECONDS)
+            assert (await http.delete(f"{dataset}/files/images/a.png")).status_code == 204
+            deadline = time.monotonic() + PATIENCE_SECONDS
+            while len(held(service)) > 1:
+                assert time.monotonic() < deadline
+                await asyncio.sleep(0.1)
+            assert (await http.get(f"{dataset}/files/images/b.png")).content == picture(5 * MIB, "b")
+
+    with small_disk(tmp_path / "disk", 16) as folder:
+        asyncio.run(story(folder))
+
+
+@pytest.fixture
+def sharp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the margins that would hide a race; the clocks here are one."""
+    monkeypatch.setattr(collecting, "_SETTLED_SECONDS", 0.0)
+    monkeypatch.setattr(collecting, "CLOCK_SECONDS", 0.05)  # file times have the resolution of a tick
+
+
+def test_nothing_goes_that_an_upload_is_about_to_name(conninfo: str, tmp_path: Path, sharp: None) -> None:
+    """Archives with the same contents, again and again, while others delete them and all is collected."""
+    contents = {f"images/{n}.png": picture(2000, str(n)) for n in range(12)}
+    archive = build(*(Member(name, content) for name, content in contents.items()))
+
+    async def upload(http: httpx.AsyncClient, over: asyncio.Event) -> int:
+        count = 0
+        while not over.is_set():
+            dataset = await new_dataset(http)
+            assert (await http.put(f"{dataset}/archive", content=archive)).status_code == 200
+            for name in list(contents)[:2]:
+                answer = await http.get(f"{dataset}/files/{name}")
+                assert answer.status_code == 200 and answer.content == contents[name], answer.text
+            assert (await http.delete(dataset)).status_code == 204
+            count += 1
+        return count
+
+    async def story() -> None:
+        async with running(conninfo, tmp_path) as (http, service):
+            over = asyncio.Event()
+            uploads = [asyncio.create_task(upload(http, over)) for _ in range(3)]
+            removed = 0
+            deadline = time.monotonic() + PATIENCE_SECONDS
+            while removed < 20 and time.monotonic() < deadline:
+                found = await collect_at_once(service.pool, service.storage, every_seconds=0.0)
+                removed += found.blobs if found is not None else 0
+                if any(task.done() for task in uploads):
+                    break
+            over.set()
+            assert min(await asyncio.gather(*uploads)) > 0 and removed >= 20
+            await collect_at_once(service.pool, service.storage, every_seconds=0.0)
+            async with service.pool.connection() as connection:
+                assert await storing.oldest_note(connection) is None
+
+    asyncio.run(story())
+
+
+def test_what_is_stored_under_a_note_stays_and_a_note_given_up_names_nothing(
+    conninfo: str, tmp_path: Path, sharp: None
+) -> None:
+    def store(service: Service, content: bytes) -> str:
+        with service.storage.begin() as writer:
+            writer.write(content)
+            return writer.commit().sha256
+
+    async def story() -> None:
+        async with running(conninfo, tmp_path) as (_, service):
+            pool, storage = service.pool, service.storage
+            old = store(service, b"stored before and named by nobody")
+            await asyncio.sleep(0.2)
+            async with storing.storing(pool):
+                young = store(service, b"about to be named")
+                removed = await collect_at_once(pool, storage, every_seconds=0.0)
+                assert removed is not None and held(service) == {young} and old not in held(service)
+            async with storing.storing(pool) as note:
+                store(service, b"about to be named")
+                async with pool.connection() as connection:
+                    await connection.execute("UPDATE storing SET seen_at = now() - interval '1 hour'")
+                # A note that is being confirmed is not given up, however old.
+                async with pool.connection() as connection:
+                    await note.confirm(connection)
+                    await collect_at_once(pool, storage, every_seconds=0.0)
+                    assert held(service) == {young}
+                await collect_at_once(pool, storage, every_seconds=0.0)
+                assert not held(service)
+                async with pool.connection() as connection:
+                    with pytest.raises(StorageUnavailable, match="silent for too long"):
+                        await note.confirm(connection)
+
+    asyncio.run(story())

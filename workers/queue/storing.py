@@ -1,0 +1,100 @@
+"""Notes of who stores contents and will name them in a table only afterwards, so that nobody collects them.
+
+A note is there before the first byte is stored. Whoever names the contents confirms it in the same
+transaction, which fails if the note was given up: that of a process that was silent for long counts no more.
+"""
+
+import asyncio
+import contextlib
+import logging
+import uuid
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from datetime import datetime
+
+import psycopg
+from psycopg_pool import PoolTimeout
+
+from workers.records.database import Connection, Pool
+from workers.records.ids import new_id
+from workers.store.errors import StorageUnavailable
+
+logger = logging.getLogger(__name__)
+
+SEEN_SECONDS = 10.0
+"""How often whoever stores says that it still does."""
+SILENT_SECONDS = 120.0
+"""A note of which nothing was heard for so long is given up."""
+_UNREACHABLE = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, TimeoutError, OSError)
+
+
+@dataclass(frozen=True)
+class Note:
+    """Says that something is being stored."""
+
+    id: uuid.UUID
+
+    async def confirm(self, connection: Connection) -> None:
+        """Make sure that nothing stored meanwhile is collected before the transaction of ``connection`` ends.
+
+        Raises:
+            StorageUnavailable: the note was given up, so some of it may be gone.
+        """
+        cursor = await connection.execute("SELECT id FROM storing WHERE id = %s FOR KEY SHARE", [self.id])
+        if await cursor.fetchone() is None:
+            raise StorageUnavailable(
+                "Whoever stored this was silent for too long, so it may be gone; store it again."
+            )
+
+
+@asynccontextmanager
+async def storing(pool: Pool) -> AsyncIterator[Note]:
+    """A note for as long as the block runs, in which contents are stored and then named."""
+    note = Note(new_id())
+    async with pool.connection() as connection:
+        await connection.execute("INSERT INTO storing (id) VALUES (%s)", [note.id])
+    seen = asyncio.create_task(_say_so(pool, note))
+    try:
+        yield note
+    finally:
+        seen.cancel()
+        await asyncio.shield(_remove(pool, note))
+
+
+async def oldest_note(connection: Connection) -> datetime | None:
+    """When the oldest note in force was made; None if nobody stores anything."""
+    cursor = await connection.execute("SELECT min(began_at) AS began_at FROM storing")
+    row = await cursor.fetchone()
+    return row["began_at"] if row is not None else None
+
+
+async def give_up_silent(connection: Connection) -> None:
+    """Give up the notes of processes that are gone; one that is being confirmed stays."""
+    await connection.execute(
+        """
+        DELETE FROM storing WHERE id IN (
+            SELECT id FROM storing WHERE seen_at < clock_timestamp() - make_interval(secs => %s)
+            FOR UPDATE SKIP LOCKED
+        )
+        """,
+        [SILENT_SECONDS],
+    )
+
+
+async def _say_so(pool: Pool, note: Note) -> None:
+    while True:
+        await asyncio.sleep(SEEN_SECONDS)
+        with contextlib.suppress(*_UNREACHABLE):
+            async with pool.connection() as connection:
+                await connection.execute(
+                    "UPDATE storing SET seen_at = clock_timestamp() WHERE id = %s", [note.id]
+                )
+
+
+async def _remove(pool: Pool, note: Note) -> None:
+    try:
+        async with pool.connection() as connection:
+            await connection.execute("DELETE FROM storing WHERE id = %s", [note.id])
+    except _UNREACHABLE as error:
+        logger.info("a note of what is stored stays for a while: %s", error)

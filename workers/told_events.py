@@ -1,0 +1,38 @@
+"""The engine's events again, from the kind and the data with which they are told and kept."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from engine.events import (
+    Event,
+    HeldOutMeasured,
+    StageFinished,
+    StageProgress,
+    StageStarted,
+    TrainingProgress,
+    Warned,
+)
+
+_KINDS: dict[str, type[Event]] = {
+    kind.kind: kind
+    for kind in (StageStarted, StageProgress, StageFinished, TrainingProgress, HeldOutMeasured, Warned)
+}
+
+TOLD_KINDS = frozenset({"progress", *_KINDS})
+
+
+def told_event(kind: str, data: Mapping[str, Any]) -> Event | None:
+    """The event; None if it is none of the engine's, or of another version.
+
+    Args:
+        kind: of the event; ``progress`` stands for that of the training and that of any other stage.
+        data: its fields, and perhaps others.
+    """
+    if kind == "progress":
+        kind = TrainingProgress.kind if "iteration" in data else StageProgress.kind
+    model = _KINDS.get(kind)
+    if model is None:
+        return None
+    names = {field.name for field in fields(model)}
+    return model(**{name: data[name] for name in names}) if names <= data.keys() else None
