@@ -3,31 +3,15 @@
 import json
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from typing import Any
 
 import httpx
 
-from engine.events import (
-    Event,
-    HeldOutMeasured,
-    Listener,
-    StageFinished,
-    StageProgress,
-    StageStarted,
-    TrainingProgress,
-    Warned,
-)
+from engine.events import Listener, StageProgress, TrainingProgress, event_from
 from workers.client.api import Api, check_stream
 
 TERMINAL = frozenset({"succeeded", "failed", "canceled"})
 _PATIENCE_SECONDS = 120.0
-_KINDS: dict[str, type[Event]] = {
-    "stage_started": StageStarted,
-    "stage_finished": StageFinished,
-    "held_out_measured": HeldOutMeasured,
-    "warning": Warned,
-}
 
 
 def watch_job(
@@ -94,12 +78,10 @@ def _events(api: Api, job_id: str, last: str) -> Iterator[tuple[str, dict[str, A
 def _tell(
     kind: str, data: dict[str, Any], listener: Listener, on_state: Callable[[dict[str, Any]], None]
 ) -> None:
-    model: type[Event] | None = _KINDS.get(kind)
     if kind == "progress":
-        model = TrainingProgress if "iteration" in data else StageProgress
-    if model is None:
+        kind = (TrainingProgress if "iteration" in data else StageProgress).kind
+    event = event_from(kind, data)
+    if event is not None:
+        listener(event)
+    else:
         on_state({"kind": kind, **data})
-        return
-    names = {field.name for field in fields(model)}
-    if names <= data.keys():
-        listener(model(**{name: data[name] for name in names}))
