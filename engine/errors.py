@@ -9,6 +9,10 @@ class DatasetError(OctasplatError):
     """The photographs, masks or the COLMAP model cannot be used."""
 
 
+class PosesCrashed(OctasplatError):
+    """COLMAP died while it looked for poses."""
+
+
 class SceneFileError(OctasplatError):
     """A file of Gaussians or of a mesh cannot be read or written."""
 

@@ -6,11 +6,11 @@ neither torch nor numba, so that a front end can use it.
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import IO, ClassVar
+from typing import IO, Any, ClassVar
 
 from engine.errors import Cancelled
 from engine.files import telling_of_room
@@ -108,7 +108,29 @@ class RunFinished(Event):
     seconds: float
 
 
+EVENT_KINDS: dict[str, type[Event]] = {
+    event.kind: event
+    for event in (
+        StageStarted,
+        StageProgress,
+        StageFinished,
+        TrainingProgress,
+        HeldOutMeasured,
+        CheckpointWritten,
+        Warned,
+    )
+}
+
 Listener = Callable[[Event], None]
+
+
+def event_from(kind: str, content: Mapping[str, Any]) -> Event | None:
+    """The event that was written as JSON; None if there is no such kind, or it lacks something."""
+    model = EVENT_KINDS.get(kind)
+    names = {field.name for field in fields(model)} if model is not None else set()
+    if model is None or not names <= content.keys():
+        return None
+    return model(**{name: content[name] for name in names})
 
 
 def ignore(_event: Event) -> None:

@@ -1,25 +1,11 @@
 """The engine's events again, from the kind and the data with which they are told and kept."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
-from engine.events import (
-    Event,
-    HeldOutMeasured,
-    StageFinished,
-    StageProgress,
-    StageStarted,
-    TrainingProgress,
-    Warned,
-)
+from engine.events import EVENT_KINDS, Event, StageProgress, TrainingProgress, event_from
 
-_KINDS: dict[str, type[Event]] = {
-    kind.kind: kind
-    for kind in (StageStarted, StageProgress, StageFinished, TrainingProgress, HeldOutMeasured, Warned)
-}
-
-TOLD_KINDS = frozenset({"progress", *_KINDS})
+TOLD_KINDS = frozenset({"progress", *EVENT_KINDS})
 
 
 def told_event(kind: str, data: Mapping[str, Any]) -> Event | None:
@@ -31,8 +17,4 @@ def told_event(kind: str, data: Mapping[str, Any]) -> Event | None:
     """
     if kind == "progress":
         kind = TrainingProgress.kind if "iteration" in data else StageProgress.kind
-    model = _KINDS.get(kind)
-    if model is None:
-        return None
-    names = {field.name for field in fields(model)}
-    return model(**{name: data[name] for name in names}) if names <= data.keys() else None
+    return event_from(kind, data)

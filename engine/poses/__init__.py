@@ -1,5 +1,6 @@
 """Poses for photographs that have none: features, matches, mapping by COLMAP, and checks of what came out."""
 
-from engine.poses.find import PosesConfig, find_poses
+from engine.poses.config import PosesConfig
+from engine.poses.find import find_poses
 
 __all__ = ["PosesConfig", "find_poses"]

@@ -1,0 +1,75 @@
+"""The process in which COLMAP works; see :mod:`engine.poses.find`, which starts it.
+
+Run as ``python -m engine.poses.child``. The first line of stdin is the request as JSON, its end means that
+nobody waits any more. Events go to stdout, one JSON object a line, and then ``done`` or ``error``.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import NoReturn
+
+from pydantic import BaseModel, ConfigDict
+
+from engine.errors import DatasetError
+from engine.events import Event
+from engine.poses.config import PosesConfig
+
+FOUND, FOUND_RECORD = "found", "found.json"
+"""Where the result is put, below the folder for the work."""
+
+
+class Request(BaseModel):
+    """What to search, and where to put it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    images: Path
+    names: tuple[str, ...]
+    work: Path
+    config: PosesConfig
+    threads: int
+
+
+def main() -> NoReturn:
+    """Search as asked and exit."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who waits
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # whatever libraries print goes to stderr
+    request = Request.model_validate_json(sys.stdin.readline())
+    threading.Thread(target=_end_with_stdin, daemon=True).start()
+
+    def write(line: dict[str, object]) -> None:
+        out.write(json.dumps(line) + "\n")
+        out.flush()
+
+    def tell(event: Event) -> None:
+        write(event.as_dict())
+
+    try:
+        from engine.poses.search import Search
+
+        search = Search(request.images, request.names, request.work, request.config, request.threads, tell)
+        search.run(request.work / FOUND, request.work / FOUND_RECORD)
+        write({"kind": "done"})
+    except DatasetError as error:
+        write({"kind": "error", "message": str(error)})
+    except (RuntimeError, ValueError, OSError, MemoryError) as error:  # COLMAP's, by way of its binding
+        text = " ".join(str(error).split())[:300].rstrip(".") or type(error).__name__
+        message = f"COLMAP cannot find poses for {request.images} ({text}); look at the photographs."
+        write({"kind": "error", "message": message})
+    # Not by way of the interpreter's clean-up, in which a library may hang or crash after all is done.
+    os._exit(0)
+
+
+def _end_with_stdin() -> None:
+    for _line in sys.stdin:
+        pass
+    os._exit(70)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""The settings of the search for poses, and the names that it goes by."""
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+FEATURES, MATCHES, STAGE = "features", "matches", "poses"
+"""The stages of the search."""
+MODEL = Path("sparse") / "0"
+"""Where the model is put, below the output folder."""
+RECORD = "poses.json"
+"""What was found, and for which photographs; beside the model."""
+MIN_PHOTOGRAPHS = 3
+
+
+class PosesConfig(BaseModel):
+    """How poses are found.
+
+    Attributes:
+        max_image_side_px: features are looked for at most at this size.
+        max_features: of a photograph; a second search takes twice as many, and fainter ones.
+        exhaustive_up_to: up to so many photographs every pair is matched; above, those that a quick look at
+            the largest features finds alike.
+        quick_features: of a photograph, for the quick look.
+        quick_matches: by which two photographs are alike.
+        partners: most photographs that one is matched with for being alike.
+        neighbours: by name on either side, which each photograph is matched with in any case.
+        again_below: share of placed photographs below which a large set, too, is searched a second time.
+        min_share: of the photographs that must get a pose.
+        max_reprojection_px: mean error above which the result is not trusted.
+        min_points: sparse points below which it is not either.
+        seed: of everything random.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_image_side_px: int = Field(1600, ge=64)
+    max_features: int = Field(4096, ge=256)
+    exhaustive_up_to: int = Field(40, ge=2)
+    quick_features: int = Field(511, ge=64)
+    quick_matches: int = Field(12, ge=1)
+    partners: int = Field(40, ge=2)
+    neighbours: int = Field(3, ge=0)
+    again_below: float = Field(0.9, ge=0, le=1)
+    min_share: float = Field(0.5, gt=0, le=1)
+    max_reprojection_px: float = Field(2.5, gt=0)
+    min_points: int = Field(100, ge=10)
+    seed: int = Field(0, ge=0)
+
+
+DEFAULT_CONFIG = PosesConfig()

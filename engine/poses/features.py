@@ -1,0 +1,202 @@
+"""Features of photographs and matches between them, by COLMAP, the same on any number of threads.
+
+COLMAP numbers photographs in the order in which its threads finish them, and draws a pair's random numbers
+from the generator of the thread that happens to take it: photographs are numbered beforehand, and every pair
+has the same seed. A call looks at a few photographs or pairs, and what is done is counted between calls; the
+database of a call that runs must not be opened by anybody else in the process, as closing any handle on an
+SQLite file gives up the locks of all.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pycolmap
+
+from engine.poses.config import PosesConfig
+from engine.poses.pairs import (
+    Pair,
+    all_pairs,
+    chosen_pairs,
+    in_batches,
+    largest_features,
+)
+
+Counted = Callable[[int], None]
+"""Told how many are done."""
+
+_PHOTOGRAPHS_AT_ONCE = 4
+_PAIRS_AT_ONCE = 64
+_QUICK_PAIRS_AT_ONCE = 2048
+_FEWEST_QUICK = 4
+_LESS_CLEAR_RATIO = 0.9
+"""A match may be so near in distance to the second best one; otherwise 0.8."""
+
+
+def find_features(
+    database: Path,
+    photographs: Path,
+    names: Sequence[str],
+    config: PosesConfig,
+    *,
+    thorough: bool,
+    one_camera: bool,
+    threads: int,
+    counted: Counted,
+) -> list[int]:
+    """Make the database and fill it with the features of every photograph.
+
+    Args:
+        database: does not exist yet.
+        photographs: folder.
+        names: of the photographs in it; the first gets the number 1 in the database.
+        config: settings.
+        thorough: twice as many features, and fainter ones.
+        one_camera: all photographs were taken with one lens.
+        threads: to use; -1 means all cores.
+        counted: hears of photographs.
+
+    Returns:
+        Number of features by photograph.
+    """
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = threads
+    options.max_image_size = config.max_image_side_px
+    options.use_gpu = False
+    options.sift.max_num_features = config.max_features * (2 if thorough else 1)
+    if thorough:
+        options.sift.peak_threshold /= 3
+    mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
+    pycolmap.Database.open(database).close()  # COLMAP wants it to exist
+    pycolmap.import_images(database, photographs, mode, list(names))
+    for start in range(0, len(names), _PHOTOGRAPHS_AT_ONCE):
+        some = list(names[start : start + _PHOTOGRAPHS_AT_ONCE])
+        pycolmap.extract_features(
+            database,
+            photographs,
+            image_names=some,
+            camera_mode=mode,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+        counted(start + len(some))
+    with pycolmap.Database.open(database) as found:
+        return [found.num_keypoints_for_image(number + 1) for number in range(len(names))]
+
+
+def match_pairs(
+    database: Path,
+    names: Sequence[str],
+    pairs: Sequence[Pair],
+    config: PosesConfig,
+    *,
+    thorough: bool,
+    threads: int,
+    counted: Counted,
+) -> None:
+    """Match the features of pairs, and keep what one geometry explains.
+
+    Args:
+        database: with features.
+        names: of the photographs, as they are numbered.
+        pairs: indices into ``names``.
+        config: settings.
+        thorough: take matches that are less clear.
+        threads: to use; -1 means all cores.
+        counted: hears of pairs.
+    """
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = threads
+    options.use_gpu = False
+    if thorough:
+        options.sift.max_ratio = _LESS_CLEAR_RATIO
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = config.seed
+    done = 0
+    for some in in_batches(pairs, _PAIRS_AT_ONCE):
+        _match(database, names, some, options, verification)
+        done += len(some)
+        counted(done)
+
+
+def quick_pairs(
+    database: Path, names: Sequence[str], config: PosesConfig, *, threads: int, counted: Counted
+) -> list[Pair]:
+    """Pairs worth matching, by a match of each photograph's largest features with everybody else's.
+
+    Args:
+        database: with features; is only read.
+        names: of the photographs, as they are numbered.
+        config: settings.
+        threads: to use; -1 means all cores.
+        counted: hears of pairs that are not alike.
+    """
+    small = database.with_name("quick.db")
+    _copy_largest_features(database, small, len(names), config.quick_features)
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = threads
+    options.use_gpu = False
+    options.skip_geometric_verification = True
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers = _FEWEST_QUICK
+    alike: dict[Pair, int] = {}
+    looked = unlike = 0
+    for some in in_batches(all_pairs(len(names)), _QUICK_PAIRS_AT_ONCE):
+        _match(small, names, some, options, verification)
+        with pycolmap.Database.open(small) as found:
+            ids, counts = found.read_num_matches()
+            found.clear_matches()
+        for pair_id, count in zip(ids, counts, strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            alike[first - 1, second - 1] = count
+        looked += len(some)
+        unlike = looked - sum(count >= config.quick_matches for count in alike.values())
+        counted(unlike)
+    small.unlink()
+    return chosen_pairs(
+        alike,
+        len(names),
+        least=config.quick_matches,
+        partners=config.partners,
+        neighbours=config.neighbours,
+    )
+
+
+def _match(
+    database: Path,
+    names: Sequence[str],
+    pairs: Sequence[Pair],
+    options: "pycolmap.FeatureMatchingOptions",
+    verification: "pycolmap.TwoViewGeometryOptions",
+) -> None:
+    listed = database.with_name("pairs.txt")
+    listed.write_text("\n".join(f"{names[a]} {names[b]}" for a, b in pairs), encoding="utf-8")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listed
+    pycolmap.match_image_pairs(
+        database,
+        matching_options=options,
+        pairing_options=pairing,
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _copy_largest_features(database: Path, small: Path, photographs: int, count: int) -> None:
+    with pycolmap.Database.open(database) as source, pycolmap.Database.open(small) as target:
+        for camera in source.read_all_cameras():
+            target.write_camera(camera, use_camera_id=True)
+        for rig in source.read_all_rigs():
+            target.write_rig(rig, use_rig_id=True)
+        for frame in source.read_all_frames():
+            target.write_frame(frame, use_frame_id=True)
+        for image in source.read_all_images():
+            target.write_image(image, use_image_id=True)
+        for number in range(1, photographs + 1):
+            if not source.exists_keypoints(number):
+                continue  # the photograph could not be read
+            keypoints = source.read_keypoints(number)
+            descriptors = source.read_descriptors(number)
+            kept = largest_features(keypoints, count)
+            descriptors.data = descriptors.data[kept]
+            target.write_keypoints(number, keypoints[kept])
+            target.write_descriptors(number, descriptors)

@@ -1,0 +1,60 @@
+"""Which pairs of photographs are worth matching."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+Pair = tuple[int, int]
+_TILE = 8
+
+
+def all_pairs(count: int) -> list[Pair]:
+    """Every pair of ``count`` photographs, the lower index first."""
+    return list(combinations(range(count), 2))
+
+
+def chosen_pairs(
+    alike: Mapping[Pair, int], count: int, *, least: int, partners: int, neighbours: int
+) -> list[Pair]:
+    """Pairs that have something in common, and neighbours by name.
+
+    The quick look is the preemptive matching of Wu, "Towards Linear-time Incremental Structure from Motion"
+    (3DV 2013): two photographs that share features share some of the largest ones.
+
+    Args:
+        alike: matches of the largest features, of pairs that have any.
+        count: photographs in all.
+        least: matches that make a pair worth it.
+        partners: most pairs of one photograph, the best ones; another's choice may add to them.
+        neighbours: in the order of names, on either side, in any case.
+    """
+    kept = {(a, b) for a, b in all_pairs(count) if b - a <= neighbours}
+    of: list[list[tuple[int, Pair]]] = [[] for _ in range(count)]
+    for pair, matches in alike.items():
+        if matches >= least:
+            for end in pair:
+                of[end].append((-matches, pair))
+    for found in of:
+        kept |= {pair for _, pair in sorted(found)[:partners]}
+    return sorted(kept)
+
+
+def in_batches(pairs: Iterable[Pair], size: int) -> list[tuple[Pair, ...]]:
+    """Pairs a few at a time, those of the same photographs together, which COLMAP prepares anew each time."""
+    ordered = sorted(pairs, key=lambda pair: (pair[0] // _TILE, pair[1] // _TILE, pair))
+    return [tuple(ordered[start : start + size]) for start in range(0, len(ordered), size)]
+
+
+def largest_features(keypoints: Float32[np.ndarray, "n 6"], count: int) -> Int64[np.ndarray, " k"]:
+    """Indices, in order, of the ``count`` features of the largest scale; columns as COLMAP's."""
+    area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+    kept: Int64[np.ndarray, " k"] = np.sort(np.argsort(-area, kind="stable")[:count])
+    return kept
+
+
+def pairs_with(some: Sequence[int], count: int, without: Iterable[Pair]) -> list[Pair]:
+    """Pairs of ``some`` photographs with any other, but for those in ``without``."""
+    wanted = {(min(a, b), max(a, b)) for a in some for b in range(count) if a != b}
+    return sorted(wanted - set(without))

@@ -1,0 +1,48 @@
+"""Which files of a folder are photographs to find poses for."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from engine.errors import DatasetError
+from engine.poses.config import MIN_PHOTOGRAPHS
+
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+
+
+def photograph_folder(scene: Path) -> Path:
+    """``images/`` of a scene, or the scene itself where it is a bare folder of photographs."""
+    return scene / "images" if (scene / "images").is_dir() else scene
+
+
+def photographs_in(folder: Path) -> list[str]:
+    """Names of the photographs that poses can be found for, relative to ``folder``.
+
+    Those in folders below count only where ``folder`` is called ``images``; below a bare folder there may be
+    anything, masks and results among it.
+
+    Raises:
+        DatasetError: there are fewer than three.
+    """
+    below = folder.rglob("*") if folder.name == "images" else folder.glob("*")
+    names = sorted(
+        path.relative_to(folder).as_posix()
+        for path in below
+        if path.suffix.lower() in _SUFFIXES and path.is_file() and not path.name.startswith(".")
+    )
+    if len(names) < MIN_PHOTOGRAPHS:
+        raise DatasetError(
+            f"{folder} holds {len(names)} photographs that poses can be found for (JPEG, PNG, TIFF, BMP); "
+            f"at least {MIN_PHOTOGRAPHS} are needed."
+        )
+    return names
+
+
+def photographs_sha256(folder: Path, names: Sequence[str]) -> str:
+    """A digest of the photographs' names and contents."""
+    digest = hashlib.sha256()
+    for name in names:
+        digest.update(f"{name}\0{(folder / name).stat().st_size}\n".encode())
+        with (folder / name).open("rb") as content:
+            digest.update(hashlib.file_digest(content, "sha256").digest())
+    return digest.hexdigest()

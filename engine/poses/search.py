@@ -1,0 +1,218 @@
+"""The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from engine.errors import DatasetError
+from engine.events import Listener, StageFinished, StageProgress, StageStarted, Warned
+from engine.files import write_json
+from engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, STAGE, PosesConfig
+from engine.poses.features import find_features, match_pairs, quick_pairs
+from engine.poses.mapping import map_photographs, rank
+from engine.poses.pairs import Pair, all_pairs, pairs_with
+from engine.scene.images import read_image_info
+
+SMALL_PX = 480
+"""Below this, what COLMAP finds was seen to be wrong without any sign of it."""
+_POOR_FEATURES = 50
+
+
+class Search:
+    """A search in a folder of its own.
+
+    Args:
+        images: folder of the photographs.
+        names: of the photographs in it.
+        work: an empty folder.
+        config: settings.
+        threads: to use; 0 means all cores.
+        tell: hears the progress.
+    """
+
+    def __init__(
+        self,
+        images: Path,
+        names: Sequence[str],
+        work: Path,
+        config: PosesConfig,
+        threads: int,
+        tell: Listener,
+    ) -> None:
+        self._images = images
+        self._names = tuple(names)
+        self._work = work
+        self._config = config
+        self._threads = threads or -1
+        self._tell = tell
+        # COLMAP lists pairs by names with a space between, and its numbers follow the order of names.
+        self._photographs = work / "photographs"
+        self._aliases = tuple(f"{k:06d}{Path(name).suffix.lower()}" for k, name in enumerate(names))
+        self._photographs.mkdir()
+        for alias, name in zip(self._aliases, self._names, strict=True):
+            (self._photographs / alias).symlink_to((images / name).resolve())
+        self._one_camera = self._look_at_sizes()
+        pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
+
+    def run(self, found: Path, record: Path) -> None:
+        """Search, a second time if photographs are left out, and write the best model.
+
+        Args:
+            found: folder to make for the model.
+            record: receives what was found, as JSON.
+
+        Raises:
+            DatasetError: too few photographs have poses, or these do not fit.
+        """
+        count, config = len(self._names), self._config
+        best = self._search(thorough=False)
+        placed = rank(best)[0]
+        if placed < count and (count <= config.exhaustive_up_to or placed < config.again_below * count):
+            self._tell(
+                Warned(
+                    f"{placed} of {count} photographs could be placed at first; they are searched again with "
+                    "more features."
+                )
+            )
+            best = max(best, self._search(thorough=True), key=rank)
+        self._check(best)
+        for image in best.images.values():
+            image.name = self._names[image.image_id - 1]
+        # One after the other: colours are sums.
+        best.extract_colors_for_all_images(self._images, num_threads=1)
+        found.mkdir()
+        best.write_binary(found)
+        posed = {best.image(number).name for number in best.reg_image_ids()}
+        write_json(
+            record,
+            {
+                "photographs": count,
+                "placed": len(posed),
+                "left_out": [name for name in self._names if name not in posed],
+                "points": best.num_points3D(),
+                "mean_reprojection_px": round(float(best.compute_mean_reprojection_error()), 4),
+            },
+        )
+
+    def _search(self, *, thorough: bool) -> Any:
+        database = self._work / ("thorough.db" if thorough else "database.db")
+        self._find_features(database, thorough)
+        matched = self._match(database, thorough)
+        count = len(self._names)
+        with self._stage(STAGE, count) as at:
+            best = map_photographs(database, self._photographs, self._config, counted=at)
+            if rank(best)[0] < count:
+                best = self._place_the_rest(database, best, matched, at)
+            at(rank(best)[0])
+        return best
+
+    def _find_features(self, database: Path, thorough: bool) -> None:
+        with self._stage(FEATURES, len(self._names)) as at:
+            counts = find_features(
+                database,
+                self._photographs,
+                self._aliases,
+                self._config,
+                thorough=thorough,
+                one_camera=self._one_camera,
+                threads=self._threads,
+                counted=at,
+            )
+        poor = [name for name, found in zip(self._names, counts, strict=True) if found < _POOR_FEATURES]
+        if poor:
+            self._tell(
+                Warned(f"{len(poor)} photographs show little that can be recognised ({', '.join(poor[:3])}).")
+            )
+
+    def _match(self, database: Path, thorough: bool) -> list[Pair]:
+        pairs = everything = all_pairs(len(self._names))
+        with self._stage(MATCHES, len(everything)) as at:
+            if len(self._names) > self._config.exhaustive_up_to:
+                pairs = quick_pairs(database, self._aliases, self._config, threads=self._threads, counted=at)
+            unlike = len(everything) - len(pairs)
+            match_pairs(
+                database,
+                self._aliases,
+                pairs,
+                self._config,
+                thorough=thorough,
+                threads=self._threads,
+                counted=lambda done: at(unlike + done),
+            )
+        return pairs
+
+    def _place_the_rest(
+        self, database: Path, best: Any, matched: list[Pair], at: Callable[[int], None]
+    ) -> Any:
+        """Photographs that were left out: matched with all others, and placed by fewer matches."""
+        posed = set() if best is None else {number - 1 for number in best.reg_image_ids()}
+        rest = [k for k in range(len(self._names)) if k not in posed]
+        more = pairs_with(rest, len(self._names), matched)
+        if more:
+            match_pairs(
+                database,
+                self._aliases,
+                more,
+                self._config,
+                thorough=True,
+                threads=self._threads,
+                counted=lambda _done: None,
+            )
+        start = None
+        if best is not None:
+            start = self._work / "start"
+            start.mkdir(exist_ok=True)
+            best.write_binary(start)
+        again = map_photographs(database, self._photographs, self._config, counted=at, weak=True, start=start)
+        return max(best, again, key=rank)
+
+    def _look_at_sizes(self) -> bool:
+        """Whether all photographs have one size.
+
+        That means one lens as a rule, and a lens shared by all is found far more surely.
+        """
+        infos = [read_image_info(self._images / name) for name in self._names]
+        longest = max(max(info.width_px, info.height_px) for info in infos)
+        if longest < SMALL_PX:
+            self._tell(
+                Warned(
+                    f"The photographs are {longest} px long at most; poses found from such small ones may be "
+                    "wrong, so give them at full size."
+                )
+            )
+        return len({(info.width_px, info.height_px) for info in infos}) == 1
+
+    @contextmanager
+    def _stage(self, name: str, steps: int) -> Iterator[Callable[[int], None]]:
+        began = time.monotonic()
+        self._tell(StageStarted(name, steps))
+        yield lambda done: self._tell(StageProgress(name, done, steps))
+        self._tell(StageFinished(name, time.monotonic() - began))
+
+    def _check(self, best: Any) -> None:
+        """Refuse a result that would only waste the training."""
+        count, config = len(self._names), self._config
+        if best is None:
+            raise DatasetError(
+                "No poses were found: the photographs do not overlap enough, or are blurred or plain; "
+                "take more of them from nearby places, or send a COLMAP model."
+            )
+        posed, points = rank(best)
+        advice = (
+            "take more photographs with more overlap, of things that stand still, or send a COLMAP model."
+        )
+        if posed < max(MIN_PHOTOGRAPHS, config.min_share * count):
+            raise DatasetError(f"Only {posed} of {count} photographs could be placed; {advice}")
+        error_px = float(best.compute_mean_reprojection_error())
+        if points < config.min_points or not error_px <= config.max_reprojection_px:
+            raise DatasetError(
+                f"The poses are not to be trusted ({points} points, {error_px:.1f} px mean error); {advice}"
+            )
+        if posed < count:
+            self._tell(
+                Warned(f"{count - posed} of {count} photographs could not be placed and are left out.")
+            )
