@@ -32,7 +32,6 @@ from engine.events import (
 )
 from engine.export.options import ExportOptions
 from engine.export.registry import export_scene
-from engine.files import write_json
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
@@ -42,6 +41,7 @@ from engine.train.config import TrainConfig, iteration_count, most_gaussians
 from engine.train.dense_points import dense_points
 from engine.train.initialise import from_points, from_rays
 from engine.train.trainer import Trainer, fresh_state, trace_settings
+from engine.writing import write_json
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json",

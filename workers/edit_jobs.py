@@ -16,8 +16,8 @@ from engine.edit.mesh import Mesh, read_mesh
 from engine.edit.recovery import EditOptions, EditReport, recover_edit
 from engine.errors import ConfigError, SceneFileError
 from engine.export.registry import export_scene, exporter_for
-from engine.files import write_json
 from engine.gaussians.model import FlatGaussians
+from engine.writing import write_json
 from workers.scene_files import open_scene
 
 Say = Callable[[str], None]

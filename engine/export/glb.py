@@ -26,9 +26,9 @@ from engine.export.options import ExportOptions
 from engine.export.radial_alpha import white_with_alpha_png
 from engine.export.registry import Exporter, register
 from engine.export.spatial import kd_chunks
-from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES, octagon_triangles
+from engine.writing import replacing
 
 MAX_BYTES = 2**32 - 1
 """A GLB states its length in 32 bits."""

@@ -18,7 +18,6 @@ from engine.errors import SceneFileError
 from engine.export.options import ExportOptions
 from engine.export.registry import Exporter, register
 from engine.export.selection import blocks, check_scales, selected
-from engine.files import replacing
 from engine.gaussians.encodings import (
     HALF_TURN_SIGNS,
     bytes_from,
@@ -27,6 +26,7 @@ from engine.gaussians.encodings import (
     unit_quats,
 )
 from engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from engine.writing import replacing
 
 EXTENSION = "KHR_gaussian_splatting"
 ARRAY_BUFFER, UNSIGNED_BYTE, FLOAT, POINTS = 34962, 5121, 5126, 0

@@ -13,9 +13,9 @@ from engine.export.octagon_soup import BATCH, OctagonBatch, OctagonSoup
 from engine.export.options import ExportOptions
 from engine.export.radial_alpha import grey_png
 from engine.export.registry import Exporter, register
-from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES, octagon_triangles
+from engine.writing import replacing
 
 MATERIAL = "octagons"
 MATERIAL_TEXT = f"newmtl {MATERIAL}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 0\n"

@@ -7,10 +7,10 @@ from engine.errors import SceneFileError
 from engine.export.options import ExportOptions
 from engine.export.registry import Exporter, register
 from engine.export.selection import selected
-from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import write_gaussian_ply
 from engine.splat_transform import convert
+from engine.writing import replacing
 
 
 def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:

@@ -8,10 +8,10 @@ from engine.errors import SceneFileError
 from engine.export.options import ExportOptions
 from engine.export.registry import Exporter, register
 from engine.export.selection import blocks, check_scales, selected
-from engine.files import replacing
 from engine.gaussians.encodings import bytes_from, unit_quats
 from engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from engine.importers.splat import SPLAT
+from engine.writing import replacing
 
 
 def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:

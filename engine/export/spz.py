@@ -9,12 +9,12 @@ from engine.errors import SceneFileError
 from engine.export.options import ExportOptions
 from engine.export.registry import Exporter, register
 from engine.export.selection import blocks, selected
-from engine.files import replacing
 from engine.gaussians.encodings import SQRT_HALF, bytes_from, half_turned, smallest_three
 from engine.gaussians.flattening import FLAT_LOG_SCALE
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.spz_format import SpzFile, write_spz
 from engine.importers.spz import COLOUR_SCALE, LOG_SCALE_OFFSET, LOG_SCALE_STEPS
+from engine.writing import replacing
 
 FRACTIONAL_BITS = 12
 """The least precision of positions where they fit: 1/4096 of a unit."""

@@ -17,10 +17,10 @@ from engine.errors import SceneFileError
 from engine.export.options import ExportOptions
 from engine.export.registry import Exporter, register
 from engine.export.selection import check_scales, selected
-from engine.files import replacing
 from engine.gaussians.encodings import half_turned, unit_quats
 from engine.gaussians.flattening import turned
 from engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from engine.writing import replacing
 
 ROOT, FIELD = "/octasplat", "/octasplat/gaussians"
 COLOUR_SPACE = "srgb_rec709_scene"

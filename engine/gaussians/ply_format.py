@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 
 from engine.errors import SceneFileError
-from engine.files import replacing
+from engine.writing import replacing
 
 SCALAR_TYPES: Mapping[str, str] = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

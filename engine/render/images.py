@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from engine.colour import srgb_to_linear
 from engine.errors import DatasetError, OutputError
-from engine.files import replacing
+from engine.writing import replacing
 
 _AS_STORED = "oiio:UnassociatedAlpha"
 """Keeps OpenImageIO from multiplying or dividing colours by alpha on its own."""

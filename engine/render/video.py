@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from engine.errors import OutputError
-from engine.files import replacing
 from engine.render.images import to_8_bits
+from engine.writing import replacing
 
 DEFAULT_CRF = 18
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from engine.colour import srgb_to_linear, to_bytes
 from engine.errors import ConfigError, SceneFileError
-from engine.files import replacing
 from engine.gaussians.ply_format import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
 from engine.render.images import write_png
 from engine.surface.mesh import TriangleMesh
+from engine.writing import replacing
 
 MAX_GLB_BYTES = 2**32 - 1
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from engine.errors import CheckpointError, DamagedCheckpoint
-from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
 from engine.train.exposure import Exposures
 from engine.train.optimiser import Adam
+from engine.writing import replacing
 
 FORMAT = 1
 KEEP = 2

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import OctasplatError, OutputError
-from engine.files import write_json
+from engine.writing import write_json
 from workers.client.api import ADDRESS_FILE
 from workers.queue.embedded_postgres import EmbeddedPostgres
 from workers.queue.migrate import migrate
