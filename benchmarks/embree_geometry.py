@@ -22,10 +22,10 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
+from engine.files.importing import read_scene
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_radii
 from engine.gaussians.order import morton_order
-from engine.importers import read_scene
 from engine.trace.arrays import aligned_empty
 from engine.trace.embree_library import Handle
 from engine.trace.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon

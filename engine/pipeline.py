@@ -30,10 +30,10 @@ from engine.events import (
     Warned,
     broadcast,
 )
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.files.options import ExportOptions
+from engine.files.registry import export_scene
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
 from engine.threads import use_threads
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint

@@ -9,10 +9,10 @@ import pytest
 from edit_scenes import assert_same, cube
 
 from engine.edit.affine import transform
-from engine.edit.mesh import read_mesh
-from engine.export.registry import export_scene
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.files.mesh import read_mesh
+from engine.files.registry import export_scene
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 
 Make = Callable[..., FlatGaussians]
 

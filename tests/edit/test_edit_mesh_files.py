@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from engine.edit import mesh_obj
-from engine.edit.mesh import read_mesh
 from engine.errors import SceneFileError
-from engine.gaussians.ply_format import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
+from engine.files import mesh_obj
+from engine.files.mesh import read_mesh
+from engine.files.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
 
 
 def obj(tmp_path: Path, text: str) -> Path:

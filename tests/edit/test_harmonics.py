@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from edit_scenes import random_turn
 
-from engine.edit.harmonics import rotate_sh, sh_basis, sh_rotations
+from engine.gaussians.harmonics import rotate_sh, sh_basis, sh_rotations
 from engine.trace.kernels_sh import write_basis
 
 

@@ -7,14 +7,14 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-import engine.export.glb as glb_module
+import engine.files.glb_export as glb_module
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
-from engine.export.glb_layout import OPAQUE_CUTOFF
-from engine.export.options import ExportOptions
-from engine.export.radial_alpha import radial_alpha
-from engine.export.registry import export_scene
-from engine.export.spatial import kd_chunks
+from engine.files.octagon_glb_layout import OPAQUE_CUTOFF
+from engine.files.options import ExportOptions
+from engine.files.registry import export_scene
+from engine.files.spatial import kd_chunks
+from engine.files.textures import radial_alpha
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from engine.colour import srgb_to_linear
-from engine.edit.harmonics import sh_basis
 from engine.errors import SceneFileError
-from engine.export.registry import export_scene
+from engine.files.importing import importer_for, read_scene
+from engine.files.registry import export_scene
 from engine.gaussians.frames import rotation_matrices
+from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians
-from engine.importers import importer_for, read_scene
 
 Make = Callable[..., FlatGaussians]
 KHR = "KHR_gaussian_splatting"

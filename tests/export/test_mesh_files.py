@@ -7,10 +7,11 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-import engine.export.obj as obj_module
-from engine.export import octagon_soup
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+import engine.files.obj_export as obj_module
+from engine.files import octagon_soup
+from engine.files.options import ExportOptions
+from engine.files.ply_container import read_ply
+from engine.files.registry import export_scene
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import (
     CHI2_2_99,
@@ -20,7 +21,6 @@ from engine.gaussians.octagon import (
     octagon_radii,
     octagon_triangles,
 )
-from engine.gaussians.ply_format import read_ply
 
 Make = Callable[..., FlatGaussians]
 

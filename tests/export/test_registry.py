@@ -6,11 +6,11 @@ import pytest
 from pydantic import ValidationError
 
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
-from engine.export.registry import Exporter, export_scene, exporter_for, exporters, register
+from engine.files.gaussian_ply import read_gaussian_ply
+from engine.files.options import ExportOptions
+from engine.files.ply_container import read_ply_header
+from engine.files.registry import Exporter, export_scene, exporter_for, exporters, register
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import read_gaussian_ply
-from engine.gaussians.ply_format import read_ply_header
 
 Make = Callable[..., FlatGaussians]
 ALL = ("scene.ply", "mesh.ply", "scene.obj", "scene.glb")

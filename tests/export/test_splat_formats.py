@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene, exporter_for
+from engine.files.importing import read_scene
+from engine.files.options import ExportOptions
+from engine.files.registry import export_scene, exporter_for
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
-from engine.importers import read_scene
 
 Make = Callable[[int, int], FlatGaussians]
 FORMATS = ("scene.ply", "scene.splat", "scene.spz", "scene.splats.glb")

@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.edit.harmonics import sh_basis
 from engine.errors import SceneFileError
-from engine.export.registry import export_scene
+from engine.files.registry import export_scene
+from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians
 
 usd = pytest.importorskip(

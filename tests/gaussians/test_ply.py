@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 
 Make = Callable[..., FlatGaussians]
 TYPES = {"<f4": "float", "<f8": "double", "<i2": "short", "<u1": "uchar"}

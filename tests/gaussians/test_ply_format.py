@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
-from engine.gaussians.ply_format import PlyWriteElement, list_field, read_ply, read_ply_header, write_ply
+from engine.files.ply_container import PlyWriteElement, list_field, read_ply, read_ply_header, write_ply
 
 POINTS = "ply\nformat {layout} 1.0\nelement vertex 2\nproperty float x\nproperty short n\n"
 FACES = "element face 2\nproperty uchar flag\nproperty list uchar int vertex_indices\nend_header\n"

@@ -6,9 +6,9 @@ import pytest
 from cloud_difference import difference
 
 from engine.errors import SceneFileError
+from engine.files.importing import importer_for, read_scene
+from engine.files.ply_container import PlyWriteElement, write_ply
 from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.ply_format import PlyWriteElement, write_ply
-from engine.importers import importer_for, read_scene
 
 Make = Callable[..., GaussianCloud]
 CHUNK = 256

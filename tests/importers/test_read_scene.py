@@ -5,10 +5,10 @@ import pytest
 
 from engine.errors import SceneFileError
 from engine.events import Event, StageFinished, StageStarted
+from engine.files.gaussian_ply import write_gaussian_ply
+from engine.files.importing import Importer, importer_for, importers, read_scene, register
 from engine.gaussians.flattening import GaussianCloud
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import write_gaussian_ply
-from engine.importers import Importer, importer_for, importers, read_scene, register
 
 
 @pytest.fixture

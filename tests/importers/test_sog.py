@@ -12,9 +12,9 @@ import pytest
 from cloud_difference import difference
 
 from engine.errors import SceneFileError
+from engine.files.gaussian_ply import read_ply_cloud
+from engine.files.importing import importer_for, read_scene
 from engine.gaussians.flattening import GaussianCloud
-from engine.importers import importer_for, read_scene
-from engine.importers.gaussian_ply import read_ply_cloud
 
 Make = Callable[..., GaussianCloud]
 COUNT, WIDTH = 200, 16

@@ -9,11 +9,11 @@ import pytest
 import zstandard
 from cloud_difference import difference
 
-from engine.edit.harmonics import sh_basis
 from engine.errors import SceneFileError
+from engine.files.gaussian_ply import read_ply_cloud
+from engine.files.importing import importer_for, read_scene
 from engine.gaussians.flattening import GaussianCloud
-from engine.importers import importer_for, read_scene
-from engine.importers.gaussian_ply import read_ply_cloud
+from engine.gaussians.harmonics import sh_basis
 
 Make = Callable[..., GaussianCloud]
 BITS = 12

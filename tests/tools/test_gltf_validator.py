@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.files.options import ExportOptions
+from engine.files.registry import export_scene
 from engine.gaussians.model import FlatGaussians
 
 pytestmark = pytest.mark.tools

@@ -4,12 +4,12 @@ import tempfile
 from pathlib import Path
 
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
-from engine.export.registry import Exporter, register
-from engine.export.selection import selected
+from engine.files.gaussian_ply import write_gaussian_ply
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.selection import selected
+from engine.files.splat_transform import convert
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import write_gaussian_ply
-from engine.splat_transform import convert
 from engine.writing import replacing
 
 

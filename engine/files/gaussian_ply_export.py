@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from engine.export.options import ExportOptions
-from engine.export.registry import Exporter, register
-from engine.export.selection import selected
+from engine.files.gaussian_ply import write_gaussian_ply
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.selection import selected
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import write_gaussian_ply
 
 
 def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from engine.export.options import ExportOptions
-from engine.formats import FormatTable
+from engine.files.format_table import FormatTable
+from engine.files.options import ExportOptions
 from engine.gaussians.model import FlatGaussians
 
 Writer = Callable[[FlatGaussians, Path, ExportOptions], tuple[Path, ...]]

@@ -10,8 +10,7 @@ import numpy as np
 
 from engine.colour import srgb_to_linear, to_bytes
 from engine.errors import ConfigError, SceneFileError
-from engine.gaussians.ply_format import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
-from engine.render.images import write_png
+from engine.files.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
 from engine.surface.mesh import TriangleMesh
 from engine.writing import replacing
 
@@ -201,6 +200,8 @@ def _write_lines(write: Callable[[str], object], line: str, rows: np.ndarray) ->
 
 
 def _png_bytes(texture_srgb: np.ndarray) -> bytes:
+    from engine.render.images import write_png  # loads the image library, which the front end has not
+
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "texture.png"
         write_png(path, texture_srgb.astype(np.float32) / np.float32(255))

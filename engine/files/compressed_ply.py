@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt32
 
 from engine.errors import SceneFileError
-from engine.gaussians.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes, sh0_from_rgb
+from engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes, sh0_from_rgb
+from engine.files.importing import Importer, register
+from engine.files.ply_container import PlyHeader, columns, read_ply, read_ply_header
 from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.ply_format import PlyHeader, columns, read_ply, read_ply_header
-from engine.importers.registry import Importer, register
 
 CHUNK = 256
 SH_RANGE = 8.0

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
+from engine.files.options import ExportOptions
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import APOTHEM, corner_directions, octagon_corners_world, octagon_radii
 

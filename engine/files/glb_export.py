@@ -20,12 +20,12 @@ from jaxtyping import Float32, Int
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
-from engine.export.glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout, padded
-from engine.export.octagon_soup import OctagonBatch, OctagonSoup
-from engine.export.options import ExportOptions
-from engine.export.radial_alpha import white_with_alpha_png
-from engine.export.registry import Exporter, register
-from engine.export.spatial import kd_chunks
+from engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout, padded
+from engine.files.octagon_soup import OctagonBatch, OctagonSoup
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.spatial import kd_chunks
+from engine.files.textures import white_with_alpha_png
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES, octagon_triangles
 from engine.writing import replacing

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
+from engine.files.options import ExportOptions
 from engine.gaussians.model import FlatGaussians
 
 ROWS_AT_ONCE = 65536

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from engine.errors import SceneFileError
-from engine.gaussians.encodings import logits_from_bytes, sh0_from_rgb
+from engine.files.encodings import logits_from_bytes, sh0_from_rgb
+from engine.files.importing import Importer, register
 from engine.gaussians.flattening import GaussianCloud
-from engine.importers.registry import Importer, register
 
 SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 

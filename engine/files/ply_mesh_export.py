@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from engine.colour import to_bytes
-from engine.export.octagon_soup import BATCH, OctagonSoup
-from engine.export.options import ExportOptions
-from engine.export.registry import Exporter, register
+from engine.files.octagon_soup import BATCH, OctagonSoup
+from engine.files.options import ExportOptions
+from engine.files.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
+from engine.files.registry import Exporter, register
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import FAN, SIDES, octagon_triangles
-from engine.gaussians.ply_format import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
 
 VERTEX = np.dtype(
     [

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from engine.errors import SceneFileError
 from engine.events import Listener, StageFinished, StageStarted, ignore
-from engine.formats import FormatTable
+from engine.files.format_table import FormatTable
 from engine.gaussians.flattening import GaussianCloud, ImportReport, flatten
 from engine.gaussians.model import FlatGaussians
 

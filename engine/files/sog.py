@@ -11,14 +11,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 from jaxtyping import Float32, UInt8
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from engine.errors import SceneFileError
-from engine.gaussians.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
+from engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
+from engine.files.importing import Importer, register
 from engine.gaussians.flattening import GaussianCloud
-from engine.importers.registry import Importer, register
 
 META = "meta.json"
 PALETTE_COLUMNS = 64
@@ -100,6 +99,8 @@ def _member(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
 
 def _pixels(path: Path, name: str, image: Path) -> UInt8[np.ndarray, "h w 4"]:
     """The bytes of an image as they are stored, as RGBA."""
+    import OpenImageIO as oiio  # which the front end has not
+
     if not image.exists():
         raise SceneFileError(f"{path}: its image {name} is missing.")
     as_stored = oiio.ImageSpec()

@@ -1,7 +1,7 @@
 """3DGS PLY: the native file, and what most programs of the field write."""
 
-from engine.gaussians.ply import read_ply_cloud
-from engine.importers.registry import Importer, register
+from engine.files.gaussian_ply import read_ply_cloud
+from engine.files.importing import Importer, register
 
 
 def _recognises(head: bytes) -> bool:

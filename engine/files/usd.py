@@ -14,10 +14,10 @@ import numpy as np
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
-from engine.export.registry import Exporter, register
-from engine.export.selection import check_scales, selected
-from engine.gaussians.encodings import half_turned, unit_quats
+from engine.files.encodings import half_turned, unit_quats
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.selection import check_scales, selected
 from engine.gaussians.flattening import turned
 from engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from engine.writing import replacing

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engine.export.options import ExportOptions
+from engine.files.options import ExportOptions
 from engine.gaussians.octagon import FAN, SIDES
 
 OPAQUE_CUTOFF = 0.2

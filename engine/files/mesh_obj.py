@@ -9,9 +9,9 @@ from typing import IO
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from engine.edit.mesh import Mesh
-from engine.edit.mesh_ply import stated_q
 from engine.errors import SceneFileError
+from engine.files.mesh import Mesh
+from engine.files.mesh_ply import stated_q
 
 BLOCK_BYTES = 1 << 22
 NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
-from engine.export.registry import Exporter, register
-from engine.export.selection import blocks, check_scales, selected
-from engine.gaussians.encodings import bytes_from, unit_quats
+from engine.files.encodings import bytes_from, unit_quats
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.selection import blocks, check_scales, selected
+from engine.files.splat import SPLAT
 from engine.gaussians.model import FLAT_SCALE, FlatGaussians
-from engine.importers.splat import SPLAT
 from engine.writing import replacing
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from engine.edit.mesh import Mesh
 from engine.errors import SceneFileError
-from engine.gaussians.ply_format import columns, read_ply
+from engine.files.mesh import Mesh
+from engine.files.ply_container import columns, read_ply
 
 _POSITION = ("x", "y", "z")
 _FACE_LISTS = ("vertex_indices", "vertex_index")

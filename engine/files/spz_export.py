@@ -6,14 +6,14 @@ import numpy as np
 from jaxtyping import Float
 
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
-from engine.export.registry import Exporter, register
-from engine.export.selection import blocks, selected
-from engine.gaussians.encodings import SQRT_HALF, bytes_from, half_turned, smallest_three
+from engine.files.encodings import SQRT_HALF, bytes_from, half_turned, smallest_three
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.selection import blocks, selected
+from engine.files.spz import COLOUR_SCALE, LOG_SCALE_OFFSET, LOG_SCALE_STEPS
+from engine.files.spz_container import SpzFile, write_spz
 from engine.gaussians.flattening import FLAT_LOG_SCALE
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.spz_format import SpzFile, write_spz
-from engine.importers.spz import COLOUR_SCALE, LOG_SCALE_OFFSET, LOG_SCALE_STEPS
 from engine.writing import replacing
 
 FRACTIONAL_BITS = 12

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from engine.errors import SceneFileError
-from engine.export.octagon_soup import BATCH, OctagonBatch, OctagonSoup
-from engine.export.options import ExportOptions
-from engine.export.radial_alpha import grey_png
-from engine.export.registry import Exporter, register
+from engine.files.octagon_soup import BATCH, OctagonBatch, OctagonSoup
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.textures import grey_png
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES, octagon_triangles
 from engine.writing import replacing

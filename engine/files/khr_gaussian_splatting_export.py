@@ -15,16 +15,16 @@ import numpy as np
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
-from engine.export.registry import Exporter, register
-from engine.export.selection import blocks, check_scales, selected
-from engine.gaussians.encodings import (
+from engine.files.encodings import (
     HALF_TURN_SIGNS,
     bytes_from,
     half_turn_points,
     half_turn_quats,
     unit_quats,
 )
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.selection import blocks, check_scales, selected
 from engine.gaussians.model import FLAT_SCALE, FlatGaussians
 from engine.writing import replacing
 

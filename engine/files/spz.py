@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from engine.errors import SceneFileError
-from engine.gaussians.encodings import (
+from engine.files.encodings import (
     SQRT_HALF,
     from_smallest_three,
     half_turn_points,
@@ -14,10 +14,10 @@ from engine.gaussians.encodings import (
     half_turn_sh,
     logits_from_bytes,
 )
+from engine.files.gaussian_ply import MAX_SH_DEGREE
+from engine.files.importing import Importer, register
+from engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, read_spz
 from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.ply import MAX_SH_DEGREE
-from engine.gaussians.spz_format import ANTIALIASED, GZIP_MAGIC, MAGIC, read_spz
-from engine.importers.registry import Importer, register
 
 COLOUR_SCALE = 0.15
 """Constant harmonics h are written as the byte 255 (0.15 h + 0.5)."""

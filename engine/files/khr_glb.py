@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from engine.colour import linear_to_srgb
-from engine.edit.harmonics import rotate_sh
 from engine.errors import SceneFileError
-from engine.gaussians.encodings import half_turn_points, half_turn_quats, half_turn_sh, sh0_from_rgb
+from engine.files.encodings import half_turn_points, half_turn_quats, half_turn_sh, sh0_from_rgb
+from engine.files.importing import Importer, register
 from engine.gaussians.flattening import GaussianCloud
 from engine.gaussians.frames import quaternions, rotation_matrices
+from engine.gaussians.harmonics import rotate_sh
 from engine.gaussians.model import SH_C0
-from engine.importers.registry import Importer, register
 
 EXTENSION = "KHR_gaussian_splatting"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

@@ -13,9 +13,7 @@ from typing import Literal
 import numpy as np
 
 from engine.errors import SceneFileError
-from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply_format import (
+from engine.files.ply_container import (
     PlyElement,
     PlyWriteElement,
     columns,
@@ -23,6 +21,8 @@ from engine.gaussians.ply_format import (
     read_ply_header,
     write_ply,
 )
+from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
+from engine.gaussians.model import FlatGaussians
 
 MAX_SH_DEGREE = 3
 ROWS_AT_ONCE = 65536

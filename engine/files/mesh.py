@@ -50,9 +50,9 @@ def read_mesh(path: Path) -> Mesh:
         SceneFileError: another suffix, a file that cannot be read, is damaged or compressed, or has vertices
             that are not finite.
     """
-    from engine.edit.mesh_glb import read_glb
-    from engine.edit.mesh_obj import read_obj
-    from engine.edit.mesh_ply import read_ply_mesh
+    from engine.files.mesh_glb import read_glb
+    from engine.files.mesh_obj import read_obj
+    from engine.files.mesh_ply import read_ply_mesh
 
     readers: dict[str, Callable[[Path], Mesh]] = {".ply": read_ply_mesh, ".obj": read_obj, ".glb": read_glb}
     reader = readers.get(path.suffix.lower())
