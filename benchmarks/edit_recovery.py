@@ -17,9 +17,7 @@ import numpy as np
 
 from engine.edit.local_maps import legs_world
 from engine.edit.recovery import EditOptions, recover_edit
-from engine.files.importing import read_scene
-from engine.files.mesh import Mesh, read_mesh
-from engine.files.registry import export_scene
+from engine.files import Mesh, export_scene, read_mesh, read_scene
 from engine.gaussians.model import FlatGaussians
 
 Map = Callable[[np.ndarray], np.ndarray]

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from engine.files import export_scene
 from engine.files.ply_container import read_ply
-from engine.files.registry import export_scene
 from engine.gaussians.model import FlatGaussians
 
 

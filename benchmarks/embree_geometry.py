@@ -22,7 +22,7 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
-from engine.files.importing import read_scene
+from engine.files import read_scene
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_radii
 from engine.gaussians.order import morton_order

@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.files.importing import read_scene
-from engine.files.registry import export_scene
+from engine.files import export_scene, read_scene
 from engine.gaussians.model import FlatGaussians
 
 NAMES = ("scene.ply", "scene.splat", "scene.spz", "scene.splats.glb", "scene.usdc")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.files.importing import read_scene
+from engine.files import read_scene
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import CHI2_3_99, octagon_radii
 from engine.render.renderer import tile_order

@@ -30,9 +30,8 @@ from engine.events import (
     Warned,
     broadcast,
 )
+from engine.files import ExportOptions, export_scene
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.files.options import ExportOptions
-from engine.files.registry import export_scene
 from engine.gaussians.model import FlatGaussians
 from engine.scene import Dataset, write_held_out
 from engine.threads import use_threads

@@ -14,8 +14,7 @@ from pydantic import BaseModel, ValidationError
 from engine.edit.deform import DeformReport, deform_to, deformation_corners
 from engine.edit.recovery import EditOptions, EditReport, recover_edit
 from engine.errors import ConfigError, SceneFileError
-from engine.files.mesh import Mesh, read_mesh
-from engine.files.registry import export_scene, exporter_for
+from engine.files import Mesh, export_scene, exporter_for, read_mesh
 from engine.gaussians.model import FlatGaussians
 from engine.writing import write_json
 from workers.scene_files import open_scene

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from engine.files.importing import read_scene
+from engine.files import read_scene
 from engine.gaussians.flattening import ImportReport
 from engine.gaussians.model import FlatGaussians
 

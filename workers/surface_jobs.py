@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from engine.config import read_config
 from engine.errors import ConfigError, DatasetError, OutputError
-from engine.files.surfaces import check_surface_path, write_surface
+from engine.files import check_surface_path, write_surface
 from engine.gaussians.model import FlatGaussians
 from engine.pipeline import CONFIG, SCENE, run_scene
 from engine.render.cameras import RenderCamera

@@ -15,7 +15,7 @@ from engine.edit.matching import Octagons, match_octagons
 from engine.edit.octagon_fit import LEAST_CORNERS, fit_octagons
 from engine.edit.surroundings import carry, flipped_against, neighbour_turns
 from engine.errors import SceneFileError
-from engine.files.mesh import Mesh
+from engine.files import Mesh
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians, concatenate
 from engine.gaussians.octagon import (

@@ -1,1 +1,41 @@
-"""Files of scenes, meshes and surfaces: splats in and out, octagon meshes in and out, surfaces out."""
+"""Files of scenes, meshes and surfaces: one module a format, reading and writing together, one registry.
+
+The rest of the engine knows the functions that are named here, and no format.
+"""
+
+from engine.files.exporting import check_surface_path, export_scene, write_surface
+from engine.files.mesh import Mesh
+from engine.files.options import ExportOptions
+from engine.files.reading import read_mesh, read_scene
+from engine.files.registry import (
+    Exporter,
+    Importer,
+    MeshReader,
+    SurfaceWriter,
+    exporter_for,
+    exporters,
+    importer_for,
+    importers,
+    register,
+)
+from engine.gaussians.flattening import ImportReport
+
+__all__ = [
+    "ExportOptions",
+    "Exporter",
+    "ImportReport",
+    "Importer",
+    "Mesh",
+    "MeshReader",
+    "SurfaceWriter",
+    "check_surface_path",
+    "export_scene",
+    "exporter_for",
+    "exporters",
+    "importer_for",
+    "importers",
+    "read_mesh",
+    "read_scene",
+    "register",
+    "write_surface",
+]

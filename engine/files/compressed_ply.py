@@ -11,8 +11,8 @@ from jaxtyping import Float32, Int, UInt32
 
 from engine.errors import SceneFileError
 from engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes, sh0_from_rgb
-from engine.files.importing import Importer, register
 from engine.files.ply_container import PlyHeader, columns, read_ply, read_ply_header
+from engine.files.registry import Importer, register
 from engine.gaussians.flattening import GaussianCloud
 
 CHUNK = 256

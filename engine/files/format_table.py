@@ -1,92 +1,93 @@
-"""A table of file formats that fills itself from the modules of a package, for reading and for writing."""
+"""A table of what can be done with files, which fills itself from the modules of a package."""
 
 import fnmatch
 import importlib
 import pkgutil
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import ClassVar, TypeVar
 
 from engine.errors import SceneFileError
 
 
-@runtime_checkable
-class Format(Protocol):
-    """A named file format with the file names that it takes, as in ``*.glb``."""
+@dataclass(frozen=True)
+class Entry:
+    """One way to read or write one format.
 
-    @property
-    def name(self) -> str:
-        """What ``format=`` calls it."""
-        ...
+    Attributes:
+        name: of the format, unique among entries of one class.
+        patterns: file names that it takes, as in ``*.glb``; where two formats match, the pattern with more
+            literal characters wins.
+    """
 
-    @property
-    def patterns(self) -> tuple[str, ...]:
-        """File names that it takes; where two formats match, more literal characters win."""
-        ...
-
-
-F = TypeVar("F", bound=Format)
+    noun: ClassVar[str]
+    """For errors, as in "import"."""
+    name: str
+    patterns: tuple[str, ...]
 
 
-class FormatTable(Generic[F]):
-    """Formats by name. Modules of a package that hold one register it when they are imported.
+E = TypeVar("E", bound=Entry)
+
+
+class FormatTable:
+    """Entries of several classes by name. Modules of a package register theirs when they are imported.
 
     Args:
         package: its modules are imported once, when somebody first asks.
-        noun: for errors, as in "import".
     """
 
-    def __init__(self, package: str, noun: str) -> None:
+    def __init__(self, package: str) -> None:
         self._package = package
-        self._noun = noun
-        self._known: dict[str, F] = {}
+        self._known: dict[tuple[type[Entry], str], Entry] = {}
         self._complete = False
 
-    def register(self, entry: F) -> F:
-        """Add a format.
+    def register(self, entry: Entry) -> None:
+        """Add an entry.
 
         Raises:
-            ValueError: there is one of that name.
+            ValueError: there is one of that class and name.
         """
-        if entry.name in self._known:
-            raise ValueError(f"an {self._noun}er named '{entry.name}' is registered already")
-        self._known[entry.name] = entry
-        return entry
+        key = (type(entry), entry.name)
+        if key in self._known:
+            raise ValueError(f"the {entry.noun} format '{entry.name}' is registered already")
+        self._known[key] = entry
 
-    def all(self) -> tuple[F, ...]:
-        """All formats, by name."""
+    def all(self, kind: type[E]) -> tuple[E, ...]:
+        """All entries of a class, by name."""
         if not self._complete:
             for module in pkgutil.iter_modules(importlib.import_module(self._package).__path__):
                 importlib.import_module(f"{self._package}.{module.name}")
             self._complete = True
-        return tuple(self._known[name] for name in sorted(self._known))
+        found = (entry for entry in self._known.values() if isinstance(entry, kind))
+        return tuple(sorted(found, key=lambda entry: entry.name))
 
-    def named(self, name: str, path: Path) -> F:
-        """The format of that name.
+    def named(self, kind: type[E], name: str, path: Path) -> E:
+        """The entry of that class and name.
 
         Raises:
             SceneFileError: there is none; the text names ``path`` and lists those that exist.
         """
-        by_name = {entry.name: entry for entry in self.all()}
+        by_name = {entry.name: entry for entry in self.all(kind)}
         if name not in by_name:
             choices = ", ".join(by_name)
-            raise SceneFileError(
-                f"{path}: there is no {self._noun} format '{name}'; choose one of {choices}."
-            )
+            raise SceneFileError(f"{path}: there is no {kind.noun} format '{name}'; choose one of {choices}.")
         return by_name[name]
 
-    def by_file_name(self, path: Path, otherwise: str) -> F:
-        """The format that takes this file name; upper and lower case are the same.
-
-        Raises:
-            SceneFileError: there is none: ``otherwise``, and the formats with their patterns.
-        """
+    def by_file_name(self, kind: type[E], path: Path) -> E | None:
+        """The entry that takes this file name, or None; upper and lower case are the same."""
         matches = [
             (sum(character not in "*?" for character in pattern), entry)
-            for entry in self.all()
+            for entry in self.all(kind)
             for pattern in entry.patterns
             if fnmatch.fnmatchcase(path.name.lower(), pattern)
         ]
-        if not matches:
-            choices = "; ".join(f"{entry.name} ({', '.join(entry.patterns)})" for entry in self.all())
-            raise SceneFileError(f"{path}: {otherwise}; the formats are {choices}.")
-        return max(matches, key=lambda match: match[0])[1]
+        return max(matches, key=lambda match: match[0])[1] if matches else None
+
+    def choices(self, kind: type[E]) -> str:
+        """All entries with their patterns, for errors."""
+        return "; ".join(f"{entry.name} ({', '.join(entry.patterns)})" for entry in self.all(kind))
+
+    def suffixes(self, kind: type[E]) -> str:
+        """The suffixes that entries take, as in ".glb, .ply or .obj"."""
+        found = [pattern.lstrip("*") for entry in self.all(kind) for pattern in entry.patterns]
+        return " or ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)

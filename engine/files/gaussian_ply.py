@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from engine.errors import SceneFileError
+from engine.files.options import ExportOptions
 from engine.files.ply_container import (
     PlyElement,
     PlyWriteElement,
@@ -21,6 +22,8 @@ from engine.files.ply_container import (
     read_ply_header,
     write_ply,
 )
+from engine.files.registry import Exporter, Importer, register
+from engine.files.selection import selected
 from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
 from engine.gaussians.model import FlatGaussians
 
@@ -165,3 +168,23 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
             f"{path}: property '{lists[0]}' of element 'vertex' is a list; Gaussians have scalars only."
         )
     return rest_count, scale_count
+
+
+def _write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write the Gaussians that are not fainter than ``options.min_opacity``."""
+    write_gaussian_ply(selected(gaussians, path, options), path, sh_pad_degree=options.sh_pad_degree)
+    return (path,)
+
+
+def _recognises(head: bytes) -> bool:
+    return head.startswith(b"ply") and b"packed_position" not in head
+
+
+register(
+    Importer("gaussians", ("*.ply",), "Gaussians in the PLY layout of 3DGS", read_ply_cloud, _recognises)
+)
+register(
+    Exporter(
+        "gaussians", ("*.ply",), "Gaussians as a 3DGS PLY, for splat viewers and for octasplat itself", _write
+    )
+)

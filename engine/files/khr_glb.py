@@ -1,76 +1,66 @@
-"""Binary glTF with ``KHR_gaussian_splatting``: all splats of the default scene, node transforms applied.
+"""Binary glTF with ``KHR_gaussian_splatting``: points with the attributes of splats.
 
-glTF is y up; the scene is turned by 180 degrees about x, to y down. With untransformed nodes that changes
-signs only, so that our own files keep the bits of positions and harmonics.
+The extension knows one kernel, an ellipsoid; a flat Gaussian is one with a standard deviation of 1e-5 along
+its first axis. glTF is y up; the scene is turned by 180 degrees about x in the data, not by a node, so that
+readers that evaluate harmonics in world directions are right too. With untransformed nodes that changes signs
+only, so that our own files keep the bits of positions and harmonics.
 """
 
-import json
-import mmap
-import struct
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.colour import linear_to_srgb
+from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.errors import SceneFileError
-from engine.files.encodings import half_turn_points, half_turn_quats, half_turn_sh, sh0_from_rgb
-from engine.files.importing import Importer, register
+from engine.files import gltf
+from engine.files.encodings import (
+    HALF_TURN_SIGNS,
+    bytes_from,
+    half_turn_points,
+    half_turn_quats,
+    half_turn_sh,
+    sh0_from_rgb,
+    unit_quats,
+)
+from engine.files.gltf import FLOAT, UNSIGNED_BYTE, GlbFile, padded, write_glb
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, Importer, register
+from engine.files.selection import blocks, check_scales, selected
 from engine.gaussians.flattening import GaussianCloud
 from engine.gaussians.frames import quaternions, rotation_matrices
 from engine.gaussians.harmonics import rotate_sh
-from engine.gaussians.model import SH_C0
+from engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
 
 EXTENSION = "KHR_gaussian_splatting"
-COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-MAX_DEPTH = 256
+COLOUR_SPACE = "srgb_rec709_display"
 SIMILARITY = 1e-4
 """Relative error up to which a node may fail to be a rotation with one scale."""
 
 
 def read(path: Path) -> GaussianCloud:
-    """Read all splats.
+    """Read all splats of the default scene, node transforms applied.
 
     Raises:
         SceneFileError: the file is no GLB, is damaged, holds no splats (an octagon mesh, say) or compressed
             ones, or scales them unevenly.
     """
-    try:
-        with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            return _read(path, content)
-    except (OSError, struct.error) as error:
-        raise SceneFileError(f"{path}: cannot be read ({error}).") from error
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
-
-
-def _read(path: Path, content: mmap.mmap) -> GaussianCloud:
-    if content[:4] != b"glTF":
-        raise SceneFileError(f"{path}: is no GLB file.")
-    length, kind = struct.unpack_from("<I4s", content, 12)
-    if kind != b"JSON" or 20 + length > len(content):
-        raise SceneFileError(f"{path}: is truncated.")
-    document: dict[str, Any] = json.loads(content[20 : 20 + length])
-    start = 28 + length
-    reader = _Reader(document, content, start)
-    if start <= len(content):
-        size = struct.unpack_from("<I", content, 20 + length)[0]
-        if start + size > len(content):
-            raise SceneFileError(f"{path}: is truncated.")
+    file = GlbFile(path)
     clouds = []
-    for matrix, mesh in _placed_meshes(document):
-        for primitive in document["meshes"][mesh]["primitives"]:
+    try:
+        for matrix, primitive in file.primitives():
             splats = primitive.get("extensions", {}).get(EXTENSION)
             if splats is None:
                 continue
             if splats.get("extensions"):
                 names = ", ".join(splats["extensions"])
                 raise SceneFileError(f"{path}: its splats need {names}, which is not read.")
-            clouds.append(_placed(path, reader.cloud(primitive["attributes"], splats), matrix))
+            clouds.append(_placed(path, _cloud(file, primitive["attributes"], splats), matrix))
+    except gltf.DAMAGE as error:
+        raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
     if not clouds:
         raise SceneFileError(
             f"{path}: holds no splats ({EXTENSION}); if it is an edited octagon mesh, use octasplat edit."
@@ -78,91 +68,38 @@ def _read(path: Path, content: mmap.mmap) -> GaussianCloud:
     return _joined(clouds)
 
 
-class _Reader:
-    """Accessors of a GLB as arrays."""
-
-    def __init__(self, document: dict[str, Any], content: mmap.mmap, start: int) -> None:
-        self._document = document
-        self._content = content
-        self._start = start
-
-    def cloud(self, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
-        """The Gaussians of a primitive, in its own frame."""
-        xyzw = self._array(attributes[f"{EXTENSION}:ROTATION"])
-        sh = self._harmonics(attributes)
-        notes: tuple[str, ...] = ()
-        if splats.get("colorSpace") == "lin_rec709_display":
-            notes = ("Its colours are linear; they were converted, without what depends on the view.",)
-            sh = sh0_from_rgb(linear_to_srgb(0.5 + SH_C0 * sh[:, 0]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            opacity = self._array(attributes[f"{EXTENSION}:OPACITY"])[:, 0].astype(np.float64)
-            logits = np.log(opacity) - np.log1p(-opacity)
-            log_scales = np.log(self._array(attributes[f"{EXTENSION}:SCALE"]))
-        return GaussianCloud(
-            means_world=self._array(attributes["POSITION"]),
-            quats_wxyz=np.ascontiguousarray(xyzw[:, [3, 0, 1, 2]]),
-            log_scales=log_scales,
-            opacity_logits=logits.astype(np.float32),
-            sh=sh,
-            notes=notes,
-        )
-
-    def _harmonics(self, attributes: dict[str, int]) -> Float32[np.ndarray, "n k 3"]:
-        bands: list[np.ndarray] = []
-        for degree in range(4):
-            names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}" for place in range(2 * degree + 1)]
-            if not all(name in attributes for name in names):
-                break
-            bands.extend(self._array(attributes[name]) for name in names)
-        if not bands:
-            raise KeyError(f"{EXTENSION}:SH_DEGREE_0_COEF_0")
-        return np.stack(bands, axis=1)
-
-    def _array(self, number: int) -> Float32[np.ndarray, "n c"]:
-        accessor = self._document["accessors"][number]
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError("sparse accessors are not read")
-        view = self._document["bufferViews"][accessor["bufferView"]]
-        if view.get("buffer", 0) != 0 or "uri" in self._document["buffers"][0]:
-            raise ValueError("data outside the file is not read")
-        kind = np.dtype(COMPONENTS[accessor["componentType"]])
-        width, count = WIDTHS[accessor["type"]], int(accessor["count"])
-        offset = self._start + view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        stride = view.get("byteStride", width * kind.itemsize)
-        rows: np.ndarray = np.ndarray((count, width), kind, self._content, offset, (stride, kind.itemsize))
-        values = rows.astype(np.float32)
-        if accessor.get("normalized"):
-            largest = float(np.iinfo(kind).max)
-            values = np.maximum(values / np.float32(largest), np.float32(-1.0))
-        return values
+def _cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
+    """The Gaussians of a primitive, in its own frame."""
+    xyzw = file.array(attributes[f"{EXTENSION}:ROTATION"], np.float32)
+    sh = _harmonics(file, attributes)
+    notes: tuple[str, ...] = ()
+    if splats.get("colorSpace") == "lin_rec709_display":
+        notes = ("Its colours are linear; they were converted, without what depends on the view.",)
+        sh = sh0_from_rgb(linear_to_srgb(0.5 + SH_C0 * sh[:, 0]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        opacity = file.array(attributes[f"{EXTENSION}:OPACITY"], np.float32)[:, 0].astype(np.float64)
+        logits = np.log(opacity) - np.log1p(-opacity)
+        log_scales = np.log(file.array(attributes[f"{EXTENSION}:SCALE"], np.float32))
+    return GaussianCloud(
+        means_world=file.array(attributes["POSITION"], np.float32),
+        quats_wxyz=np.ascontiguousarray(xyzw[:, [3, 0, 1, 2]]),
+        log_scales=log_scales,
+        opacity_logits=logits.astype(np.float32),
+        sh=sh,
+        notes=notes,
+    )
 
 
-def _placed_meshes(document: dict[str, Any]) -> Iterator[tuple[Float64[np.ndarray, "4 4"], int]]:
-    """The meshes of the default scene, each with its transform to the scene."""
-    nodes = document.get("nodes", [])
-    scenes = document.get("scenes")
-    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
-    waiting = [(number, np.eye(4), 0) for number in reversed(roots)]
-    while waiting:
-        number, above, depth = waiting.pop()
-        if depth > MAX_DEPTH:
-            raise ValueError("its nodes are nested too deeply")
-        matrix = above @ _local(nodes[number])
-        if "mesh" in nodes[number]:
-            yield matrix, nodes[number]["mesh"]
-        waiting.extend((child, matrix, depth + 1) for child in reversed(nodes[number].get("children", [])))
-
-
-def _local(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
-    if "matrix" in node:
-        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    matrix = np.eye(4)
-    if "rotation" in node:
-        x, y, z, w = node["rotation"]
-        matrix[:3, :3] = rotation_matrices(np.array([[w, x, y, z]], dtype=np.float64))[0]
-    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)))
-    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
-    return matrix
+def _harmonics(file: GlbFile, attributes: dict[str, int]) -> Float32[np.ndarray, "n k 3"]:
+    bands: list[np.ndarray] = []
+    for degree in range(4):
+        names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}" for place in range(2 * degree + 1)]
+        if not all(name in attributes for name in names):
+            break
+        bands.extend(file.array(attributes[name], np.float32) for name in names)
+    if not bands:
+        raise KeyError(f"{EXTENSION}:SH_DEGREE_0_COEF_0")
+    return np.stack(bands, axis=1)
 
 
 def _placed(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]) -> GaussianCloud:
@@ -210,8 +147,139 @@ def _joined(clouds: list[GaussianCloud]) -> GaussianCloud:
     )
 
 
+@dataclass(frozen=True)
+class _Attribute:
+    """A vertex attribute: its semantic, type, and its rows, in glTF's frame, of a block in ours."""
+
+    semantic: str
+    kind: str
+    component: int
+    item_bytes: int
+    rows: Callable[[FlatGaussians], np.ndarray]
+
+
+def _colours(some: FlatGaussians) -> np.ndarray:
+    """The fallback of readers that see points only: linear RGB of the constant harmonic, and opacity."""
+    linear = srgb_to_linear(np.clip(some.base_rgb_srgb, 0.0, 1.0))
+    return bytes_from(np.concatenate([linear, some.opacities[:, None]], axis=1).astype(np.float64) * 255.0)
+
+
+def _scales(some: FlatGaussians) -> np.ndarray:
+    flat = np.full((len(some), 1), FLAT_SCALE, dtype=np.float32)
+    return np.concatenate([flat, some.scales], axis=1)
+
+
+def _coefficient(number: int) -> Callable[[FlatGaussians], np.ndarray]:
+    return lambda some: some.sh[:, number] * HALF_TURN_SIGNS[number]
+
+
+def attributes(sh_degree: int) -> tuple[_Attribute, ...]:
+    """All attributes of a scene with harmonics of that degree, in file order."""
+    basic = (
+        _Attribute("POSITION", "VEC3", FLOAT, 12, lambda some: half_turn_points(some.means_world)),
+        _Attribute("COLOR_0", "VEC4", UNSIGNED_BYTE, 4, _colours),
+        _Attribute(
+            f"{EXTENSION}:ROTATION",
+            "VEC4",
+            FLOAT,
+            16,
+            lambda some: unit_quats(half_turn_quats(some.quats_wxyz)[:, [1, 2, 3, 0]]),
+        ),
+        _Attribute(f"{EXTENSION}:SCALE", "VEC3", FLOAT, 12, _scales),
+        _Attribute(f"{EXTENSION}:OPACITY", "SCALAR", FLOAT, 4, lambda some: some.opacities),
+    )
+    harmonics = tuple(
+        _Attribute(
+            f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}", "VEC3", FLOAT, 12, _coefficient(degree**2 + place)
+        )
+        for degree in range(sh_degree + 1)
+        for place in range(2 * degree + 1)
+    )
+    return basic + harmonics
+
+
+def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write the Gaussians in their order, block by block.
+
+    Raises:
+        SceneFileError: nothing to write, values that are not finite, or more than the 4 GiB that a GLB can
+            hold.
+        OSError: the file cannot be written.
+    """
+    scene = selected(gaussians, path, options)
+    check_scales(scene, path)
+    layout = attributes(scene.sh_degree)
+    text = gltf.json_bytes(_document(scene, layout))
+    room = padded(len(text))
+    length = len(scene) * sum(attribute.item_bytes for attribute in layout)
+    total = gltf.glb_bytes(room, length)
+    if total > gltf.MAX_BYTES:
+        advice = "Leave faint ones out with min_opacity, or export a Gaussian PLY."
+        raise gltf.too_large(path, f"{len(scene)} Gaussians need", total, advice)
+    write_glb(path, room, length, _data(scene, layout), lambda: text)
+    return (path,)
+
+
+def _data(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> Iterator[bytes]:
+    for attribute in layout:
+        kind = "u1" if attribute.component == UNSIGNED_BYTE else "<f4"
+        for block in blocks(scene):
+            yield attribute.rows(block).astype(kind, copy=False).tobytes()
+
+
+def _document(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str, object]:
+    low, high = scene.means_world.min(axis=0), scene.means_world.max(axis=0)
+    views: list[dict[str, object]] = []
+    accessors: list[dict[str, object]] = []
+    offset = 0
+    for number, attribute in enumerate(layout):
+        length = len(scene) * attribute.item_bytes
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": length, "target": gltf.ARRAY_BUFFER})
+        offset += length
+        accessor = gltf.accessor(number, attribute.component, len(scene), attribute.kind)
+        if attribute.component == UNSIGNED_BYTE:
+            accessor["normalized"] = True
+        accessors.append(accessor)
+    # The half turn about x swaps and negates the bounds of y and z.
+    accessors[0] |= {
+        "min": [float(low[0]), float(-high[1]), float(-high[2])],
+        "max": [float(high[0]), float(-low[1]), float(-low[2])],
+    }
+    primitive = {
+        "attributes": {attribute.semantic: number for number, attribute in enumerate(layout)},
+        "mode": gltf.POINTS,
+        "extensions": {
+            EXTENSION: {
+                "kernel": "ellipse",
+                "colorSpace": COLOUR_SPACE,
+                "projection": "perspective",
+                "sortingMethod": "cameraDistance",
+            }
+        },
+    }
+    return {
+        "asset": {"version": "2.0", "generator": "octasplat"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "octasplat", "mesh": 0}],
+        "meshes": [{"name": "gaussians", "primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+
+
 def _recognises(head: bytes) -> bool:
     return head.startswith(b"glTF")
 
 
 register(Importer("khr-glb", ("*.glb",), "glTF points with KHR_gaussian_splatting", read, _recognises))
+register(
+    Exporter(
+        "khr-glb",
+        ("*.splats.glb", "*_splats.glb", "*-splats.glb", "splats.glb"),
+        "Gaussians as glTF points with KHR_gaussian_splatting",
+        write,
+    )
+)

@@ -1,13 +1,9 @@
-"""Meshes that come back from an editor, or that drive a scene, in whatever of three formats."""
+"""Meshes that come back from an editor, or that drive a scene, whatever file they were in."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
-
-from engine.errors import SceneFileError
 
 
 @dataclass(frozen=True)
@@ -40,30 +36,13 @@ class Mesh:
         return len(self.vertices)
 
 
-MESH_SUFFIXES = (".ply", ".obj", ".glb")
-
-
-def read_mesh(path: Path) -> Mesh:
-    """Read a PLY, OBJ or GLB mesh.
-
-    Raises:
-        SceneFileError: another suffix, a file that cannot be read, is damaged or compressed, or has vertices
-            that are not finite.
-    """
-    from engine.files.mesh_glb import read_glb
-    from engine.files.mesh_obj import read_obj
-    from engine.files.mesh_ply import read_ply_mesh
-
-    readers: dict[str, Callable[[Path], Mesh]] = {".ply": read_ply_mesh, ".obj": read_obj, ".glb": read_glb}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise SceneFileError(f"{path}: is no mesh that is read here; save it as .ply, .obj or .glb.")
-    mesh = reader(path)
-    if len(mesh) == 0:
-        raise SceneFileError(f"{path}: holds no vertices.")
-    bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
-    if bad:
-        raise SceneFileError(f"{path}: {bad} of {len(mesh)} vertices are not finite; save the mesh again.")
-    if len(mesh.triangles) and not (mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh)):
-        raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
-    return mesh
+def stated_q(comments: tuple[str, ...]) -> float | None:
+    """The chi-square quantile that our exporters write as a comment, or None."""
+    for comment in comments:
+        words = comment.split()
+        if len(words) == 2 and words[0] == "octasplat_q":
+            try:
+                return float(words[1])
+            except ValueError:
+                return None
+    return None

@@ -1,7 +1,13 @@
-"""Meshes from OBJ, fast: whole blocks of the file are sorted by kind of line and parsed at once."""
+"""Meshes as OBJ: octagons of a scene out, surfaces out, edited meshes in.
+
+Octagons: plain geometry for any program, with vertex colours, an MTL and the radial texture beside it. OBJ
+has no opacity per vertex, so the Gaussians' own opacities are lost; the texture keeps the fall-off.
+
+Reading is fast: whole blocks of the file are sorted by kind of line and parsed at once.
+"""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -10,13 +16,26 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from engine.errors import SceneFileError
-from engine.files.mesh import Mesh
-from engine.files.mesh_ply import stated_q
+from engine.files.mesh import Mesh, stated_q
+from engine.files.octagon_soup import BATCH, OctagonBatch, OctagonSoup
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
+from engine.files.textures import grey_png, png_bytes
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.octagon import SIDES, octagon_triangles
+from engine.surface.mesh import TriangleMesh
+from engine.writing import replacing, write_text
 
 BLOCK_BYTES = 1 << 22
 NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space
 MAX_HEADER_LINES = 64
 DIGIT_LINES = 2000
+LINES_AT_ONCE = 100_000
+MATERIAL = "octagons"
+POSITION_LINE = "v %.9g %.9g %.9g"
+COLOUR_END = " %.5g %.5g %.5g\n"
+TEXTURE_LINE = "vt %.6f %.6f\n"
+FACE_LINE = "f %d/%d %d/%d %d/%d\n"
 
 
 @dataclass
@@ -31,7 +50,7 @@ class _Parts:
     uv_count: int = 0
 
 
-def read_obj(path: Path) -> Mesh:
+def read(path: Path) -> Mesh:
     """Read positions, texture coordinates and faces of an OBJ; colours, normals and groups are passed over.
 
     Raises:
@@ -206,3 +225,91 @@ def _uv_of_vertices(path: Path, parts: _Parts, count: int) -> Float32[np.ndarray
             raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
         uv[vertices] = table[places]
     return uv
+
+
+def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write ``path``, ``<stem>.mtl`` and ``<stem>_alpha.png``; coordinates keep every float32 bit.
+
+    Raises:
+        SceneFileError: nothing to write, or values that are not finite.
+        OSError: a file cannot be written.
+    """
+    soup = OctagonSoup(gaussians, path, options)
+    material, texture = path.with_suffix(".mtl"), path.with_name(f"{path.stem}_alpha.png")
+    with replacing(texture) as temporary:
+        temporary.write_bytes(grey_png(options.texture_size, options.q))
+    write_text(material, f"{_material(MATERIAL)}map_d {texture.name}\n")
+    with replacing(path) as temporary, temporary.open("wb") as handle:
+        for text in _octagon_lines(soup, material.name):
+            handle.write(text.encode())
+    return path, material, texture
+
+
+def _material(name: str) -> str:
+    return f"newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 0\n"
+
+
+def _octagon_lines(soup: OctagonSoup, material_name: str) -> Iterator[str]:
+    yield (
+        f"# octasplat octagons: {SIDES} vertices and 6 triangles per Gaussian, in the order of the scene\n"
+        f"# octasplat_q {soup.q!r}\n# octasplat_gaussians {soup.scene_size}\n"
+        f"mtllib {material_name}\no octagons\nusemtl {MATERIAL}\n"
+    )
+    for batch in soup.batches():
+        yield _vertex_lines(batch)
+    for start in range(0, len(soup), BATCH):
+        count = min(BATCH, len(soup) - start)
+        indices = octagon_triangles(count) + (1 + start * SIDES)
+        yield FACE_LINE * len(indices) % tuple(np.repeat(indices.reshape(-1), 2).tolist())
+
+
+def _vertex_lines(batch: OctagonBatch) -> str:
+    """The ``v`` and ``vt`` lines of a batch; one big format string beats a call per line many times over."""
+    count = len(batch.ids)
+    octagons = (POSITION_LINE + "\0") * SIDES * count % tuple(batch.corners_world.reshape(-1).tolist())
+    positions = octagons.split("\0")
+    colours = [COLOUR_END % tuple(rgb) for rgb in batch.rgb_srgb.tolist()]
+    vertices = "".join([positions[k] + colours[k // SIDES] for k in range(count * SIDES)])
+    return vertices + TEXTURE_LINE * (count * SIDES) % tuple(batch.uv.reshape(-1).tolist())
+
+
+def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
+    """Write a surface; vertex colours stand behind the positions, a texture in an MTL and a PNG beside it.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    head, files = "# octasplat surface\n", [path]
+    if mesh.texture_srgb is not None:
+        material, image = path.with_suffix(".mtl"), path.with_suffix(".png")
+        with replacing(image) as temporary:
+            temporary.write_bytes(png_bytes(mesh.texture_srgb))
+        write_text(material, f"{_material('surface')}map_Kd {image.name}\n")
+        head += f"mtllib {material.name}\nusemtl surface\n"
+        files += [material, image]
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as handle:
+        handle.write(head)
+        vertices = (
+            mesh.vertices_world if mesh.rgb_srgb is None else np.hstack([mesh.vertices_world, mesh.rgb_srgb])
+        )
+        _write_lines(handle.write, "v %.7g %.7g %.7g" + " %.4g" * (vertices.shape[1] - 3), vertices)
+        numbers = mesh.faces.astype(np.int64) + 1
+        if mesh.uv is None:
+            _write_lines(handle.write, "f %d %d %d", numbers)
+        else:
+            _write_lines(handle.write, "vt %.7g %.7g", mesh.uv * [1, -1] + [0, 1])  # from the lower left
+            _write_lines(handle.write, "f %d/%d %d/%d %d/%d", np.repeat(numbers, 2, axis=1))
+    return tuple(files)
+
+
+def _write_lines(write: Callable[[str], object], line: str, rows: np.ndarray) -> None:
+    for start in range(0, len(rows), LINES_AT_ONCE):
+        part = rows[start : start + LINES_AT_ONCE]
+        write((line + "\n") * len(part) % tuple(part.reshape(-1).tolist()))
+
+
+register(
+    Exporter("obj", ("*.obj",), "octagon mesh as OBJ with vertex colours, without opacity", write_octagons)
+)
+register(MeshReader("obj", ("*.obj",), read))
+register(SurfaceWriter("obj", ("*.obj",), write_surface, textured=True))

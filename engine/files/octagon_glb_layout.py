@@ -1,23 +1,30 @@
 """Where everything lies in a GLB of octagons, and the JSON that says so."""
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
 
+from engine.files.gltf import (
+    ARRAY_BUFFER,
+    CLAMP_TO_EDGE,
+    ELEMENT_ARRAY_BUFFER,
+    FLOAT,
+    HALF_TURN_ABOUT_X,
+    LINEAR,
+    UNSIGNED_INT,
+    accessor,
+    glb_bytes,
+    json_bytes,
+    padded,
+    vector_type,
+)
 from engine.files.options import ExportOptions
 from engine.gaussians.octagon import FAN, SIDES
 
 OPAQUE_CUTOFF = 0.2
 """``opaque``: a pixel is drawn where opacity times fall-off reaches this; best of 0.03 to 0.6 on a
 trained scene (docs/opening/threejs.md)."""
-HEADER_BYTES, CHUNK_HEADER_BYTES = 12, 8
-ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-FLOAT, UNSIGNED_INT = 5126, 5125
-LINEAR, CLAMP_TO_EDGE = 9729, 33071
 WIDEST_NUMBER = float(np.float32(-1.1754943508222875e-38))
-HALF_TURN_ABOUT_X = [1.0, 0.0, 0.0, 0.0]
-"""glTF writes quaternions x, y, z, w."""
 
 Bounds = tuple[list[float], list[float]]
 
@@ -32,7 +39,7 @@ class Attribute:
     @property
     def type(self) -> str:
         """The shape, as glTF names it."""
-        return "SCALAR" if self.width == 1 else f"VEC{self.width}"
+        return vector_type(self.width)
 
 
 OWN_ATTRIBUTES = (Attribute("POSITION", 3), Attribute("COLOR_0", 4), Attribute("TEXCOORD_0", 2))
@@ -70,7 +77,7 @@ class GlbLayout:
                 self._add_view(size * SIDES * attribute.width * 4, target=ARRAY_BUFFER)
         widest = ([WIDEST_NUMBER] * 3, [WIDEST_NUMBER] * 3)
         self.json_room = padded(len(self.json([widest] * len(chunk_sizes))))
-        self.total = HEADER_BYTES + 2 * CHUNK_HEADER_BYTES + self.json_room + self.length
+        self.total = glb_bytes(self.json_room, self.length)
 
     def _add_view(self, length: int, **keys: int) -> None:
         self._views.append({"buffer": 0, "byteOffset": self.length, "byteLength": length, **keys})
@@ -78,7 +85,7 @@ class GlbLayout:
 
     def json(self, bounds: list[Bounds]) -> bytes:
         """The JSON part, given each chunk's smallest and largest coordinates."""
-        return json.dumps(self._document(bounds), separators=(",", ":"), allow_nan=False).encode()
+        return json_bytes(self._document(bounds))
 
     def _document(self, bounds: list[Bounds]) -> dict[str, object]:
         accessors: list[dict[str, object]] = []
@@ -88,12 +95,12 @@ class GlbLayout:
             first_view = self._shared_views + chunk * len(self._attributes)
             for place, attribute in enumerate(self._attributes):
                 used[attribute.semantic] = len(accessors)
-                accessors.append(_accessor(first_view + place, FLOAT, size * SIDES, attribute.type))
+                accessors.append(accessor(first_view + place, FLOAT, size * SIDES, attribute.type))
             accessors[used["POSITION"]] |= {"min": bounds[chunk][0], "max": bounds[chunk][1]}
             if self._options.ids:
                 used[CORNER.semantic] = len(accessors)
-                accessors.append(_accessor(2, FLOAT, size * SIDES, CORNER.type))
-            accessors.append(_accessor(1, UNSIGNED_INT, size * len(FAN) * 3, "SCALAR"))
+                accessors.append(accessor(2, FLOAT, size * SIDES, CORNER.type))
+            accessors.append(accessor(1, UNSIGNED_INT, size * len(FAN) * 3, "SCALAR"))
             meshes.append(
                 {"primitives": [{"attributes": used, "indices": len(accessors) - 1, "material": 0}]}
             )
@@ -119,15 +126,6 @@ class GlbLayout:
             "bufferViews": self._views,
             "buffers": [{"byteLength": self.length}],
         }
-
-
-def padded(length: int) -> int:
-    """``length`` rounded up to the four bytes to which a GLB aligns everything."""
-    return -(-length // 4) * 4
-
-
-def _accessor(view: int, component: int, count: int, kind: str) -> dict[str, object]:
-    return {"bufferView": view, "componentType": component, "count": count, "type": kind}
 
 
 def _material(opaque: bool) -> dict[str, object]:

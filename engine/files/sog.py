@@ -1,7 +1,8 @@
 """SOG of PlayCanvas: lossless images of quantised parameters with a ``meta.json``, zipped or in a folder.
 
 Version 2 looks scales and colours up in code books; the older layout without a version spreads them between
-bounds. Positions have 16 bits in sign(x) ln(1 + |x|); higher harmonics are entries of a palette.
+bounds. Positions have 16 bits in sign(x) ln(1 + |x|); higher harmonics are entries of a palette. Written by
+the program splat-transform, where that is.
 """
 
 import json
@@ -16,8 +17,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from engine.errors import SceneFileError
 from engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
-from engine.files.importing import Importer, register
+from engine.files.gaussian_ply import write_gaussian_ply
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, Importer, register
+from engine.files.selection import selected
+from engine.files.splat_transform import convert
 from engine.gaussians.flattening import GaussianCloud
+from engine.gaussians.model import FlatGaussians
+from engine.writing import replacing
 
 META = "meta.json"
 PALETTE_COLUMNS = 64
@@ -227,6 +234,25 @@ def _rest(
     return palette[entry]
 
 
+def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write a bundled SOG; the program puts the Gaussians into an order of its own.
+
+    Raises:
+        SceneFileError: nothing to write, values that are not finite, or the program is missing or fails.
+        OSError: the file cannot be written.
+    """
+    scene = selected(gaussians, path, options)
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, replacing(path) as temporary:
+        source, target = Path(folder) / "scene.ply", Path(folder) / "scene.sog"
+        write_gaussian_ply(scene, source)
+        try:
+            convert(source, target)
+        except SceneFileError as error:
+            raise SceneFileError(str(error).replace(str(target), str(path), 1)) from error
+        temporary.write_bytes(target.read_bytes())
+    return (path,)
+
+
 def _recognises(head: bytes) -> bool:
     return head.startswith(b"PK\x03\x04")
 
@@ -236,3 +262,4 @@ register(
         "sog", ("*.sog", META), "SOG of PlayCanvas, bundled or as a folder's meta.json", read, _recognises
     )
 )
+register(Exporter("sog", ("*.sog",), "SOG of PlayCanvas, the smallest; needs splat-transform", write))

@@ -1,7 +1,9 @@
-"""The texture that carries the Gaussian fall-off, as a small PNG."""
+"""Textures as PNG in memory: the one that carries the Gaussian fall-off, and those of surfaces."""
 
 import struct
+import tempfile
 import zlib
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -26,6 +28,16 @@ def white_with_alpha_png(size: int, q: float) -> bytes:
 def grey_png(size: int, q: float) -> bytes:
     """The fall-off as a grey image, as MTL's ``map_d`` wants it (it takes the luminance)."""
     return _png(to_bytes(radial_alpha(size, q))[..., None], colour_type=0)
+
+
+def png_bytes(rgb_srgb: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """An image as it stands in a PNG file."""
+    from engine.render.images import write_png  # loads the image library, which the front end has not
+
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder:
+        path = Path(folder) / "texture.png"
+        write_png(path, rgb_srgb.astype(np.float32) / np.float32(255))
+        return path.read_bytes()
 
 
 def _png(pixels: UInt8[np.ndarray, "h w c"], colour_type: int) -> bytes:

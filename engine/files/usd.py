@@ -39,25 +39,22 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """Write ``.usda`` (text), ``.usd`` or ``.usdc`` (binary), or ``.usdz`` (a package).
 
     Raises:
-        SceneFileError: usd-core is missing or too old, nothing to write, values that are not finite, or the
-            file cannot be written.
+        SceneFileError: usd-core is missing or too old, nothing to write, or values that are not finite.
+        OSError: the file cannot be written.
     """
     scene = half_turned(selected(gaussians, path, options))
     check_scales(scene, path)
     pxr = _usd(path)
     suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
-    try:
-        with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, replacing(path) as temporary:
-            layer = Path(folder) / f"scene{suffix}"
-            _write_stage(pxr, scene, layer)
-            if path.suffix.lower() == ".usdz":
-                package = Path(folder) / "scene.usdz"
-                if not pxr["UsdUtils"].CreateNewUsdzPackage(pxr["Sdf"].AssetPath(str(layer)), str(package)):
-                    raise SceneFileError(f"{path}: not written; usd-core could not make the package.")
-                layer = package
-            temporary.write_bytes(layer.read_bytes())
-    except OSError as error:
-        raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, replacing(path) as temporary:
+        layer = Path(folder) / f"scene{suffix}"
+        _write_stage(pxr, scene, layer)
+        if path.suffix.lower() == ".usdz":
+            package = Path(folder) / "scene.usdz"
+            if not pxr["UsdUtils"].CreateNewUsdzPackage(pxr["Sdf"].AssetPath(str(layer)), str(package)):
+                raise SceneFileError(f"{path}: not written; usd-core could not make the package.")
+            layer = package
+        temporary.write_bytes(layer.read_bytes())
     return (path,)
 
 

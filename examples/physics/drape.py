@@ -15,7 +15,7 @@ from mujoco_drop import simulate_cloth
 
 from engine.edit.deform import deform_to, deformation_corners
 from engine.edit.proxy import Proxy, bind
-from engine.files.importing import read_scene
+from engine.files import read_scene
 from engine.gaussians.model import FlatGaussians
 
 

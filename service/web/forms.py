@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from engine.files.registry import exporters
+from engine.files import exporters
 from engine.train.config import preset
 from workers.kinds import JobKind
 

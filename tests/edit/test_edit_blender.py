@@ -9,8 +9,7 @@ from edit_scenes import assert_same, covariance_errors, moved_covariances, twist
 
 from engine.edit.recovery import EditOptions, recover_edit
 from engine.errors import SceneFileError
-from engine.files.mesh import read_mesh
-from engine.files.registry import export_scene
+from engine.files import export_scene, read_mesh
 from engine.gaussians.model import FlatGaussians
 
 pytestmark = pytest.mark.tools

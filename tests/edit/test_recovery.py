@@ -17,9 +17,7 @@ from edit_scenes import (
 
 from engine.edit.recovery import EditOptions, EditReport, recover_edit
 from engine.errors import SceneFileError
-from engine.files.mesh import Mesh, read_mesh
-from engine.files.options import ExportOptions
-from engine.files.registry import export_scene
+from engine.files import ExportOptions, Mesh, export_scene, read_mesh
 from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES

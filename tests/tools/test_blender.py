@@ -9,9 +9,8 @@ import pytest
 from blender_python import IMPORT_SCRIPT, SCRIPTS, run_blender
 from shell_scene import our_view, psnr_db, shell_cameras, shell_scene, write_shell_cameras
 
-from engine.files.options import ExportOptions
+from engine.files import ExportOptions, export_scene
 from engine.files.ply_container import read_ply
-from engine.files.registry import export_scene
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii
 from engine.render.images import read_image

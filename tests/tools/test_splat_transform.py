@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 from npm_packages import npm_folder
 
+from engine.files import ExportOptions, export_scene, importer_for, read_scene
 from engine.files.gaussian_ply import read_ply_cloud
-from engine.files.importing import importer_for, read_scene
-from engine.files.options import ExportOptions
-from engine.files.registry import export_scene
 from engine.gaussians.flattening import GaussianCloud
 from engine.gaussians.model import FlatGaussians
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "importers"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "files"))
 from cloud_difference import difference
 
 pytestmark = pytest.mark.tools

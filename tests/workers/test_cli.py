@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import engine
-from engine.files.registry import exporters
+from engine.files import exporters
 from workers.options import available_threads
 
 COMMANDS = ("reconstruct", "evaluate", "export", "render", "demo")

@@ -42,7 +42,7 @@ def test_options_reach_a_glb(run, octasplat, tmp_path):
 
 
 def test_help_lists_every_format(octasplat):
-    from engine.files.registry import exporters
+    from engine.files import exporters
 
     text = octasplat("export", "--help").stdout
     for exporter in exporters():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from engine.files import read_scene
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.files.importing import read_scene
 from engine.files.ply_container import PlyWriteElement, write_ply
 from engine.gaussians.model import FlatGaussians
 

@@ -8,9 +8,8 @@ from typing import Any
 
 from engine.config import read_config
 from engine.events import StageProgress, broadcast
+from engine.files import ExportOptions, export_scene
 from engine.files.gaussian_ply import read_gaussian_ply
-from engine.files.options import ExportOptions
-from engine.files.registry import export_scene
 from engine.pipeline import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene

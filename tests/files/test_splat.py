@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
-from engine.files.importing import importer_for, read_scene
+from engine.files import importer_for, read_scene
 
 
 def row(scale: tuple[float, float, float] = (0.5, 0.25, 1e-5)) -> bytes:

@@ -6,7 +6,7 @@ import pytest
 from cloud_difference import difference
 
 from engine.errors import SceneFileError
-from engine.files.importing import importer_for, read_scene
+from engine.files import importer_for, read_scene
 from engine.files.ply_container import PlyWriteElement, write_ply
 from engine.gaussians.flattening import GaussianCloud
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
-from engine.files import mesh_obj
-from engine.files.mesh import read_mesh
+from engine.files import mesh_obj, read_mesh
 from engine.files.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
 
 
@@ -195,5 +194,5 @@ def test_ply_of_gaussians_is_no_mesh(tmp_path: Path) -> None:
 
 
 def test_other_suffixes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(SceneFileError, match=r"save it as \.ply, \.obj or \.glb"):
+    with pytest.raises(SceneFileError, match=r"save it as \.glb, \.ply or \.obj"):
         read_mesh(tmp_path / "mesh.fbx")

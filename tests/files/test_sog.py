@@ -12,8 +12,8 @@ import pytest
 from cloud_difference import difference
 
 from engine.errors import SceneFileError
+from engine.files import importer_for, read_scene
 from engine.files.gaussian_ply import read_ply_cloud
-from engine.files.importing import importer_for, read_scene
 from engine.gaussians.flattening import GaussianCloud
 
 Make = Callable[..., GaussianCloud]

@@ -5,8 +5,8 @@ import pytest
 
 from engine.errors import SceneFileError
 from engine.events import Event, StageFinished, StageStarted
+from engine.files import Importer, importer_for, importers, read_scene, register
 from engine.files.gaussian_ply import write_gaussian_ply
-from engine.files.importing import Importer, importer_for, importers, read_scene, register
 from engine.gaussians.flattening import GaussianCloud
 from engine.gaussians.model import FlatGaussians
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from edit_scenes import random_turn
+from scipy.spatial.transform import Rotation
 
 from engine.gaussians.harmonics import rotate_sh, sh_basis, sh_rotations
 from engine.trace.kernels_sh import write_basis
@@ -27,7 +27,7 @@ def test_turned_colours_are_the_old_ones_seen_from_turned_directions(degree: int
     random = np.random.default_rng(degree)
     count = 40
     sh = random.standard_normal((count, (degree + 1) ** 2, 3)).astype(np.float32)
-    turns = np.stack([random_turn(seed) for seed in range(count)]) * (-1 if mirrored else 1)
+    turns = Rotation.random(count, random_state=degree).as_matrix() * (-1 if mirrored else 1)
     turned = rotate_sh(sh, turns)
     d = directions(30, seed=9)
     new = np.einsum("sk,nkc->nsc", sh_basis(d, degree), turned)
@@ -43,7 +43,7 @@ def test_a_quarter_turn_about_z_permutes_the_first_band() -> None:
 
 
 def test_matrices_are_orthogonal_and_follow_one_another() -> None:
-    a, b = random_turn(1), random_turn(2)
+    a, b = Rotation.random(2, random_state=1).as_matrix()
     both, first, second = (sh_rotations(m[None], 3) for m in (b @ a, a, b))
     for band in range(3):
         size = 2 * band + 3

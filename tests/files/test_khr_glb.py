@@ -9,8 +9,7 @@ import pytest
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
-from engine.files.importing import importer_for, read_scene
-from engine.files.registry import export_scene
+from engine.files import export_scene, importer_for, read_scene
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians

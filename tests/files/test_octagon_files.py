@@ -7,11 +7,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-import engine.files.obj_export as obj_module
-from engine.files import octagon_soup
-from engine.files.options import ExportOptions
+import engine.files.mesh_obj as obj_module
+from engine.files import ExportOptions, export_scene, octagon_soup
 from engine.files.ply_container import read_ply
-from engine.files.registry import export_scene
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import (
     CHI2_2_99,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
-from engine.files.registry import export_scene
+from engine.files import export_scene
 from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians
 

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
-from engine.files.importing import read_scene
-from engine.files.options import ExportOptions
-from engine.files.registry import export_scene, exporter_for
+from engine.files import ExportOptions, export_scene, exporter_for, read_scene
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
 

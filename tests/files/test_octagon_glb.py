@@ -7,12 +7,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-import engine.files.glb_export as glb_module
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
+from engine.files import ExportOptions, export_scene, gltf
 from engine.files.octagon_glb_layout import OPAQUE_CUTOFF
-from engine.files.options import ExportOptions
-from engine.files.registry import export_scene
 from engine.files.spatial import kd_chunks
 from engine.files.textures import radial_alpha
 from engine.gaussians.frames import rotation_matrices
@@ -192,9 +190,9 @@ def test_more_than_a_glb_can_hold_is_refused_before_writing(
     scene = make_scene(100)
     export_scene(scene, tmp_path / "a.glb")
     size = (tmp_path / "a.glb").stat().st_size
-    monkeypatch.setattr(glb_module, "MAX_BYTES", size)
+    monkeypatch.setattr(gltf, "MAX_BYTES", size)
     export_scene(scene, tmp_path / "b.glb")
-    monkeypatch.setattr(glb_module, "MAX_BYTES", size - 1)
+    monkeypatch.setattr(gltf, "MAX_BYTES", size - 1)
     with pytest.raises(SceneFileError, match=r"c\.glb: not written; .*min_opacity.*mesh PLY"):
         export_scene(scene, tmp_path / "c.glb")
     assert not (tmp_path / "c.glb").exists()
@@ -207,7 +205,7 @@ def test_a_scene_too_large_for_one_file_goes_into_several(
     export_scene(scene, tmp_path / "whole.glb")
     whole = Glb(tmp_path / "whole.glb")
     limit = int(0.45 * (tmp_path / "whole.glb").stat().st_size)
-    monkeypatch.setattr(glb_module, "MAX_BYTES", limit)
+    monkeypatch.setattr(gltf, "MAX_BYTES", limit)
     written = export_scene(scene, tmp_path / "a.glb")
     assert [path.name for path in written] == ["a.glb", "a.part2.glb", "a.part3.glb"]
     assert all(path.stat().st_size <= limit for path in written)

@@ -6,10 +6,9 @@ import pytest
 from pydantic import ValidationError
 
 from engine.errors import SceneFileError
+from engine.files import Exporter, ExportOptions, export_scene, exporter_for, exporters, register
 from engine.files.gaussian_ply import read_gaussian_ply
-from engine.files.options import ExportOptions
 from engine.files.ply_container import read_ply_header
-from engine.files.registry import Exporter, export_scene, exporter_for, exporters, register
 from engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., FlatGaussians]
