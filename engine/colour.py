@@ -12,10 +12,10 @@ def srgb_to_linear(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*sha
 
 
 def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Display values of linear values in [0, 1]; values below 0 are treated as 0."""
-    s = np.maximum(linear.astype(np.float64), 0.0)
-    srgb = np.where(s <= 0.0031308, s * 12.92, 1.055 * s ** (1 / 2.4) - 0.055)
-    return srgb.astype(linear.dtype)
+    """Display values of linear values in [0, 1], computed in their precision; those below 0 count as 0."""
+    exponent = linear.dtype.type(1 / 2.4)
+    curve = 1.055 * np.maximum(linear, 0.0031308) ** exponent - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * np.maximum(linear, 0.0), curve)
 
 
 def to_bytes(values: Float[np.ndarray, "*shape"]) -> np.ndarray:
