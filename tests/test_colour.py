@@ -1,6 +1,6 @@
 import numpy as np
 
-from engine.colour import linear_to_srgb, srgb_to_linear, to_bytes
+from engine.colour import linear_to_srgb, rounded_bytes, srgb_to_linear, to_bytes
 
 
 def test_known_values_of_the_srgb_curve() -> None:
@@ -20,3 +20,10 @@ def test_bytes_are_rounded_and_clipped() -> None:
     np.testing.assert_array_equal(
         to_bytes(np.array([-1, 0, 0.499 / 255, 0.501 / 255, 1, 2.0])), [0, 0, 0, 1, 255, 255]
     )
+
+
+def test_halves_are_rounded_to_the_even_step() -> None:
+    halves = (np.arange(8) + 0.5).astype(np.float32)
+    np.testing.assert_array_equal(rounded_bytes(halves), [0, 2, 2, 4, 4, 6, 6, 8])
+    np.testing.assert_array_equal(to_bytes(halves / np.float64(255)), rounded_bytes(halves))
+    np.testing.assert_array_equal(rounded_bytes(np.array([-3.0, 255.4, 300.0])), [0, 255, 255])

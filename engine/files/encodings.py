@@ -25,11 +25,6 @@ def logits_from_bytes(opacities: UInt8[np.ndarray, " n"]) -> Float32[np.ndarray,
     return np.log(opacity / (1.0 - opacity)).astype(np.float32)
 
 
-def bytes_from(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Values in units of one byte step, rounded and clipped to 0 ... 255."""
-    return np.rint(np.clip(values, 0.0, 255.0)).astype(np.uint8)
-
-
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
     """Quaternions of length 1, in float64."""
     q = quats.astype(np.float64)

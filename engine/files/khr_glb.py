@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.colour import linear_to_srgb, srgb_to_linear
+from engine.colour import linear_to_srgb, rounded_bytes, srgb_to_linear
 from engine.errors import SceneFileError
 from engine.files import gltf
 from engine.files.encodings import (
     HALF_TURN_SIGNS,
-    bytes_from,
     half_turn_points,
     half_turn_quats,
     half_turn_sh,
@@ -161,7 +160,7 @@ class _Attribute:
 def _colours(some: FlatGaussians) -> np.ndarray:
     """The fallback of readers that see points only: linear RGB of the constant harmonic, and opacity."""
     linear = srgb_to_linear(np.clip(some.base_rgb_srgb, 0.0, 1.0))
-    return bytes_from(np.concatenate([linear, some.opacities[:, None]], axis=1).astype(np.float64) * 255.0)
+    return rounded_bytes(np.concatenate([linear, some.opacities[:, None]], axis=1).astype(np.float64) * 255.0)
 
 
 def _scales(some: FlatGaussians) -> np.ndarray:

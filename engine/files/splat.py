@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from engine.colour import rounded_bytes
 from engine.errors import SceneFileError
-from engine.files.encodings import bytes_from, logits_from_bytes, sh0_from_rgb, unit_quats
+from engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
 from engine.files.options import ExportOptions
 from engine.files.registry import Exporter, Importer, register
 from engine.files.selection import blocks, check_scales, selected
@@ -62,12 +63,12 @@ def _rows(some: FlatGaussians) -> np.ndarray:
     rows["mean"] = some.means_world
     rows["scale"][:, 0] = FLAT_SCALE
     rows["scale"][:, 1:] = some.scales
-    rows["rgba"][:, :3] = bytes_from(some.base_rgb_srgb.astype(np.float64) * 255.0)
-    rows["rgba"][:, 3] = bytes_from(some.opacities.astype(np.float64) * 255.0)
+    rows["rgba"][:, :3] = rounded_bytes(some.base_rgb_srgb.astype(np.float64) * 255.0)
+    rows["rgba"][:, 3] = rounded_bytes(some.opacities.astype(np.float64) * 255.0)
     unit = unit_quats(some.quats_wxyz)
     # A byte reaches from -1 to 127/128, so a component near 1 is written as its negative.
     largest = np.take_along_axis(unit, np.argmax(np.abs(unit), axis=1)[:, None], axis=1)
-    rows["quat_wxyz"] = bytes_from(np.where(largest > 0, -unit, unit) * 128.0 + 128.0)
+    rows["quat_wxyz"] = rounded_bytes(np.where(largest > 0, -unit, unit) * 128.0 + 128.0)
     return rows
 
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
+from engine.colour import rounded_bytes
 from engine.errors import SceneFileError
 from engine.files.encodings import (
     SQRT_HALF,
-    bytes_from,
     from_smallest_three,
     half_turn_points,
     half_turn_quats,
@@ -120,9 +120,9 @@ def _packed(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
     log_scales = np.concatenate([np.full((len(scene), 1), FLAT_LOG_SCALE), scene.log_scales], axis=1)
     return (
         _packed_positions(scene.means_world.astype(np.float64) * (1 << bits)),
-        bytes_from(scene.opacities.astype(np.float64) * 255.0).tobytes(),
-        bytes_from((scene.sh[:, 0].astype(np.float64) * COLOUR_SCALE + 0.5) * 255.0).tobytes(),
-        bytes_from((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes(),
+        rounded_bytes(scene.opacities.astype(np.float64) * 255.0).tobytes(),
+        rounded_bytes((scene.sh[:, 0].astype(np.float64) * COLOUR_SCALE + 0.5) * 255.0).tobytes(),
+        rounded_bytes((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes(),
         _packed_rotations(scene),
         _packed_harmonics(scene),
     )
@@ -159,7 +159,7 @@ def _packed_harmonics(scene: FlatGaussians) -> bytes:
     steps = np.full((scene.sh.shape[1] - 1, 1), SH_STEPS[1], dtype=np.float64)
     steps[:3] = SH_STEPS[0]
     bins = np.rint(scene.sh[:, 1:].astype(np.float64) * 128.0 / steps)
-    return bytes_from(bins * steps + 128.0).tobytes()
+    return rounded_bytes(bins * steps + 128.0).tobytes()
 
 
 def _recognises(head: bytes) -> bool:
