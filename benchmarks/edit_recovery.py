@@ -16,11 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from engine.edit.local_maps import legs_world
-from engine.edit.mesh import Mesh, read_mesh
 from engine.edit.recovery import EditOptions, recover_edit
-from engine.export.registry import export_scene
+from engine.files import Mesh, export_scene, read_mesh, read_scene
 from engine.gaussians.model import FlatGaussians
-from engine.importers import read_scene
 
 Map = Callable[[np.ndarray], np.ndarray]
 STEP = 1e-5

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.export.registry import export_scene
+from engine.files import export_scene
+from engine.files.ply_container import read_ply
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply_format import read_ply
 
 
 def random_scene(count: int, degree: int) -> FlatGaussians:

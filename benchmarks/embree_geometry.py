@@ -22,10 +22,10 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
+from engine.files import read_scene
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_radii
 from engine.gaussians.order import morton_order
-from engine.importers import read_scene
 from engine.trace.cpu.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon
 from engine.trace.cpu.kernels_records import write_boxes, write_records
 from engine.trace.cpu.memory import aligned_empty

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.export.registry import export_scene
+from engine.files import export_scene
 from engine.gaussians.model import FlatGaussians
 
 NAMES = {

@@ -16,9 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.export.registry import export_scene
+from engine.files import export_scene, read_scene
 from engine.gaussians.model import FlatGaussians
-from engine.importers import read_scene
 
 NAMES = ("scene.ply", "scene.splat", "scene.spz", "scene.splats.glb", "scene.usdc")
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from engine.files import read_scene
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import CHI2_3_99, octagon_radii
-from engine.importers import read_scene
 from engine.render.renderer import tile_order
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings

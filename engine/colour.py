@@ -1,7 +1,7 @@
-"""Transfer functions between display (sRGB-encoded) and linear colour values (IEC 61966-2-1)."""
+"""Display (sRGB-encoded) and linear colour values (IEC 61966-2-1), and values as bytes."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 
 def srgb_to_linear(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -12,15 +12,20 @@ def srgb_to_linear(srgb: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*sha
 
 
 def linear_to_srgb(linear: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Display values of linear values in [0, 1]; values below 0 are treated as 0."""
-    s = np.maximum(linear.astype(np.float64), 0.0)
-    srgb = np.where(s <= 0.0031308, s * 12.92, 1.055 * s ** (1 / 2.4) - 0.055)
-    return srgb.astype(linear.dtype)
+    """Display values of linear values in [0, 1], computed in their precision; those below 0 count as 0."""
+    exponent = linear.dtype.type(1 / 2.4)
+    curve = 1.055 * np.maximum(linear, 0.0031308) ** exponent - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * np.maximum(linear, 0.0), curve)
 
 
-def to_bytes(values: Float[np.ndarray, "*shape"]) -> np.ndarray:
-    """Values in [0, 1], clipped and rounded, as uint8 of the same shape."""
-    return np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)
+def to_bytes(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Values in [0, 1], clipped and rounded to the nearest of 256 steps (halves to even)."""
+    return rounded_bytes(values * 255.0)
+
+
+def rounded_bytes(steps: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Values in units of one byte step, clipped to 0 ... 255 and rounded (halves to even)."""
+    return np.rint(np.clip(steps, 0.0, 255.0)).astype(np.uint8)
 
 
 def composited(

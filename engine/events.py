@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any, ClassVar
 
 from engine.errors import Cancelled
-from engine.files import telling_of_room
+from engine.writing import telling_of_room
 
 
 @dataclass(frozen=True)

@@ -32,12 +32,10 @@ from engine.events import (
     Warned,
     broadcast,
 )
-from engine.export.options import ExportOptions
-from engine.export.registry import check_writable
-from engine.export.several import export_files
-from engine.files import write_json
+from engine.files import ExportOptions, check_writable
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.files.several import export_files
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
 from engine.threads import use_threads
 from engine.train.batches import BatchSource
@@ -49,6 +47,7 @@ from engine.train.parts import make_shading
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 from engine.versions import versions
+from engine.writing import write_json
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from engine.export.registry import exporter_for, exporters
+from engine.files import exporter_for, exporters
 from service.problems import Problem
 from workers.records.database import Connection
 from workers.records.rows import WorkerRow

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from engine.edit.harmonics import rotate_sh
 from engine.edit.local_maps import frames_from_skewed_legs, has_area, surface_turns
+from engine.gaussians.harmonics import rotate_sh
 from engine.gaussians.model import FlatGaussians
 
 ROWS_AT_ONCE = 1 << 15

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from engine.edit.mesh import Mesh
+from engine.files import Mesh
 from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
 
 Axes = Literal["x0", "x90", "x180", "x270"]

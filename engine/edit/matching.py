@@ -10,9 +10,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from engine.edit.apply import blocks
-from engine.edit.mesh import Mesh
 from engine.edit.octagon_fit import LEAST_CORNERS
 from engine.errors import SceneFileError
+from engine.files import Mesh
 from engine.gaussians.octagon import SIDES, corner_directions
 
 ID_TOLERANCE = 1e-3

@@ -12,10 +12,10 @@ from engine.edit.apply import apply_legs_to, blocks, without_harmonics
 from engine.edit.axes import TURNS, Axes, detect_axes, infer_q, usual_axes
 from engine.edit.local_maps import has_area, legs_world, solid_derivatives
 from engine.edit.matching import Octagons, match_octagons
-from engine.edit.mesh import Mesh
 from engine.edit.octagon_fit import LEAST_CORNERS, fit_octagons
 from engine.edit.surroundings import carry, flipped_against, neighbour_turns
 from engine.errors import SceneFileError
+from engine.files import Mesh
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians, concatenate
 from engine.gaussians.octagon import (

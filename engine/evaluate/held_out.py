@@ -12,7 +12,6 @@ from engine.evaluate.gallery import ViewImages, WorstAndBest
 from engine.evaluate.report import write_report
 from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
 from engine.events import Listener, StageProgress
-from engine.files import write_json
 from engine.gaussians.model import FlatGaussians
 from engine.render.images import write_png
 from engine.render.names import render_names
@@ -21,6 +20,7 @@ from engine.scene import Dataset
 from engine.shading.protocol import ShadingModel
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import Tracer, TraceSettings
+from engine.writing import write_json
 
 RENDERS, METRICS, REPORT = "renders", "metrics.json", "report.html"
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.ndimage import correlate1d
 
-from engine.render.images import to_8_bits
+from engine.colour import to_bytes
 
 WINDOW = 11
 SIGMA = 1.5
@@ -54,7 +54,7 @@ class FlipError(NamedTuple):
 
 def rounded_to_8_bits(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
     """The image as it would come back from an 8-bit file."""
-    return to_8_bits(image).astype(np.float32) / np.float32(255.0)
+    return to_bytes(image).astype(np.float32) / np.float32(255.0)
 
 
 def filled_outside(

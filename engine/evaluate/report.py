@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from engine.errors import OutputError
 from engine.evaluate.curves import duration, training_charts
 from engine.evaluate.gallery import BEST, MAGMA, WORST, ViewImages, data_uri, embedded_names, magma
-from engine.files import write_text
+from engine.writing import write_text
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from typing import IO, Any
 
 from engine.errors import Cancelled, DatasetError, PosesCrashed
 from engine.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
-from engine.files import write_json
 from engine.poses.child import FOUND, FOUND_RECORD, Request
 from engine.poses.config import DEFAULT_CONFIG, MODEL, RECORD, PosesConfig
 from engine.poses.photographs import photographs_in, photographs_sha256
+from engine.writing import write_json
 
 _WORK = "work"
 _LOOK_SECONDS = 0.5

@@ -10,12 +10,12 @@ import pycolmap
 
 from engine.errors import DatasetError
 from engine.events import Listener, StageFinished, StageProgress, StageStarted, Warned
-from engine.files import write_json
 from engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, STAGE, PosesConfig
 from engine.poses.features import find_features, match_pairs, quick_pairs
 from engine.poses.mapping import map_photographs, rank
 from engine.poses.pairs import Pair, all_pairs, pairs_with
 from engine.scene.images import read_image_info
+from engine.writing import write_json
 
 SMALL_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""

@@ -9,19 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32
 
-from engine.colour import srgb_to_linear
+from engine.colour import srgb_to_linear, to_bytes
 from engine.errors import DatasetError, OutputError
-from engine.files import replacing
+from engine.writing import replacing
 
 _AS_STORED = "oiio:UnassociatedAlpha"
 """Keeps OpenImageIO from multiplying or dividing colours by alpha on its own."""
-
-
-def to_8_bits(image: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
-    """Display values as bytes: clipped to [0, 1] and rounded to the nearest of 256 steps."""
-    return np.asarray(np.floor(np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
 
 
 def exr_layers(
@@ -72,7 +67,7 @@ def write_png(
     height, width, channels = image.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
     spec.attribute("oiio:ColorSpace", "sRGB")
-    _write(path, spec, to_8_bits(image))
+    _write(path, spec, to_bytes(image))
 
 
 def write_webp(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"], *, quality: int = 90) -> None:
@@ -84,7 +79,7 @@ def write_webp(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"], *, quality: i
     height, width, channels = rgb_srgb.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
     spec.attribute("Compression", f"webp:{quality}")
-    _write(path, spec, to_8_bits(rgb_srgb))
+    _write(path, spec, to_bytes(rgb_srgb))
 
 
 def write_exr(path: Path, channels: Mapping[str, Float32[np.ndarray, "h w"]], *, half: bool = False) -> None:

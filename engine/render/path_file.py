@@ -24,8 +24,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from engine.errors import ConfigError, OutputError
-from engine.files import write_json
 from engine.render.cameras import RenderCamera, focal_from_fov
+from engine.writing import write_json
 
 _RIGID_TOLERANCE = 1e-3
 

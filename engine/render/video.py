@@ -14,9 +14,9 @@ import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float32
 
+from engine.colour import to_bytes
 from engine.errors import OutputError
-from engine.files import replacing
-from engine.render.images import to_8_bits
+from engine.writing import replacing
 
 DEFAULT_CRF = 18
 
@@ -86,7 +86,7 @@ class VideoWriter:
                 f"A frame of {width} x {height} pixels does not fit the video {self._path} of "
                 f"{self._width} x {self._height}."
             )
-        frame = np.pad(to_8_bits(rgb_srgb), [(0, height % 2), (0, width % 2), (0, 0)], mode="edge")
+        frame = np.pad(to_bytes(rgb_srgb), [(0, height % 2), (0, width % 2), (0, 0)], mode="edge")
         try:
             self._process.stdin.write(np.ascontiguousarray(frame).data)
         except OSError as error:

@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Int64
 
 from engine.errors import DatasetError, NoSpaceLeft, OutputError
-from engine.files import replacing, write_json
 from engine.scene.image_info import ImageInfo
 from engine.scene.images import read_mask, read_photo
 from engine.scene.mapped import MappedArray
 from engine.scene.model import SceneModel, View
+from engine.writing import replacing, write_json
 
 CACHE_VERSION = 1
 """Raised whenever the contents of the cache files change for the same photographs."""

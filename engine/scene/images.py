@@ -7,6 +7,7 @@ import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float32, UInt8
 
+from engine.colour import linear_to_srgb
 from engine.errors import DatasetError
 from engine.scene.image_info import ImageInfo
 from engine.threads import one_torch_thread
@@ -73,7 +74,7 @@ def read_photo(
     if coverage is not None and not straight:
         colours = _divided_by_alpha(colours, coverage)
     if is_float:
-        colours = srgb_encode(np.clip(np.nan_to_num(colours, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0))
+        colours = linear_to_srgb(np.clip(np.nan_to_num(colours, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0))
     if resized and coverage is None:
         colours = resize(colours, width_px, height_px)
     elif resized and coverage is not None:
@@ -131,12 +132,6 @@ def resize(pixels: Pixels, width_px: int, height_px: int, mode: str = "bicubic")
     with torch.no_grad(), one_torch_thread():
         small = torch.nn.functional.interpolate(planes, (height_px, width_px), mode=mode, antialias=True)
     return np.ascontiguousarray(small[0].permute(1, 2, 0).numpy())
-
-
-def srgb_encode(linear: Float32[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """Display values of linear light in [0, 1] (IEC 61966-2-1)."""
-    curve = 1.055 * np.power(np.maximum(linear, np.float32(0.0031308)), np.float32(1 / 2.4)) - 0.055
-    return np.where(linear <= 0.0031308, 12.92 * linear, curve).astype(np.float32)
 
 
 def _open(path: Path) -> tuple[Any, Any]:

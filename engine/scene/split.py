@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from engine.errors import ConfigError, DatasetError
-from engine.files import write_json
+from engine.writing import write_json
 
 
 def split_views(

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from engine.files import telling_of_room
 from engine.render.cameras import RenderCamera
 from engine.render.renderer import RenderedImage, render_rays
 from engine.surface.options import SurfaceOptions
 from engine.trace.protocol import Tracer
+from engine.writing import telling_of_room
 
 Progress = Callable[[int, int], None]
 EMPTY_ALPHA = 0.05

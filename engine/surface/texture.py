@@ -3,9 +3,10 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from scipy.ndimage import distance_transform_edt
 
+from engine.colour import to_bytes
 from engine.surface.kernels_texture import rasterise
 from engine.surface.mesh import TriangleMesh
 
@@ -69,5 +70,4 @@ def with_texture(layout: TextureLayout, rgb_srgb: Float32[np.ndarray, "n 3"], si
     if known.any():
         rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
         image = image[rows, columns]
-    texture: UInt8[np.ndarray, "h w 3"] = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    return replace(layout.mesh, texture_srgb=texture)
+    return replace(layout.mesh, texture_srgb=to_bytes(image))

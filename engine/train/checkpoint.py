@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from engine.errors import CheckpointError, DamagedCheckpoint
-from engine.files import replacing
 from engine.gaussians.model import FlatGaussians
 from engine.train.optimiser import Adam
 from engine.train.state import TrainState
+from engine.writing import replacing
 
 FORMAT = 2
 KEEP = 2

@@ -15,8 +15,8 @@ from mujoco_drop import simulate_cloth
 
 from engine.edit.deform import deform_to, deformation_corners
 from engine.edit.proxy import Proxy, bind
+from engine.files import read_scene
 from engine.gaussians.model import FlatGaussians
-from engine.importers import read_scene
 
 
 def round_grid(

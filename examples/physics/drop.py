@@ -14,9 +14,8 @@ import numpy as np
 from mujoco_drop import simulate
 from soft_body import Rider, belongs_to, lattice_around
 
-from engine.edit.mesh import read_mesh
+from engine.files import read_mesh, read_scene
 from engine.gaussians.model import FlatGaussians, concatenate
-from engine.importers import read_scene
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.images import write_png
 from engine.render.paths import look_at

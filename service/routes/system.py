@@ -7,7 +7,7 @@ from fastapi import APIRouter, Response
 
 import engine
 from engine.errors import ConfigError
-from engine.export.registry import exporters
+from engine.files import exporters
 from service.auth import Admin, Reader
 from service.problems import not_found
 from service.routes import problems

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from engine.export.registry import exporters
+from engine.files import exporters
 from engine.train.config import preset
 from workers.work.kinds import JobKind
 

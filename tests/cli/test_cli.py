@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import engine
-from engine.export.registry import exporters
+from engine.files import exporters
 from workers.cli.options import available_threads
 
 COMMANDS = ("reconstruct", "evaluate", "export", "render", "demo")

@@ -7,8 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from engine.gaussians.ply import read_gaussian_ply
-from engine.gaussians.ply_format import PlyWriteElement, write_ply
+from engine.files.gaussian_ply import read_gaussian_ply
+from engine.files.ply_container import PlyWriteElement, write_ply
 
 
 def test_scene_to_glb(run, octasplat, tmp_path):
@@ -42,7 +42,7 @@ def test_options_reach_a_glb(run, octasplat, tmp_path):
 
 
 def test_help_lists_every_format(octasplat):
-    from engine.export.registry import exporters
+    from engine.files import exporters
 
     text = octasplat("export", "--help").stdout
     for exporter in exporters():

@@ -9,10 +9,9 @@ import pytest
 from edit_scenes import assert_same, cube
 
 from engine.edit.affine import transform
-from engine.edit.mesh import read_mesh
-from engine.export.registry import export_scene
+from engine.files import export_scene, read_mesh
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 
 Make = Callable[..., FlatGaussians]
 
@@ -85,7 +84,7 @@ def test_edit_tells_of_turned_axes(octasplat, scene: Path, tmp_path: Path) -> No
         (("--mesh", "mesh.ply", "-o", "scene.ply"), "would overwrite"),
         (("--mesh", "mesh.ply", "-o", "%s%d.ply"), "is no pattern"),
         (("--mesh", "scene.ply", "-o", "out.ply"), "is a file of Gaussians"),
-        (("--mesh", "mesh.fbx", "-o", "out.ply"), "save it as .ply"),
+        (("--mesh", "mesh.fbx", "-o", "out.ply"), "save it as .glb, .ply or .obj"),
     ],
 )
 def test_edit_refuses_in_one_sentence(

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from edit_scenes import assert_same, covariance_errors, moved_covariances, twist
 
-from engine.edit.mesh import read_mesh
 from engine.edit.recovery import EditOptions, recover_edit
 from engine.errors import SceneFileError
-from engine.export.registry import export_scene
+from engine.files import export_scene, read_mesh
 from engine.gaussians.model import FlatGaussians
 
 pytestmark = pytest.mark.tools

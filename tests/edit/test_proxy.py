@@ -17,9 +17,9 @@ from edit_scenes import (
 )
 
 from engine.edit.deform import deform, deform_to, deformation_corners
-from engine.edit.harmonics import sh_basis
 from engine.edit.proxy import MeanValueBinding, Proxy, bind
 from engine.errors import SceneFileError
+from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., FlatGaussians]

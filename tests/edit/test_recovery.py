@@ -15,12 +15,10 @@ from edit_scenes import (
     twist,
 )
 
-from engine.edit.harmonics import sh_basis
-from engine.edit.mesh import Mesh, read_mesh
 from engine.edit.recovery import EditOptions, EditReport, recover_edit
 from engine.errors import SceneFileError
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.files import ExportOptions, Mesh, export_scene, read_mesh
+from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES
 

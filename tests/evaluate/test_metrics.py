@@ -5,8 +5,8 @@ from pytorch_msssim import ms_ssim as reference_ms_ssim
 from pytorch_msssim import ssim as reference_ssim
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from engine.colour import to_bytes
 from engine.evaluate import metrics
-from engine.render.images import to_8_bits
 
 
 def pair(height, width, seed=0):
@@ -163,5 +163,5 @@ def test_errors_under_the_mask_cost_nothing_once_filled():
 
 def test_rounding_to_8_bits_goes_to_the_nearest_step_and_clips():
     values = np.array([[[-0.2, 0.5, 1.3], [0.4 / 255, 0.6 / 255, 254.4 / 255]]], np.float32)
-    assert to_8_bits(values).tolist() == [[[0, 128, 255], [0, 1, 254]]]
-    assert np.array_equal(metrics.rounded_to_8_bits(values), to_8_bits(values) / np.float32(255))
+    assert to_bytes(values).tolist() == [[[0, 128, 255], [0, 1, 254]]]
+    assert np.array_equal(metrics.rounded_to_8_bits(values), to_bytes(values) / np.float32(255))

@@ -2,7 +2,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from engine.colour import linear_to_srgb, srgb_to_linear
+from engine.colour import linear_to_srgb, srgb_to_linear, to_bytes
 from engine.errors import DatasetError, OutputError
 from engine.render import images
 
@@ -15,7 +15,7 @@ def picture():
 def test_a_png_keeps_display_values_to_8_bits(tmp_path, picture):
     images.write_png(tmp_path / "a.png", picture)
     again = images.read_image(tmp_path / "a.png")
-    assert np.array_equal(images.to_8_bits(again), images.to_8_bits(picture))
+    assert np.array_equal(to_bytes(again), to_bytes(picture))
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
@@ -24,8 +24,8 @@ def test_a_png_keeps_straight_colours_under_any_alpha(tmp_path, picture):
     images.write_png(tmp_path / "a.png", picture, alpha)
     again = images.read_image(tmp_path / "a.png")
     assert again.shape == (6, 9, 4)
-    assert np.array_equal(images.to_8_bits(again[..., :3]), images.to_8_bits(picture))
-    assert np.array_equal(images.to_8_bits(again[..., 3]), images.to_8_bits(alpha))
+    assert np.array_equal(to_bytes(again[..., :3]), to_bytes(picture))
+    assert np.array_equal(to_bytes(again[..., 3]), to_bytes(alpha))
 
 
 def test_an_exr_holds_linear_light_depth_alpha_and_normals(tmp_path, picture):

@@ -59,7 +59,7 @@ assert not answer.faults and answer.views == 4, answer
 ACCEPT = (
     BLOCK
     + """
-from engine.export.registry import exporters
+from engine.files import exporters
 from service.web.forms import options_form
 from workers.work.kinds import job_kinds, kind_named
 assert exporters()

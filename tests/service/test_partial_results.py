@@ -15,7 +15,7 @@ import pytest
 from service_bench import claimed, committed_dataset, running
 from test_reconstruction import ROOT, TRAIN, Machine, start
 
-from engine.export.registry import exporters
+from engine.files import exporters
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from service.state import Service
 from workers.client.submission import Submission, submit

@@ -11,10 +11,10 @@ from surface_shapes import cameras_on_sphere
 
 from engine.errors import Cancelled, ConfigError, SceneFileError
 from engine.events import StageFinished
+from engine.files import write_surface
 from engine.render.images import read_image
 from engine.surface.cameras import cameras_around
 from engine.surface.extract import ExtractedSurface, extract_surface
-from engine.surface.files import write_surface
 from engine.surface.mesh import TriangleMesh, edge_report
 from engine.surface.options import SurfaceOptions
 from engine.trace.cpu import CpuTracer

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from engine.config import resolve_config
-from engine.gaussians.ply import read_gaussian_ply
+from engine.files.gaussian_ply import read_gaussian_ply
 from engine.pipeline import SCENE, reconstruct
 from engine.render.cameras import RenderCamera
 from engine.render.images import read_channels

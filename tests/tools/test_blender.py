@@ -9,11 +9,10 @@ import pytest
 from blender_python import IMPORT_SCRIPT, SCRIPTS, run_blender
 from shell_scene import our_view, psnr_db, shell_cameras, shell_scene, write_shell_cameras
 
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.files import ExportOptions, export_scene
+from engine.files.ply_container import read_ply
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii
-from engine.gaussians.ply_format import read_ply
 from engine.render.images import read_image
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.files import ExportOptions, export_scene
 from engine.gaussians.model import FlatGaussians
 
 pytestmark = pytest.mark.tools

@@ -10,7 +10,7 @@ from npm_packages import npm_folder
 from shell_scene import our_view, shell_scene
 
 from engine.colour import to_bytes
-from engine.export.registry import export_scene
+from engine.files import export_scene
 from engine.render.cameras import RenderCamera, focal_from_fov
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]

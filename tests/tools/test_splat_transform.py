@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 from npm_packages import npm_folder
 
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.files import ExportOptions, export_scene, importer_for, read_scene
+from engine.files.gaussian_ply import read_ply_cloud
 from engine.gaussians.flattening import GaussianCloud
 from engine.gaussians.model import FlatGaussians
-from engine.importers import importer_for, read_scene
-from engine.importers.gaussian_ply import read_ply_cloud
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "importers"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "files"))
 from cloud_difference import difference
 
 pytestmark = pytest.mark.tools

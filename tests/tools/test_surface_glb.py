@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from engine.surface.files import write_surface
+from engine.files import write_surface
 from engine.surface.mesh import TriangleMesh
 
 pytestmark = pytest.mark.tools

@@ -9,8 +9,7 @@ from shell_scene import our_view, shell_cameras, shell_scene, write_shell_camera
 from threejs_example import draw_glb
 
 from engine.colour import to_bytes
-from engine.export.options import ExportOptions
-from engine.export.registry import export_scene
+from engine.files import ExportOptions, export_scene
 from engine.gaussians.model import FlatGaussians
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]

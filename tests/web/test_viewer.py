@@ -13,9 +13,9 @@ from shell_scene import our_view, shell_scene
 
 import service.web
 from engine.colour import to_bytes
+from engine.files.gaussian_ply import write_gaussian_ply
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
-from engine.gaussians.ply import write_gaussian_ply
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.renderer import background_colour, render_rays
 from engine.trace.cpu import CpuTracer

@@ -12,12 +12,11 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from engine.edit.deform import DeformReport, deform_to, deformation_corners
-from engine.edit.mesh import Mesh, read_mesh
 from engine.edit.recovery import EditOptions, EditReport, recover_edit
 from engine.errors import ConfigError, SceneFileError
-from engine.export.registry import export_scene, exporter_for
-from engine.files import write_json
+from engine.files import Mesh, export_scene, exporter_for, read_mesh
 from engine.gaussians.model import FlatGaussians
+from engine.writing import write_json
 from workers.cli.scene_files import open_scene
 
 Say = Callable[[str], None]

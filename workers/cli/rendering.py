@@ -11,8 +11,8 @@ from jaxtyping import Float64
 from engine.config import read_config
 from engine.errors import OutputError
 from engine.events import Listener, staged
+from engine.files.gaussian_ply import read_gaussian_ply
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import read_gaussian_ply
 from engine.pipeline import CONFIG, SCENE, run_scene
 from engine.render.cameras import RenderCamera
 from engine.render.jobs import (

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import click
 
+from engine.files import read_scene
 from engine.gaussians.flattening import ImportReport
 from engine.gaussians.model import FlatGaussians
-from engine.importers import read_scene
 
 
 def open_scene(path: Path, *, drop_invalid: bool = False, quiet: bool = False) -> FlatGaussians:

@@ -10,13 +10,13 @@ from pydantic import ValidationError
 
 from engine.config import read_config
 from engine.errors import ConfigError, DatasetError, OutputError
+from engine.files import check_surface_path, write_surface
 from engine.gaussians.model import FlatGaussians
 from engine.pipeline import CONFIG, SCENE, run_scene
 from engine.render.cameras import RenderCamera
 from engine.scene import load_scene, scene_extent, split_views
 from engine.surface.cameras import cameras_around, photograph_cameras
 from engine.surface.extract import ExtractedSurface, extract_surface
-from engine.surface.files import check_surface_path, write_surface
 from engine.surface.options import SurfaceOptions
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from engine.errors import OctasplatError, OutputError
-from engine.files import write_json
+from engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
 from engine.isolated_python import python_command
-from engine.splat_transform import VARIABLE as SPLAT_TRANSFORM
+from engine.writing import write_json
 from workers.postgres.embedded import EmbeddedPostgres
 from workers.records.migrate import migrate
 from workers.serve.children import KeptChild

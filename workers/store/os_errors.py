@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from engine.files import NO_ROOM
+from engine.writing import NO_ROOM
 from workers.store.errors import StorageFull, StorageUnavailable
 
 MAKE_ROOM = "delete datasets or jobs, whose contents then go at once, or add room"

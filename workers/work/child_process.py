@@ -14,8 +14,8 @@ from typing import Any
 
 import psutil
 
+from engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
 from engine.isolated_python import python_command
-from engine.splat_transform import VARIABLE as SPLAT_TRANSFORM
 
 MAX_LINE_BYTES = 1 << 20
 LAST_WORDS = 20

@@ -17,7 +17,7 @@ import psutil
 from procrastinate.exceptions import ConnectorException
 
 import engine
-from engine.export.registry import writable_formats
+from engine.files import writable_formats
 from workers.parent import die_with_server
 from workers.queue.attempts import claim
 from workers.queue.jobs import get_job, queue_again

@@ -9,13 +9,13 @@ from typing import Any
 from engine.config import read_config
 from engine.errors import ExportFailed
 from engine.events import Event, StageFinished, StageProgress, broadcast, staged, stopping
-from engine.export.options import ExportOptions
-from engine.export.several import export_files
-from engine.files import write_json
-from engine.gaussians.ply import read_gaussian_ply
+from engine.files import ExportOptions
+from engine.files.gaussian_ply import read_gaussian_ply
+from engine.files.several import export_files
 from engine.pipeline import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
+from engine.writing import write_json
 from workers.work.kinds.options import ExportJobOptions, ReconstructOptions, RenderJobOptions
 from workers.work.places import Places
 from workers.work.preview import Previews

@@ -22,8 +22,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from engine.errors import DatasetError, OutputError
-from engine.files import write_json
 from engine.scene.generated.config import CAMERA_MODELS, GeneratedSceneConfig
+from engine.writing import write_json
 
 __all__ = ["CAMERA_MODELS", "GeneratedSceneConfig", "write_generated_scene"]
 

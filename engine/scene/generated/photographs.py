@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from engine.colour import to_bytes
 from engine.scene.generated.cameras import View, directions_cam
 from engine.scene.generated.config import GeneratedSceneConfig
 from engine.scene.generated.tracing import LitScene
@@ -64,7 +65,7 @@ class Photographer:
         away = np.sum(normals * directions, axis=1) > 0
         normals[away] *= -1
         return Photograph(
-            np.round(self._pixels(view) * 255).astype(np.uint8).reshape(height, width, -1),
+            to_bytes(self._pixels(view)).reshape(height, width, -1),
             depth.reshape(height, width),
             normals.reshape(height, width, 3),
             (hit & life.face_is_object[hits.faces]).reshape(height, width),

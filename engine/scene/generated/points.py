@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float, UInt8
 
+from engine.colour import to_bytes
 from engine.scene.generated.cameras import View, directions_cam, projected
 from engine.scene.generated.config import GeneratedSceneConfig
 from engine.scene.generated.photographs import rays_world
@@ -91,7 +92,7 @@ def _looked_up(
         wanted &= scene.still_life.face_is_object[face]
     distance = np.where(wanted, hits.distances[middle], 0).astype(np.float64)
     xyz = origins[middle] + distance[:, None] * along[middle]
-    return xyz[wanted], np.round(colours[wanted] * 255).astype(np.uint8)
+    return xyz[wanted], to_bytes(colours[wanted])
 
 
 def _observed(

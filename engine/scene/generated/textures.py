@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from engine.colour import srgb_to_linear
 from engine.scene.generated import kernels_scene
 
 _FONT = {
@@ -40,8 +41,7 @@ _BITMAPS = _font_bitmaps()
 def linear(colour: str) -> Float32[np.ndarray, "3"]:
     """Linear light of a display colour written as ``rrggbb``."""
     srgb = np.array([int(colour[k : k + 2], 16) for k in (0, 2, 4)]) / 255
-    decoded = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return decoded.astype(np.float32)
+    return srgb_to_linear(srgb).astype(np.float32)
 
 
 def mix(

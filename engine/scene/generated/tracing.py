@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float, Float32
 
+from engine.colour import linear_to_srgb
 from engine.rays import RayBatch
 from engine.scene.generated import kernels_scene
 from engine.scene.generated.arrangement import StillLife
@@ -161,7 +162,4 @@ def _sky(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 def _display(radiance: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
     """sRGB-encoded colours of linear light, with a soft shoulder so that nothing clips hard."""
-    x = 1 - np.exp(radiance * np.float32(-_EXPOSURE))
-    return np.where(
-        x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** np.float32(1 / 2.4) - 0.055
-    )
+    return linear_to_srgb(1 - np.exp(radiance * np.float32(-_EXPOSURE)))

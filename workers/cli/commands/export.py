@@ -10,7 +10,7 @@ class _ExportCommand(click.Command):
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the formats, one a row."""
-        from engine.export.registry import exporters
+        from engine.files import exporters
 
         rows = [
             (exporter.name, f"{', '.join(exporter.patterns)}: {exporter.description}")
@@ -84,8 +84,7 @@ def export(
     OUT's name says the format, unless --format does; the formats are listed below. Where two take a name, as
     *.ply and *.mesh.ply do, the longer pattern wins.
     """
-    from engine.export.options import ExportOptions
-    from engine.export.registry import export_scene, exporter_for
+    from engine.files import ExportOptions, export_scene, exporter_for
     from engine.gaussians.octagon import CHI2_2_99
     from workers.cli.scene_files import open_scene
     from workers.cli.signals import orderly_termination

@@ -36,8 +36,8 @@ def import_(
     .glb with KHR_gaussian_splatting. A Gaussian with three extents loses the smallest; what that means for
     the scene is told. All other commands read the same formats.
     """
-    from engine.gaussians.ply import write_gaussian_ply
-    from engine.importers import read_scene
+    from engine.files import read_scene
+    from engine.files.gaussian_ply import write_gaussian_ply
     from workers.cli.progress import show_progress
     from workers.cli.scene_files import losses
     from workers.cli.signals import orderly_termination

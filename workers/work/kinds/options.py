@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from engine.config import ReconstructionConfig
 from engine.errors import SceneFileError
-from engine.export.registry import exporter_for
+from engine.files import exporter_for
 from engine.train.config import preset
 
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")

@@ -1,1 +1,0 @@
-"""Files for other programs: one small module a format, all found by `engine.export.registry`."""

@@ -1,0 +1,45 @@
+"""Files of scenes, meshes and surfaces: one module a format, reading and writing together, one registry.
+
+The rest of the engine knows the functions that are named here, and no format.
+"""
+
+from engine.files.exporting import check_surface_path, export_scene, write_surface
+from engine.files.mesh import Mesh
+from engine.files.options import ExportOptions
+from engine.files.reading import read_mesh, read_scene
+from engine.files.registry import (
+    Exporter,
+    Importer,
+    MeshReader,
+    SurfaceWriter,
+    check_writable,
+    exporter_for,
+    exporters,
+    importer_for,
+    importers,
+    register,
+    writable_formats,
+)
+from engine.gaussians.flattening import ImportReport
+
+__all__ = [
+    "ExportOptions",
+    "Exporter",
+    "ImportReport",
+    "Importer",
+    "Mesh",
+    "MeshReader",
+    "SurfaceWriter",
+    "check_surface_path",
+    "check_writable",
+    "export_scene",
+    "exporter_for",
+    "exporters",
+    "importer_for",
+    "importers",
+    "read_mesh",
+    "read_scene",
+    "register",
+    "writable_formats",
+    "write_surface",
+]

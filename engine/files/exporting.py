@@ -1,0 +1,64 @@
+"""Scenes and surfaces written to files of any known format."""
+
+from pathlib import Path
+
+from engine.errors import ConfigError, SceneFileError
+from engine.files.options import ExportOptions
+from engine.files.registry import SurfaceWriter, exporter_for, surface_suffixes, surface_writer_for
+from engine.gaussians.model import FlatGaussians
+from engine.surface.mesh import TriangleMesh
+
+
+def export_scene(
+    gaussians: FlatGaussians, path: Path, options: ExportOptions | None = None, format: str | None = None
+) -> tuple[Path, ...]:
+    """Write ``gaussians`` to ``path`` in the format that its name or ``format`` says.
+
+    Returns:
+        Every file written, ``path`` first.
+
+    Raises:
+        SceneFileError: no such format, nothing to write, values that are not finite, or a file that cannot be
+            written.
+    """
+    exporter = exporter_for(path, format)
+    try:
+        return exporter.write(gaussians, path, options or ExportOptions())
+    except OSError as error:
+        raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
+
+
+def check_surface_path(path: Path, *, textured: bool) -> None:
+    """Refuse names that no writer takes, before the long work.
+
+    Raises:
+        ConfigError: the suffix is unknown, or cannot hold a texture.
+    """
+    _surface_writer(path, textured)
+
+
+def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
+    """Write ``mesh`` as GLB, PLY or OBJ, as its suffix says, and return every file written, ``path`` first.
+
+    GLB: unlit, the colours being those of the photographs with their light; normals are there for who wants
+    to light it anew. Its root node turns COLMAP's frame to glTF's. PLY and OBJ keep the world frame. OBJ
+    with vertex colours writes them behind the positions; with a texture, an MTL and a PNG lie beside it.
+
+    Raises:
+        ConfigError: the suffix does not fit.
+        SceneFileError: the file cannot be written.
+    """
+    writer = _surface_writer(path, textured=mesh.texture_srgb is not None)
+    try:
+        return writer.write(mesh, path)
+    except OSError as error:
+        raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
+
+
+def _surface_writer(path: Path, textured: bool) -> SurfaceWriter:
+    writer = surface_writer_for(path)
+    if writer is None:
+        raise ConfigError(f"{path}: a surface is written as {surface_suffixes()}; name one of these.")
+    if textured and not writer.textured:
+        raise ConfigError(f"{path}: a PLY holds no texture; name a .glb or .obj, or leave the texture out.")
+    return writer

@@ -1,0 +1,93 @@
+"""A table of what can be done with files, which fills itself from the modules of a package."""
+
+import fnmatch
+import importlib
+import pkgutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, TypeVar
+
+from engine.errors import SceneFileError
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One way to read or write one format.
+
+    Attributes:
+        name: of the format, unique among entries of one class.
+        patterns: file names that it takes, as in ``*.glb``; where two formats match, the pattern with more
+            literal characters wins.
+    """
+
+    noun: ClassVar[str]
+    """For errors, as in "import"."""
+    name: str
+    patterns: tuple[str, ...]
+
+
+E = TypeVar("E", bound=Entry)
+
+
+class FormatTable:
+    """Entries of several classes by name. Modules of a package register theirs when they are imported.
+
+    Args:
+        package: its modules are imported once, when somebody first asks.
+    """
+
+    def __init__(self, package: str) -> None:
+        self._package = package
+        self._known: dict[tuple[type[Entry], str], Entry] = {}
+        self._complete = False
+
+    def register(self, entry: Entry) -> None:
+        """Add an entry.
+
+        Raises:
+            ValueError: there is one of that class and name.
+        """
+        key = (type(entry), entry.name)
+        if key in self._known:
+            raise ValueError(f"the {entry.noun} format '{entry.name}' is registered already")
+        self._known[key] = entry
+
+    def all(self, kind: type[E]) -> tuple[E, ...]:
+        """All entries of a class, by name."""
+        if not self._complete:
+            for module in pkgutil.iter_modules(importlib.import_module(self._package).__path__):
+                importlib.import_module(f"{self._package}.{module.name}")
+            self._complete = True
+        found = (entry for entry in self._known.values() if isinstance(entry, kind))
+        return tuple(sorted(found, key=lambda entry: entry.name))
+
+    def named(self, kind: type[E], name: str, path: Path) -> E:
+        """The entry of that class and name.
+
+        Raises:
+            SceneFileError: there is none; the text names ``path`` and lists those that exist.
+        """
+        by_name = {entry.name: entry for entry in self.all(kind)}
+        if name not in by_name:
+            choices = ", ".join(by_name)
+            raise SceneFileError(f"{path}: there is no {kind.noun} format '{name}'; choose one of {choices}.")
+        return by_name[name]
+
+    def by_file_name(self, kind: type[E], path: Path) -> E | None:
+        """The entry that takes this file name, or None; upper and lower case are the same."""
+        matches = [
+            (sum(character not in "*?" for character in pattern), entry)
+            for entry in self.all(kind)
+            for pattern in entry.patterns
+            if fnmatch.fnmatchcase(path.name.lower(), pattern)
+        ]
+        return max(matches, key=lambda match: match[0])[1] if matches else None
+
+    def choices(self, kind: type[E]) -> str:
+        """All entries with their patterns, for errors."""
+        return "; ".join(f"{entry.name} ({', '.join(entry.patterns)})" for entry in self.all(kind))
+
+    def suffixes(self, kind: type[E]) -> str:
+        """The suffixes that entries take, as in ".glb, .ply or .obj"."""
+        found = [pattern.lstrip("*") for entry in self.all(kind) for pattern in entry.patterns]
+        return " or ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)

@@ -1,0 +1,190 @@
+"""The native file: flat Gaussians in the PLY layout of the 3DGS family.
+
+One element ``vertex``, all float32: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``, ``f_rest_*``
+channel-major (all red, then green, then blue), ``opacity`` (logit), ``scale_0..2`` (ln of the standard
+deviations) and ``rot_0..3`` (w, x, y, z). The flat axis, the normal r1, is axis 0 with scale ln 1e-5, so that
+every viewer of 3DGS files shows the scene.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from engine.errors import SceneFileError
+from engine.files.options import ExportOptions
+from engine.files.ply_container import (
+    PlyElement,
+    PlyWriteElement,
+    columns,
+    read_ply,
+    read_ply_header,
+    write_ply,
+)
+from engine.files.registry import Exporter, Importer, register
+from engine.files.selection import selected
+from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
+from engine.gaussians.model import FlatGaussians
+
+MAX_SH_DEGREE = 3
+ROWS_AT_ONCE = 65536
+_POSITION = ("x", "y", "z")
+_NORMAL = ("nx", "ny", "nz")
+_SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+
+
+def write_gaussian_ply(gaussians: FlatGaussians, path: Path, *, sh_pad_degree: int | None = None) -> None:
+    """Write ``gaussians`` as a 3DGS PLY, atomically and in blocks.
+
+    Args:
+        gaussians: at least one, all finite.
+        path: the file, replaced if it exists.
+        sh_pad_degree: write at least this degree of spherical harmonics, the missing ones zero; some
+            importers accept only degree 3.
+
+    Raises:
+        SceneFileError: nothing to write, a parameter is not finite, or the file cannot be written.
+    """
+    if len(gaussians) == 0:
+        raise SceneFileError(f"{path}: not written, as there are no Gaussians.")
+    if not gaussians.is_finite():
+        raise SceneFileError(f"{path}: not written, as some Gaussians hold values that are not finite.")
+    if sh_pad_degree is not None and not 0 <= sh_pad_degree <= MAX_SH_DEGREE:
+        raise SceneFileError(f"{path}: not written, as sh_pad_degree is {sh_pad_degree} but must be 0 to 3.")
+    degree = max(gaussians.sh_degree, sh_pad_degree or 0)
+    names = [*_POSITION, *_NORMAL, *_SH_DC, *_rest_names(degree), "opacity", *_scale_names(3), *_ROTATION]
+    dtype = np.dtype([(name, "<f4") for name in names])
+    element = PlyWriteElement("vertex", len(gaussians), dtype, _row_blocks(gaussians, degree, dtype))
+    write_ply(path, [element])
+
+
+def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void]) -> Iterator[np.ndarray]:
+    rest_own = gaussians.sh.shape[1] - 1
+    rest_file = (degree + 1) ** 2 - 1
+    for start in range(0, len(gaussians), ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
+        n = len(gaussians.means_world[part])
+        values = np.zeros((n, len(dtype.names or ())), dtype="<f4")
+        values[:, 0:3] = gaussians.means_world[part]
+        values[:, 6:9] = gaussians.sh[part, 0]
+        rest = values[:, 9 : 9 + 3 * rest_file].reshape(n, 3, rest_file)
+        rest[:, :, :rest_own] = gaussians.sh[part, 1:].transpose(0, 2, 1)
+        values[:, 9 : 9 + 3 * rest_file] = rest.reshape(n, -1)
+        tail = values[:, 9 + 3 * rest_file :]
+        tail[:, 0] = gaussians.opacity_logits[part]
+        tail[:, 1] = FLAT_LOG_SCALE
+        tail[:, 2:4] = gaussians.log_scales[part]
+        tail[:, 4:8] = gaussians.quats_wxyz[part]
+        yield values.view(dtype)[:, 0]
+
+
+def read_gaussian_ply(
+    path: Path, *, two_scale_normal: Literal[0, 2] = 0, drop_invalid: bool = False
+) -> tuple[FlatGaussians, ImportReport]:
+    """Read a PLY of Gaussians, flat or not, by property name.
+
+    Properties may come in any order and numeric type, ascii or binary; unknown ones are ignored. A Gaussian
+    with three scales is flattened along its smallest one; a file of ours comes back bit for bit.
+
+    Args:
+        path: the file.
+        two_scale_normal: which axis is the normal in a file with two scales: 0 as GaMeS writes it, 2 as
+            2DGS does.
+        drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
+
+    Raises:
+        SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, lacks a
+            property, or holds values that are not finite.
+    """
+    cloud = read_ply_cloud(path)
+    return flatten(cloud, path, two_scale_normal=two_scale_normal, drop_invalid=drop_invalid)
+
+
+def read_ply_cloud(path: Path) -> GaussianCloud:
+    """The Gaussians of a PLY as they are in the file, found by property name.
+
+    Raises:
+        SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, or lacks a
+            property.
+    """
+    header = read_ply_header(path)
+    vertex = header.element("vertex")
+    if header.element("chunk") is not None or (vertex is not None and "packed_position" in vertex.names):
+        raise SceneFileError(
+            f"{path}: is a compressed PLY; octasplat import turns it into a standard 3DGS PLY."
+        )
+    if vertex is None:
+        raise SceneFileError(f"{path}: has no element 'vertex', so it holds no Gaussians.")
+    rest_count, scale_count = _check_properties(path, vertex)
+    if vertex.count == 0:
+        raise SceneFileError(f"{path}: holds no Gaussians.")
+    table = read_ply(path, ["vertex"])[1]["vertex"]
+    colours = columns(table, [*_SH_DC, *(f"f_rest_{k}" for k in range(rest_count))])
+    rest = colours[:, 3:].reshape(len(table), 3, rest_count // 3).transpose(0, 2, 1)
+    return GaussianCloud(
+        means_world=columns(table, _POSITION),
+        quats_wxyz=columns(table, _ROTATION),
+        log_scales=columns(table, _scale_names(scale_count)),
+        opacity_logits=columns(table, ["opacity"])[:, 0],
+        sh=np.ascontiguousarray(np.concatenate([colours[:, None, :3], rest], axis=1)),
+    )
+
+
+def _rest_names(degree: int) -> list[str]:
+    return [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
+
+
+def _scale_names(count: int) -> list[str]:
+    return [f"scale_{k}" for k in range(count)]
+
+
+def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
+    """Numbers of f_rest and scale properties of an element that has all it needs."""
+    names = set(vertex.names)
+    rest_count = sum(name.startswith("f_rest_") for name in names)
+    scale_count = 3 if "scale_2" in names else 2
+    needed = [*_POSITION, *_SH_DC, "opacity", *_scale_names(scale_count), *_ROTATION]
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise SceneFileError(
+            f"{path}: is not a PLY of Gaussians; it lacks the property {', '.join(missing)}."
+        )
+    if rest_count not in {len(_rest_names(degree)) for degree in range(MAX_SH_DEGREE + 1)}:
+        raise SceneFileError(
+            f"{path}: has {rest_count} f_rest properties, but degrees 0 to 3 of spherical harmonics "
+            "need 0, 9, 24 or 45."
+        )
+    needed += [f"f_rest_{k}" for k in range(rest_count)]
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise SceneFileError(
+            f"{path}: its f_rest properties are not numbered from 0; {missing[0]} is missing."
+        )
+    lists = [prop.name for prop in vertex.lists]
+    if lists:
+        raise SceneFileError(
+            f"{path}: property '{lists[0]}' of element 'vertex' is a list; Gaussians have scalars only."
+        )
+    return rest_count, scale_count
+
+
+def _write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write the Gaussians that are not fainter than ``options.min_opacity``."""
+    write_gaussian_ply(selected(gaussians, path, options), path, sh_pad_degree=options.sh_pad_degree)
+    return (path,)
+
+
+def _recognises(head: bytes) -> bool:
+    return head.startswith(b"ply") and b"packed_position" not in head
+
+
+register(
+    Importer("gaussians", ("*.ply",), "Gaussians in the PLY layout of 3DGS", read_ply_cloud, _recognises)
+)
+register(
+    Exporter(
+        "gaussians", ("*.ply",), "Gaussians as a 3DGS PLY, for splat viewers and for octasplat itself", _write
+    )
+)

@@ -1,0 +1,284 @@
+"""Binary glTF with ``KHR_gaussian_splatting``: points with the attributes of splats.
+
+The extension knows one kernel, an ellipsoid; a flat Gaussian is one with a standard deviation of 1e-5 along
+its first axis. glTF is y up; the scene is turned by 180 degrees about x in the data, not by a node, so that
+readers that evaluate harmonics in world directions are right too. With untransformed nodes that changes signs
+only, so that our own files keep the bits of positions and harmonics.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from engine.colour import linear_to_srgb, rounded_bytes, srgb_to_linear
+from engine.errors import SceneFileError
+from engine.files import gltf
+from engine.files.encodings import (
+    HALF_TURN_SIGNS,
+    half_turn_points,
+    half_turn_quats,
+    half_turn_sh,
+    sh0_from_rgb,
+    unit_quats,
+)
+from engine.files.gltf import FLOAT, UNSIGNED_BYTE, GlbFile, padded, write_glb
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, Importer, register
+from engine.files.selection import blocks, check_scales, selected
+from engine.gaussians.flattening import GaussianCloud
+from engine.gaussians.frames import quaternions, rotation_matrices
+from engine.gaussians.harmonics import rotate_sh
+from engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
+
+EXTENSION = "KHR_gaussian_splatting"
+COLOUR_SPACE = "srgb_rec709_display"
+SIMILARITY = 1e-4
+"""Relative error up to which a node may fail to be a rotation with one scale."""
+
+
+def read(path: Path) -> GaussianCloud:
+    """Read all splats of the default scene, node transforms applied.
+
+    Raises:
+        SceneFileError: the file is no GLB, is damaged, holds no splats (an octagon mesh, say) or compressed
+            ones, or scales them unevenly.
+    """
+    file = GlbFile(path)
+    clouds = []
+    try:
+        for matrix, primitive in file.primitives():
+            splats = primitive.get("extensions", {}).get(EXTENSION)
+            if splats is None:
+                continue
+            if splats.get("extensions"):
+                names = ", ".join(splats["extensions"])
+                raise SceneFileError(f"{path}: its splats need {names}, which is not read.")
+            clouds.append(_placed(path, _cloud(file, primitive["attributes"], splats), matrix))
+    except gltf.DAMAGE as error:
+        raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
+    if not clouds:
+        raise SceneFileError(
+            f"{path}: holds no splats ({EXTENSION}); if it is an edited octagon mesh, use octasplat edit."
+        )
+    return _joined(clouds)
+
+
+def _cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
+    """The Gaussians of a primitive, in its own frame."""
+    xyzw = file.array(attributes[f"{EXTENSION}:ROTATION"], np.float32)
+    sh = _harmonics(file, attributes)
+    notes: tuple[str, ...] = ()
+    if splats.get("colorSpace") == "lin_rec709_display":
+        notes = ("Its colours are linear; they were converted, without what depends on the view.",)
+        sh = sh0_from_rgb(linear_to_srgb(0.5 + SH_C0 * sh[:, 0]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        opacity = file.array(attributes[f"{EXTENSION}:OPACITY"], np.float32)[:, 0].astype(np.float64)
+        logits = np.log(opacity) - np.log1p(-opacity)
+        log_scales = np.log(file.array(attributes[f"{EXTENSION}:SCALE"], np.float32))
+    return GaussianCloud(
+        means_world=file.array(attributes["POSITION"], np.float32),
+        quats_wxyz=np.ascontiguousarray(xyzw[:, [3, 0, 1, 2]]),
+        log_scales=log_scales,
+        opacity_logits=logits.astype(np.float32),
+        sh=sh,
+        notes=notes,
+    )
+
+
+def _harmonics(file: GlbFile, attributes: dict[str, int]) -> Float32[np.ndarray, "n k 3"]:
+    bands: list[np.ndarray] = []
+    for degree in range(4):
+        names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}" for place in range(2 * degree + 1)]
+        if not all(name in attributes for name in names):
+            break
+        bands.extend(file.array(attributes[name], np.float32) for name in names)
+    if not bands:
+        raise KeyError(f"{EXTENSION}:SH_DEGREE_0_COEF_0")
+    return np.stack(bands, axis=1)
+
+
+def _placed(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]) -> GaussianCloud:
+    """The cloud in the world frame: its node's transform, then the half turn to y down."""
+    if not np.array_equal(matrix, np.eye(4)):
+        cloud = _transformed(path, cloud, matrix)
+    return replace(
+        cloud,
+        means_world=half_turn_points(cloud.means_world),
+        quats_wxyz=half_turn_quats(cloud.quats_wxyz),
+        sh=half_turn_sh(cloud.sh),
+    )
+
+
+def _transformed(path: Path, cloud: GaussianCloud, matrix: Float64[np.ndarray, "4 4"]) -> GaussianCloud:
+    linear = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not scale > 0 or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > SIMILARITY:
+        raise SceneFileError(f"{path}: a node mirrors its splats or scales them unevenly; apply it first.")
+    rotation = linear / scale
+    frames = rotation @ rotation_matrices(cloud.quats_wxyz.astype(np.float64))
+    turns = np.broadcast_to(rotation, (len(frames), 3, 3))
+    means = cloud.means_world.astype(np.float64) @ linear.T + matrix[:3, 3]
+    return replace(
+        cloud,
+        means_world=means.astype(np.float32),
+        quats_wxyz=quaternions(frames).astype(np.float32),
+        log_scales=(cloud.log_scales + np.log(scale)).astype(np.float32),
+        sh=rotate_sh(cloud.sh, turns),
+    )
+
+
+def _joined(clouds: list[GaussianCloud]) -> GaussianCloud:
+    if len(clouds) == 1:
+        return clouds[0]
+    most = max(cloud.sh.shape[1] for cloud in clouds)
+    padded = [np.pad(cloud.sh, ((0, 0), (0, most - cloud.sh.shape[1]), (0, 0))) for cloud in clouds]
+    return GaussianCloud(
+        means_world=np.concatenate([cloud.means_world for cloud in clouds]),
+        quats_wxyz=np.concatenate([cloud.quats_wxyz for cloud in clouds]),
+        log_scales=np.concatenate([cloud.log_scales for cloud in clouds]),
+        opacity_logits=np.concatenate([cloud.opacity_logits for cloud in clouds]),
+        sh=np.concatenate(padded),
+        notes=tuple(dict.fromkeys(note for cloud in clouds for note in cloud.notes)),
+    )
+
+
+@dataclass(frozen=True)
+class _Attribute:
+    """A vertex attribute: its semantic, type, and its rows, in glTF's frame, of a block in ours."""
+
+    semantic: str
+    kind: str
+    component: int
+    item_bytes: int
+    rows: Callable[[FlatGaussians], np.ndarray]
+
+
+def _colours(some: FlatGaussians) -> np.ndarray:
+    """The fallback of readers that see points only: linear RGB of the constant harmonic, and opacity."""
+    linear = srgb_to_linear(np.clip(some.base_rgb_srgb, 0.0, 1.0))
+    return rounded_bytes(np.concatenate([linear, some.opacities[:, None]], axis=1).astype(np.float64) * 255.0)
+
+
+def _scales(some: FlatGaussians) -> np.ndarray:
+    flat = np.full((len(some), 1), FLAT_SCALE, dtype=np.float32)
+    return np.concatenate([flat, some.scales], axis=1)
+
+
+def _coefficient(number: int) -> Callable[[FlatGaussians], np.ndarray]:
+    return lambda some: some.sh[:, number] * HALF_TURN_SIGNS[number]
+
+
+def attributes(sh_degree: int) -> tuple[_Attribute, ...]:
+    """All attributes of a scene with harmonics of that degree, in file order."""
+    basic = (
+        _Attribute("POSITION", "VEC3", FLOAT, 12, lambda some: half_turn_points(some.means_world)),
+        _Attribute("COLOR_0", "VEC4", UNSIGNED_BYTE, 4, _colours),
+        _Attribute(
+            f"{EXTENSION}:ROTATION",
+            "VEC4",
+            FLOAT,
+            16,
+            lambda some: unit_quats(half_turn_quats(some.quats_wxyz)[:, [1, 2, 3, 0]]),
+        ),
+        _Attribute(f"{EXTENSION}:SCALE", "VEC3", FLOAT, 12, _scales),
+        _Attribute(f"{EXTENSION}:OPACITY", "SCALAR", FLOAT, 4, lambda some: some.opacities),
+    )
+    harmonics = tuple(
+        _Attribute(
+            f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}", "VEC3", FLOAT, 12, _coefficient(degree**2 + place)
+        )
+        for degree in range(sh_degree + 1)
+        for place in range(2 * degree + 1)
+    )
+    return basic + harmonics
+
+
+def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write the Gaussians in their order, block by block.
+
+    Raises:
+        SceneFileError: nothing to write, values that are not finite, or more than the 4 GiB that a GLB can
+            hold.
+        OSError: the file cannot be written.
+    """
+    scene = selected(gaussians, path, options)
+    check_scales(scene, path)
+    layout = attributes(scene.sh_degree)
+    text = gltf.json_bytes(_document(scene, layout))
+    room = padded(len(text))
+    length = len(scene) * sum(attribute.item_bytes for attribute in layout)
+    total = gltf.glb_bytes(room, length)
+    if total > gltf.MAX_BYTES:
+        advice = "Leave faint ones out with min_opacity, or export a Gaussian PLY."
+        raise gltf.too_large(path, f"{len(scene)} Gaussians need", total, advice)
+    write_glb(path, room, length, _data(scene, layout), lambda: text)
+    return (path,)
+
+
+def _data(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> Iterator[bytes]:
+    for attribute in layout:
+        kind = "u1" if attribute.component == UNSIGNED_BYTE else "<f4"
+        for block in blocks(scene):
+            yield attribute.rows(block).astype(kind, copy=False).tobytes()
+
+
+def _document(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str, object]:
+    low, high = scene.means_world.min(axis=0), scene.means_world.max(axis=0)
+    views: list[dict[str, object]] = []
+    accessors: list[dict[str, object]] = []
+    offset = 0
+    for number, attribute in enumerate(layout):
+        length = len(scene) * attribute.item_bytes
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": length, "target": gltf.ARRAY_BUFFER})
+        offset += length
+        accessor = gltf.accessor(number, attribute.component, len(scene), attribute.kind)
+        if attribute.component == UNSIGNED_BYTE:
+            accessor["normalized"] = True
+        accessors.append(accessor)
+    # The half turn about x swaps and negates the bounds of y and z.
+    accessors[0] |= {
+        "min": [float(low[0]), float(-high[1]), float(-high[2])],
+        "max": [float(high[0]), float(-low[1]), float(-low[2])],
+    }
+    primitive = {
+        "attributes": {attribute.semantic: number for number, attribute in enumerate(layout)},
+        "mode": gltf.POINTS,
+        "extensions": {
+            EXTENSION: {
+                "kernel": "ellipse",
+                "colorSpace": COLOUR_SPACE,
+                "projection": "perspective",
+                "sortingMethod": "cameraDistance",
+            }
+        },
+    }
+    return {
+        "asset": {"version": "2.0", "generator": "octasplat"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "octasplat", "mesh": 0}],
+        "meshes": [{"name": "gaussians", "primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+
+
+def _recognises(head: bytes) -> bool:
+    return head.startswith(b"glTF")
+
+
+register(Importer("khr-glb", ("*.glb",), "glTF points with KHR_gaussian_splatting", read, _recognises))
+register(
+    Exporter(
+        "khr-glb",
+        ("*.splats.glb", "*_splats.glb", "*-splats.glb", "splats.glb"),
+        "Gaussians as glTF points with KHR_gaussian_splatting",
+        write,
+    )
+)

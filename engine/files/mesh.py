@@ -1,0 +1,48 @@
+"""Meshes that come back from an editor, or that drive a scene, whatever file they were in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh, and what else of an octagon mesh survived its way.
+
+    Attributes:
+        vertices: positions as the file gives them, with the transforms of glTF nodes applied; which axes they
+            are along is :mod:`engine.edit.axes`' business.
+        triangles: vertex indices; polygons are cut into fans. Empty for a file of points.
+        uv: texture coordinates as the file has them (v may count up or down), or None; NaN where a vertex has
+            none, and the last where it has several.
+        gid: number of the Gaussian that a vertex belongs to, NaN where the file says none, or None.
+        corner: corner number 0 to 7 likewise.
+        radius: radius of the octagon in standard deviations likewise.
+        q: chi-square quantile of the octagons, where the file still names it.
+        rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
+    """
+
+    vertices: Float64[np.ndarray, "v 3"]
+    triangles: Int64[np.ndarray, "t 3"]
+    uv: Float32[np.ndarray, "v 2"] | None = None
+    gid: Float32[np.ndarray, " v"] | None = None
+    corner: Float32[np.ndarray, " v"] | None = None
+    radius: Float32[np.ndarray, " v"] | None = None
+    q: float | None = None
+    rounding: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+
+def stated_q(comments: tuple[str, ...]) -> float | None:
+    """The chi-square quantile that our exporters write as a comment, or None."""
+    for comment in comments:
+        words = comment.split()
+        if len(words) == 2 and words[0] == "octasplat_q":
+            try:
+                return float(words[1])
+            except ValueError:
+                return None
+    return None

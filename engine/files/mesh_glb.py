@@ -1,0 +1,275 @@
+"""Meshes as binary glTF: octagons of a scene out, surfaces out, edited meshes in with their ids kept.
+
+Octagons: the format to look at, as it carries colour, opacity and the Gaussian fall-off. Base colour = white
+texture with radial alpha x COLOR_0, so that alpha = opacity * exp(-rho^2 / 2) at every pixel (to the 8 bits
+of the texture). COLOR_0 is float32, as some programs misread 16-bit colours and 8-bit linear colours are too
+coarse in the dark. Vertices stay in the world frame of COLMAP (y down, z forward); a half turn about x in the
+root node brings them to glTF's (y up). The scene is cut into spatial chunks, each with its own node, because
+viewers sort transparent objects, not triangles.
+
+The opaque variant needs no sorting: alpha is cut at a threshold (``alphaMode`` MASK), and each octagon
+shrinks to the ellipse that is left of it.
+"""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from engine.colour import srgb_to_linear
+from engine.errors import SceneFileError
+from engine.files import gltf
+from engine.files.gltf import GlbFile, padded, write_glb
+from engine.files.mesh import Mesh
+from engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout
+from engine.files.octagon_soup import OctagonBatch, OctagonSoup
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
+from engine.files.spatial import kd_chunks
+from engine.files.textures import png_bytes, white_with_alpha_png
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.octagon import SIDES, octagon_triangles
+from engine.surface.mesh import TriangleMesh
+
+COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
+UNLIT = "KHR_materials_unlit"
+
+Chunks = list[Int[np.ndarray, "_"]]
+
+
+def read(path: Path) -> Mesh:
+    """Read the triangles of a GLB, in the frame of its scene, in which glTF says that y is up.
+
+    All triangles of the default scene, with node transforms applied.
+
+    Raises:
+        SceneFileError: the file is no GLB, is damaged, or its meshes are compressed.
+    """
+    file = GlbFile(path)
+    try:
+        packed = [name for name in COMPRESSIONS if name in file.document.get("extensionsUsed", [])]
+        if packed:
+            raise SceneFileError(
+                f"{path}: its meshes are compressed ({packed[0]}), which changes the order of vertices; "
+                "export it without compression."
+            )
+        return _mesh(file)
+    except gltf.DAMAGE as error:
+        raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
+
+
+def _mesh(file: GlbFile) -> Mesh:
+    vertices: list[np.ndarray] = []
+    triangles: list[np.ndarray] = []
+    extras: dict[str, list[np.ndarray]] = {key: [] for key in ATTRIBUTES}
+    count = 0
+    for matrix, primitive in file.primitives():
+        if primitive.get("mode", gltf.TRIANGLES) != gltf.TRIANGLES:
+            continue
+        attributes = primitive["attributes"]
+        positions = file.array(attributes["POSITION"], np.float64)
+        size = len(positions)
+        vertices.append(positions @ matrix[:3, :3].T + matrix[:3, 3])
+        if "indices" in primitive:
+            indices = file.array(primitive["indices"], np.int64).reshape(-1, 3)
+        else:
+            indices = np.arange(size - size % 3).reshape(-1, 3)
+        triangles.append(indices + count)
+        for key, name in ATTRIBUTES.items():
+            if name in attributes:
+                extras[key].append(file.array(attributes[name], np.float32))
+            else:
+                extras[key].append(np.full((size, 2 if key == "uv" else 1), np.nan, np.float32))
+        count += size
+    whole = {key: _joined(parts) for key, parts in extras.items()}
+    q = file.document.get("asset", {}).get("extras", {}).get("octasplat_q")
+    return Mesh(
+        np.concatenate([*vertices, np.zeros((0, 3))]),
+        np.concatenate([*triangles, np.zeros((0, 3), np.int64)]),
+        uv=whole["uv"],
+        gid=_flat(whole["gid"]),
+        corner=_flat(whole["corner"]),
+        radius=_flat(whole["radius"]),
+        q=float(q) if isinstance(q, int | float) else None,
+    )
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray | None:
+    """One array, or None where no part had the attribute."""
+    if not parts:
+        return None
+    whole = np.concatenate(parts)
+    return None if np.isnan(whole).all() else whole
+
+
+def _flat(values: np.ndarray | None) -> np.ndarray | None:
+    return None if values is None else values[:, 0]
+
+
+def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write the octagons as unlit meshes; memory stays at one chunk's vertices.
+
+    A scene for which one file is too small goes into ``path``, ``<stem>.part2.glb`` and so on, by chunks.
+
+    Raises:
+        SceneFileError: nothing to write, or a chunk that is larger than the 4 GiB that a GLB can hold.
+        OSError: a file cannot be written.
+    """
+    soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
+    png = white_with_alpha_png(options.texture_size, options.q)
+    parts = _parts(soup, path, len(png), options)
+    paths = [path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, len(parts) + 1))]
+    for part_path, (layout, chunks) in zip(paths, parts, strict=True):
+        bounds: list[Bounds] = []
+        data = _octagon_data(layout, soup, chunks, png, options.ids, bounds)
+        write_glb(part_path, layout.json_room, layout.length, data, lambda: layout.json(bounds))  # noqa: B023
+    return tuple(paths)
+
+
+def _parts(
+    soup: OctagonSoup, path: Path, png_size: int, options: ExportOptions
+) -> list[tuple[GlbLayout, Chunks]]:
+    """The fewest files that hold all chunks; neighbouring chunks stay together."""
+    chunks = kd_chunks(soup.means_world, options.chunks)
+    for count in range(1, len(chunks) + 1):
+        bounds = np.linspace(0, len(chunks), count + 1).astype(int).tolist()
+        groups = [chunks[start:end] for start, end in itertools.pairwise(bounds)]
+        parts = [
+            (GlbLayout([len(chunk) for chunk in group], png_size, options, extras), group)
+            for group, extras in zip(groups, _extras(soup, options, count), strict=True)
+        ]
+        if all(layout.total <= gltf.MAX_BYTES for layout, _ in parts):
+            return parts
+    largest = max(layout.total for layout, _ in parts)
+    advice = "Allow more chunks, leave faint Gaussians out with min_opacity, or export a mesh PLY."
+    raise gltf.too_large(path, "its largest chunk needs", largest, advice)
+
+
+def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[str, object]]:
+    """What each file says of itself: enough for an edited mesh to find back to its Gaussians."""
+    extras: dict[str, object] = {"octasplat_q": options.q, "octasplat_gaussians": soup.scene_size}
+    if options.opaque:
+        extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF
+    return [extras | ({"octasplat_part": [part, parts]} if parts > 1 else {}) for part in range(1, parts + 1)]
+
+
+def _octagon_data(
+    layout: GlbLayout, soup: OctagonSoup, chunks: Chunks, png: bytes, ids: bool, bounds: list[Bounds]
+) -> Iterator[bytes]:
+    """The binary part in the order of the layout; adds the bounds of each chunk to ``bounds``."""
+    yield png.ljust(padded(len(png)), b"\0")
+    yield octagon_triangles(layout.largest).astype("<u4").tobytes()
+    if ids:
+        yield np.tile(np.arange(SIDES, dtype="<f4"), layout.largest).tobytes()
+    for chunk in chunks:
+        batch = soup.batch(chunk)
+        yield from _chunk_data(batch, ids)
+        corners = batch.corners_world.reshape(-1, 3)
+        bounds.append((corners.min(axis=0).tolist(), corners.max(axis=0).tolist()))
+
+
+def _chunk_data(batch: OctagonBatch, ids: bool) -> Iterator[bytes]:
+    """The attributes of one chunk, in the order of the layout; all are multiples of four bytes."""
+    yield batch.corners_world.astype("<f4").tobytes()
+    rgba = np.concatenate([srgb_to_linear(batch.rgb_srgb), batch.opacities[:, None]], axis=1)
+    yield _per_corner(rgba).tobytes()
+    yield batch.uv.astype("<f4").tobytes()
+    if ids:
+        yield _per_corner(batch.ids[:, None]).tobytes()
+
+
+def _per_corner(values: Float32[np.ndarray, "n c"] | Int[np.ndarray, "n c"]) -> Float32[np.ndarray, "m c"]:
+    return np.repeat(values.astype("<f4"), SIDES, axis=0)
+
+
+def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
+    """Write a surface, unlit, with normals, and with a texture or the colours of its vertices.
+
+    Raises:
+        SceneFileError: more than the 4 GiB that a GLB can hold.
+        OSError: the file cannot be written.
+    """
+    attributes = {"POSITION": mesh.vertices_world, "NORMAL": mesh.vertex_normals()}
+    shading: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    document: dict[str, object] = {
+        "asset": {"version": "2.0", "generator": "octasplat"},
+        "extensionsUsed": [UNLIT],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "surface", "rotation": gltf.HALF_TURN_ABOUT_X, "mesh": 0}],
+        "materials": [
+            {
+                "name": "surface",
+                "pbrMetallicRoughness": shading,
+                "extensions": {UNLIT: {}},
+                "doubleSided": True,
+            }
+        ],
+    }
+    data: list[bytes] = []
+    views: list[dict[str, object]] = []
+
+    def add(piece: bytes, target: int | None = None) -> int:
+        """Add a buffer view and return its number."""
+        views.append({"buffer": 0, "byteOffset": sum(map(len, data)), "byteLength": len(piece)})
+        if target is not None:
+            views[-1]["target"] = target
+        data.append(piece.ljust(padded(len(piece)), b"\0"))
+        return len(views) - 1
+
+    if mesh.texture_srgb is not None and mesh.uv is not None:
+        attributes["TEXCOORD_0"] = mesh.uv
+        sampler = {
+            "magFilter": gltf.LINEAR,
+            "minFilter": gltf.LINEAR_MIPMAP_LINEAR,
+            "wrapS": gltf.CLAMP_TO_EDGE,
+            "wrapT": gltf.CLAMP_TO_EDGE,
+        }
+        image = {"name": "surface", "mimeType": "image/png", "bufferView": add(png_bytes(mesh.texture_srgb))}
+        document |= {"textures": [{"sampler": 0, "source": 0}], "samplers": [sampler], "images": [image]}
+        shading["baseColorTexture"] = {"index": 0}
+    elif mesh.rgb_srgb is not None:
+        attributes["COLOR_0"] = srgb_to_linear(mesh.rgb_srgb)
+    accessors: list[dict[str, object]] = []
+    used: dict[str, int] = {}
+    for semantic, values in attributes.items():
+        view = add(np.ascontiguousarray(values, "<f4").tobytes(), gltf.ARRAY_BUFFER)
+        used[semantic] = len(accessors)
+        accessors.append(gltf.accessor(view, gltf.FLOAT, len(values), gltf.vector_type(values.shape[1])))
+    accessors[0] |= {
+        "min": mesh.vertices_world.min(axis=0).tolist(),
+        "max": mesh.vertices_world.max(axis=0).tolist(),
+    }
+    view = add(mesh.faces.astype("<u4").tobytes(), gltf.ELEMENT_ARRAY_BUFFER)
+    accessors.append(gltf.accessor(view, gltf.UNSIGNED_INT, mesh.faces.size, "SCALAR"))
+    length = sum(map(len, data))
+    document |= {
+        "meshes": [
+            {
+                "name": "surface",
+                "primitives": [{"attributes": used, "indices": len(accessors) - 1, "material": 0}],
+            }
+        ],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": length}],
+    }
+    text = gltf.json_bytes(document)
+    room = padded(len(text))
+    if gltf.glb_bytes(room, length) > gltf.MAX_BYTES:
+        advice = "Decimate it with --max-triangles, or name a .ply."
+        raise gltf.too_large(path, "the surface needs", gltf.glb_bytes(room, length), advice)
+    write_glb(path, room, length, data, lambda: text)
+    return (path,)
+
+
+register(
+    Exporter(
+        "glb", ("*.glb",), "octagon mesh as GLB with opacity and fall-off, for looking at", write_octagons
+    )
+)
+register(MeshReader("glb", ("*.glb",), read))
+register(SurfaceWriter("glb", ("*.glb",), write_surface, textured=True))

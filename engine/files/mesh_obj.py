@@ -1,0 +1,315 @@
+"""Meshes as OBJ: octagons of a scene out, surfaces out, edited meshes in.
+
+Octagons: plain geometry for any program, with vertex colours, an MTL and the radial texture beside it. OBJ
+has no opacity per vertex, so the Gaussians' own opacities are lost; the texture keeps the fall-off.
+
+Reading is fast: whole blocks of the file are sorted by kind of line and parsed at once.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from jaxtyping import Float32, Int32, Int64
+
+from engine.errors import SceneFileError
+from engine.files.mesh import Mesh, stated_q
+from engine.files.octagon_soup import BATCH, OctagonBatch, OctagonSoup
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
+from engine.files.textures import grey_png, png_bytes
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.octagon import SIDES, octagon_triangles
+from engine.surface.mesh import TriangleMesh
+from engine.writing import replacing, write_text
+
+BLOCK_BYTES = 1 << 22
+NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space
+MAX_HEADER_LINES = 64
+DIGIT_LINES = 2000
+LINES_AT_ONCE = 100_000
+MATERIAL = "octagons"
+POSITION_LINE = "v %.9g %.9g %.9g"
+COLOUR_END = " %.5g %.5g %.5g\n"
+TEXTURE_LINE = "vt %.6f %.6f\n"
+FACE_LINE = "f %d/%d %d/%d %d/%d\n"
+
+
+@dataclass
+class _Parts:
+    positions: list[np.ndarray] = field(default_factory=list)
+    uv: list[np.ndarray] = field(default_factory=list)
+    triangles: list[np.ndarray] = field(default_factory=list)
+    triangle_uv: list[np.ndarray] = field(default_factory=list)
+    comments: list[str] = field(default_factory=list)
+    decimals: int = 0
+    vertex_count: int = 0
+    uv_count: int = 0
+
+
+def read(path: Path) -> Mesh:
+    """Read positions, texture coordinates and faces of an OBJ; colours, normals and groups are passed over.
+
+    Raises:
+        SceneFileError: the file cannot be read, or a line is not understood.
+    """
+    parts = _Parts()
+    try:
+        with path.open("rb") as handle:
+            for block in _blocks(handle):
+                _take_block(path, block, parts)
+    except OSError as error:
+        raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    if not parts.positions:
+        raise SceneFileError(f"{path}: is no OBJ mesh; it has no line that begins with 'v'.")
+    positions = np.concatenate(parts.positions)
+    parts.positions.clear()
+    uv = _uv_of_vertices(path, parts, len(positions))
+    parts.uv.clear()
+    parts.triangle_uv.clear()
+    triangles = np.concatenate([*parts.triangles, np.zeros((0, 3), np.int32)], dtype=np.int64)
+    rounding = 0.5 * 10.0**-parts.decimals
+    return Mesh(
+        positions,
+        triangles,
+        uv=uv,
+        q=stated_q(tuple(parts.comments)),
+        rounding=rounding,
+    )
+
+
+def _blocks(handle: IO[bytes]) -> Iterator[bytes]:
+    """The file in blocks that end at the end of a line."""
+    rest = b""
+    while chunk := handle.read(BLOCK_BYTES):
+        whole, newline, tail = chunk.rpartition(b"\n")
+        if newline:
+            yield rest + whole + newline
+            rest = tail
+        else:
+            rest += chunk
+    if rest:
+        yield rest + b"\n"
+
+
+def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
+    if not parts.positions:
+        for line in block.split(b"\n", MAX_HEADER_LINES)[:MAX_HEADER_LINES]:
+            if line.startswith(b"#"):
+                parts.comments.append(line[1:].decode("utf-8", "replace").strip())
+    if b"\\\n" in block or b"\\\r\n" in block:
+        block = block.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    data = np.frombuffer(block, np.uint8)
+    ends = np.flatnonzero(data == NEWLINE) + 1
+    starts = np.concatenate([[0], ends[:-1]])
+    first, second = data[starts], data[np.minimum(starts + 1, len(data) - 1)]
+    third = data[np.minimum(starts + 2, len(data) - 1)]
+    blank = (second == SPACE) | (second == TAB)
+    is_position = (first == ord("v")) & blank
+    is_uv = (first == ord("v")) & (second == ord("t")) & ((third == SPACE) | (third == TAB))
+    is_face = (first == ord("f")) & blank
+    lengths = ends - starts
+    if is_position.any():
+        text = _lines(data, is_position, lengths)
+        values = _numbers(path, text.translate(None, b"v"), int(is_position.sum()), "v")
+        if values.shape[1] < 3:
+            raise SceneFileError(f"{path}: a line 'v' has fewer than three numbers.")
+        parts.positions.append(values[:, :3].copy())  # without the colours behind them
+        parts.vertex_count += len(values)
+        for line in text.split(b"\n", DIGIT_LINES)[:DIGIT_LINES]:
+            words = line.split()[1:4]
+            parts.decimals = max([parts.decimals, *(len(word.partition(b".")[2]) for word in words)])
+    if is_uv.any():
+        text = _lines(data, is_uv, lengths).translate(None, b"vt")
+        parts.uv.append(_numbers(path, text, int(is_uv.sum()), "vt")[:, :2].astype(np.float32))
+        parts.uv_count += int(is_uv.sum())
+    if is_face.any():
+        _take_faces(path, _lines(data, is_face, lengths), int(is_face.sum()), parts)
+
+
+def _lines(data: np.ndarray, chosen: np.ndarray, lengths: np.ndarray) -> bytes:
+    return data.tobytes() if chosen.all() else data[np.repeat(chosen, lengths)].tobytes()
+
+
+def _numbers(path: Path, text: bytes, lines: int, keyword: str) -> np.ndarray:
+    """All numbers of ``lines`` lines, one row a line; all lines must have the same count."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # numpy's way to say that it met no number
+        try:
+            values = np.fromstring(text, dtype=np.float64, sep=" ")
+        except (DeprecationWarning, ValueError) as error:
+            raise SceneFileError(f"{path}: a line '{keyword}' holds something that is no number.") from error
+    words = len(text[: text.index(b"\n")].split())
+    if len(values) != lines * words or _is_ragged(text, words):
+        return _ragged_numbers(path, text, keyword)
+    return values.reshape(lines, words)
+
+
+def _ragged_numbers(path: Path, text: bytes, keyword: str) -> np.ndarray:
+    """As many columns as the shortest line has (some programs colour only part of the vertices)."""
+    rows = [line.split() for line in text.split(b"\n") if line.strip()]
+    width = min(len(row) for row in rows)
+    if width == 0:
+        raise SceneFileError(f"{path}: a line '{keyword}' is empty.")
+    return np.array([[float(word) for word in row[:width]] for row in rows])
+
+
+def _take_faces(path: Path, text: bytes, lines: int, parts: _Parts) -> None:
+    """Faces as fans of triangles, and the texture coordinates of their corners where they name some."""
+    sample = text[: text.index(b"\n")].split()[1:]
+    slashes = {word.count(b"/") for word in sample}
+    spaces, words_per_line = text.count(b"/"), len(sample)
+    uniform = len(slashes) == 1 and spaces == lines * words_per_line * next(iter(slashes))
+    if uniform and b"//" not in text:
+        per_word = 1 + next(iter(slashes))
+        values = _numbers(path, text.replace(b"/", b" ").translate(None, b"f"), lines, "f")
+        if values.shape[1] == words_per_line * per_word and not _is_ragged(text, words_per_line + 1):
+            indices = values.astype(np.int64).reshape(lines, words_per_line, per_word)
+            _add_fans(indices[:, :, 0], indices[:, :, 1] if per_word > 1 else None, parts)
+            return
+    for line in text.split(b"\n"):
+        words = [word.split(b"/") for word in line.split()[1:]]
+        if len(words) < 3:
+            continue
+        try:
+            vertex = np.array([[int(word[0]) for word in words]])
+            named = all(len(word) > 1 and word[1] for word in words)
+            texture = np.array([[int(word[1]) for word in words]]) if named else None
+        except ValueError as error:
+            raise SceneFileError(f"{path}: a line 'f' holds something that is no number.") from error
+        _add_fans(vertex, texture, parts)
+
+
+def _is_ragged(text: bytes, words_per_line: int) -> bool:
+    """Whether lines of several lengths happen to add up to the same count."""
+    data = np.frombuffer(text, np.uint8)
+    gap = data <= SPACE
+    starts = ~gap
+    starts[1:] &= gap[:-1]
+    ends = np.flatnonzero(data == NEWLINE)
+    counts = np.diff(np.concatenate([[0], np.cumsum(starts, dtype=np.int64)[ends]]))
+    return bool((counts != words_per_line).any())
+
+
+def _add_fans(vertex: np.ndarray, texture: np.ndarray | None, parts: _Parts) -> None:
+    sides = vertex.shape[1]
+    fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
+    # Numbers count from 1; negative ones count back from the newest vertex.
+    positions = np.where(vertex > 0, vertex - 1, vertex + parts.vertex_count)
+    parts.triangles.append(_small(positions[:, fan].reshape(-1, 3)))
+    if texture is None:
+        parts.triangle_uv.append(np.full((len(vertex) * len(fan), 3), -1, np.int32))
+    else:
+        places = np.where(texture > 0, texture - 1, texture + parts.uv_count)
+        parts.triangle_uv.append(_small(places[:, fan].reshape(-1, 3)))
+
+
+def _small(numbers: Int64[np.ndarray, "t 3"]) -> Int32[np.ndarray, "t 3"]:
+    """Numbers in half the memory; those that no mesh can hold stay too large."""
+    return np.clip(numbers, -1, np.iinfo(np.int32).max).astype(np.int32)
+
+
+def _uv_of_vertices(path: Path, parts: _Parts, count: int) -> Float32[np.ndarray, "v 2"] | None:
+    if not parts.uv or not parts.triangle_uv:
+        return None
+    table = np.concatenate(parts.uv)
+    uv = np.full((count, 2), np.nan, np.float32)
+    for triangles, places in zip(parts.triangles, parts.triangle_uv, strict=True):
+        if places.max(initial=-1) >= len(table):
+            raise SceneFileError(f"{path}: a face names a texture coordinate that is not there.")
+        vertices, places = triangles[places >= 0], places[places >= 0]
+        if len(vertices) and not (vertices.min() >= 0 and vertices.max() < count):
+            raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
+        uv[vertices] = table[places]
+    return uv
+
+
+def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write ``path``, ``<stem>.mtl`` and ``<stem>_alpha.png``; coordinates keep every float32 bit.
+
+    Raises:
+        SceneFileError: nothing to write, or values that are not finite.
+        OSError: a file cannot be written.
+    """
+    soup = OctagonSoup(gaussians, path, options)
+    material, texture = path.with_suffix(".mtl"), path.with_name(f"{path.stem}_alpha.png")
+    with replacing(texture) as temporary:
+        temporary.write_bytes(grey_png(options.texture_size, options.q))
+    write_text(material, f"{_material(MATERIAL)}map_d {texture.name}\n")
+    with replacing(path) as temporary, temporary.open("wb") as handle:
+        for text in _octagon_lines(soup, material.name):
+            handle.write(text.encode())
+    return path, material, texture
+
+
+def _material(name: str) -> str:
+    return f"newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 0\n"
+
+
+def _octagon_lines(soup: OctagonSoup, material_name: str) -> Iterator[str]:
+    yield (
+        f"# octasplat octagons: {SIDES} vertices and 6 triangles per Gaussian, in the order of the scene\n"
+        f"# octasplat_q {soup.q!r}\n# octasplat_gaussians {soup.scene_size}\n"
+        f"mtllib {material_name}\no octagons\nusemtl {MATERIAL}\n"
+    )
+    for batch in soup.batches():
+        yield _vertex_lines(batch)
+    for start in range(0, len(soup), BATCH):
+        count = min(BATCH, len(soup) - start)
+        indices = octagon_triangles(count) + (1 + start * SIDES)
+        yield FACE_LINE * len(indices) % tuple(np.repeat(indices.reshape(-1), 2).tolist())
+
+
+def _vertex_lines(batch: OctagonBatch) -> str:
+    """The ``v`` and ``vt`` lines of a batch; one big format string beats a call per line many times over."""
+    count = len(batch.ids)
+    octagons = (POSITION_LINE + "\0") * SIDES * count % tuple(batch.corners_world.reshape(-1).tolist())
+    positions = octagons.split("\0")
+    colours = [COLOUR_END % tuple(rgb) for rgb in batch.rgb_srgb.tolist()]
+    vertices = "".join([positions[k] + colours[k // SIDES] for k in range(count * SIDES)])
+    return vertices + TEXTURE_LINE * (count * SIDES) % tuple(batch.uv.reshape(-1).tolist())
+
+
+def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
+    """Write a surface; vertex colours stand behind the positions, a texture in an MTL and a PNG beside it.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    head, files = "# octasplat surface\n", [path]
+    if mesh.texture_srgb is not None:
+        material, image = path.with_suffix(".mtl"), path.with_suffix(".png")
+        with replacing(image) as temporary:
+            temporary.write_bytes(png_bytes(mesh.texture_srgb))
+        write_text(material, f"{_material('surface')}map_Kd {image.name}\n")
+        head += f"mtllib {material.name}\nusemtl surface\n"
+        files += [material, image]
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as handle:
+        handle.write(head)
+        vertices = (
+            mesh.vertices_world if mesh.rgb_srgb is None else np.hstack([mesh.vertices_world, mesh.rgb_srgb])
+        )
+        _write_lines(handle.write, "v %.7g %.7g %.7g" + " %.4g" * (vertices.shape[1] - 3), vertices)
+        numbers = mesh.faces.astype(np.int64) + 1
+        if mesh.uv is None:
+            _write_lines(handle.write, "f %d %d %d", numbers)
+        else:
+            _write_lines(handle.write, "vt %.7g %.7g", mesh.uv * [1, -1] + [0, 1])  # from the lower left
+            _write_lines(handle.write, "f %d/%d %d/%d %d/%d", np.repeat(numbers, 2, axis=1))
+    return tuple(files)
+
+
+def _write_lines(write: Callable[[str], object], line: str, rows: np.ndarray) -> None:
+    for start in range(0, len(rows), LINES_AT_ONCE):
+        part = rows[start : start + LINES_AT_ONCE]
+        write((line + "\n") * len(part) % tuple(part.reshape(-1).tolist()))
+
+
+register(
+    Exporter("obj", ("*.obj",), "octagon mesh as OBJ with vertex colours, without opacity", write_octagons)
+)
+register(MeshReader("obj", ("*.obj",), read))
+register(SurfaceWriter("obj", ("*.obj",), write_surface, textured=True))

@@ -1,0 +1,174 @@
+"""Meshes as PLY: octagons of a scene out, surfaces out, edited meshes in.
+
+Octagons: the format to edit in, as mesh editors keep vertex attributes both ways; they are found by name.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int, Int64
+
+from engine.colour import to_bytes
+from engine.errors import SceneFileError
+from engine.files.mesh import Mesh, stated_q
+from engine.files.octagon_soup import BATCH, OctagonSoup
+from engine.files.options import ExportOptions
+from engine.files.ply_container import (
+    COUNT_SUFFIX,
+    PlyWriteElement,
+    columns,
+    list_field,
+    read_ply,
+    write_ply,
+)
+from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.octagon import FAN, SIDES, octagon_triangles
+from engine.surface.mesh import TriangleMesh
+
+_POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
+COLOURS = ("red", "green", "blue")
+_FACE_LISTS = ("vertex_indices", "vertex_index")
+VERTEX = np.dtype(
+    [
+        *((name, "<f4") for name in (*_POSITION, "s", "t")),
+        *((name, "u1") for name in (*COLOURS, "alpha")),
+        *((name, "<f4") for name in ("gid", "corner", "radius")),
+    ]
+)
+FACE = np.dtype(list_field("vertex_indices", "i4", 3))
+
+
+def read(path: Path) -> Mesh:
+    """Read a PLY mesh; faces may be triangles or polygons, all of one length.
+
+    Raises:
+        SceneFileError: no PLY, no positions, Gaussians instead of a mesh, or faces of several lengths.
+    """
+    header, tables = read_ply(path, ["vertex"])
+    vertex = header.element("vertex")
+    assert vertex is not None
+    if "f_dc_0" in vertex.names:
+        raise SceneFileError(
+            f"{path}: is a file of Gaussians, not a mesh; name the mesh that was exported and edited."
+        )
+    missing = [name for name in _POSITION if name not in vertex.names]
+    if missing or vertex.lists:
+        raise SceneFileError(f"{path}: is no mesh; its vertices lack the property {', '.join(missing)}.")
+    table = tables["vertex"]
+    face = header.element("face")
+    triangles = np.zeros((0, 3), np.int64)
+    if face is not None and face.count:
+        name = next((prop.name for prop in face.lists if prop.name in _FACE_LISTS), None)
+        if name is None:
+            raise SceneFileError(f"{path}: its faces have no list 'vertex_indices'.")
+        triangles = _fans(np.asarray(read_ply(path, ["face"])[1]["face"][name]))
+    positions = np.empty((len(table), 3))
+    for axis, name in enumerate(_POSITION):
+        positions[:, axis] = table[name]
+    return Mesh(
+        positions,
+        triangles,
+        uv=columns(table, ("s", "t")) if {"s", "t"} <= set(vertex.names) else None,
+        gid=_attribute(table, "gid"),
+        corner=_attribute(table, "corner"),
+        radius=_attribute(table, "radius"),
+        q=stated_q(header.comments),
+    )
+
+
+def _fans(polygons: np.ndarray) -> Int64[np.ndarray, "t 3"]:
+    sides = polygons.shape[1]
+    if sides < 3:
+        return np.zeros((0, 3), np.int64)
+    if sides == 3:
+        return polygons.astype(np.int64)
+    fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
+    return polygons.astype(np.int64)[:, fan].reshape(-1, 3)
+
+
+def _attribute(table: np.ndarray, name: str) -> Float32[np.ndarray, " v"] | None:
+    """A vertex attribute under its own name, or under that of the GLB, from which Blender takes it over."""
+    for known in (name, f"_{name.upper()}"):
+        if known in (table.dtype.names or ()):
+            return columns(table, (known,))[:, 0]
+    return None
+
+
+def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write eight vertices and six triangles per Gaussian.
+
+    Per vertex: position (world), texture coordinates ``s t``, display colour and opacity as bytes, and as
+    floats ``gid`` (number of the Gaussian), ``corner`` (0 to 7) and ``radius`` (of the corners, in standard
+    deviations).
+    """
+    soup = OctagonSoup(gaussians, path, options)
+    count = len(soup)
+    comments = ("octasplat octagons", f"octasplat_q {options.q!r}", f"octasplat_gaussians {soup.scene_size}")
+    vertices = PlyWriteElement("vertex", count * SIDES, VERTEX, _vertices(soup))
+    faces = PlyWriteElement("face", count * len(FAN), FACE, _faces(count))
+    write_ply(path, [vertices, faces], comments)
+    return (path,)
+
+
+def _vertices(soup: OctagonSoup) -> Iterator[np.ndarray]:
+    for batch in soup.batches():
+        rows = np.empty((len(batch.ids), SIDES), dtype=VERTEX)
+        for axis, name in enumerate(_POSITION):
+            rows[name] = batch.corners_world[..., axis]
+        rows["s"], rows["t"] = batch.uv[..., 0], batch.uv[..., 1]
+        rgba = to_bytes(np.concatenate([batch.rgb_srgb, batch.opacities[:, None]], axis=1))
+        for channel, name in enumerate((*COLOURS, "alpha")):
+            rows[name] = rgba[:, channel, None]
+        rows["gid"] = batch.ids[:, None]
+        rows["corner"] = np.arange(SIDES)
+        rows["radius"] = batch.radii[:, None]
+        yield rows.reshape(-1)
+
+
+def _faces(count: int) -> Iterator[np.ndarray]:
+    for start in range(0, count, BATCH):
+        yield _face_rows(octagon_triangles(min(BATCH, count - start)) + start * SIDES)
+
+
+def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
+    """Write a surface with its normals and the colours of its vertices, if it has some.
+
+    Raises:
+        SceneFileError: the file cannot be written.
+    """
+    colours = COLOURS if mesh.rgb_srgb is not None else ()
+    rows = np.empty(
+        len(mesh.vertices_world),
+        dtype=[*((name, "<f4") for name in (*_POSITION, *_NORMAL)), *((name, "u1") for name in colours)],
+    )
+    vectors = np.concatenate([mesh.vertices_world, mesh.vertex_normals()], axis=1)
+    for column, name in enumerate((*_POSITION, *_NORMAL)):
+        rows[name] = vectors[:, column]
+    if mesh.rgb_srgb is not None:
+        for column, name in enumerate(colours):
+            rows[name] = to_bytes(mesh.rgb_srgb[:, column])
+    vertices = PlyWriteElement("vertex", len(rows), rows.dtype, [rows])
+    faces = PlyWriteElement("face", len(mesh.faces), FACE, [_face_rows(mesh.faces)])
+    write_ply(path, [vertices, faces], ["octasplat surface"])
+    return (path,)
+
+
+def _face_rows(triangles: Int[np.ndarray, "t 3"]) -> np.ndarray:
+    rows = np.empty(len(triangles), dtype=FACE)
+    rows["vertex_indices" + COUNT_SUFFIX] = 3
+    rows["vertex_indices"] = triangles
+    return rows
+
+
+register(
+    Exporter(
+        "mesh-ply",
+        ("mesh.ply", "*.mesh.ply", "*_mesh.ply", "*-mesh.ply"),
+        "octagon mesh as a binary PLY with Gaussian numbers, for editing",
+        write_octagons,
+    )
+)
+register(MeshReader("mesh-ply", ("*.ply",), read))
+register(SurfaceWriter("mesh-ply", ("*.ply",), write_surface, textured=False))

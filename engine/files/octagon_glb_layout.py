@@ -1,0 +1,145 @@
+"""Where everything lies in a GLB of octagons, and the JSON that says so."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from engine.files.gltf import (
+    ARRAY_BUFFER,
+    CLAMP_TO_EDGE,
+    ELEMENT_ARRAY_BUFFER,
+    FLOAT,
+    HALF_TURN_ABOUT_X,
+    LINEAR,
+    UNSIGNED_INT,
+    accessor,
+    glb_bytes,
+    json_bytes,
+    padded,
+    vector_type,
+)
+from engine.files.options import ExportOptions
+from engine.gaussians.octagon import FAN, SIDES
+
+OPAQUE_CUTOFF = 0.2
+"""``opaque``: a pixel is drawn where opacity times fall-off reaches this; best of 0.03 to 0.6 on a
+trained scene (docs/opening/threejs.md)."""
+WIDEST_NUMBER = float(np.float32(-1.1754943508222875e-38))
+
+Bounds = tuple[list[float], list[float]]
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """A vertex attribute of glTF: its semantic and how many floats it has."""
+
+    semantic: str
+    width: int
+
+    @property
+    def type(self) -> str:
+        """The shape, as glTF names it."""
+        return vector_type(self.width)
+
+
+OWN_ATTRIBUTES = (Attribute("POSITION", 3), Attribute("COLOR_0", 4), Attribute("TEXCOORD_0", 2))
+GID = Attribute("_GID", 1)
+CORNER = Attribute("_CORNER", 1)
+
+
+class GlbLayout:
+    """One file: the texture, the indices and the corner numbers (shared by all chunks), then the chunks.
+
+    Attributes:
+        largest: octagons in the largest chunk, for which the shared indices are made.
+        length: bytes of the binary part.
+        json_room: bytes kept for the JSON. It comes first in the file but holds the bounds of all vertices,
+            so there is room for the longest numbers.
+        total: bytes of the whole file.
+    """
+
+    def __init__(self, chunk_sizes: list[int], png_size: int, options: ExportOptions, extras: object) -> None:
+        """Plan a file of chunks of so many octagons; ``extras`` goes into the JSON's ``asset``."""
+        self._chunk_sizes = chunk_sizes
+        self._options = options
+        self._extras = extras
+        self._attributes = (*OWN_ATTRIBUTES, *((GID,) if options.ids else ()))
+        self._views: list[dict[str, object]] = []
+        self.largest = max(chunk_sizes)
+        self.length = 0
+        self._add_view(png_size)
+        self._add_view(self.largest * len(FAN) * 3 * 4, target=ELEMENT_ARRAY_BUFFER)
+        if options.ids:
+            self._add_view(self.largest * SIDES * 4, target=ARRAY_BUFFER, byteStride=4)
+        self._shared_views = len(self._views)
+        for size in chunk_sizes:
+            for attribute in self._attributes:
+                self._add_view(size * SIDES * attribute.width * 4, target=ARRAY_BUFFER)
+        widest = ([WIDEST_NUMBER] * 3, [WIDEST_NUMBER] * 3)
+        self.json_room = padded(len(self.json([widest] * len(chunk_sizes))))
+        self.total = glb_bytes(self.json_room, self.length)
+
+    def _add_view(self, length: int, **keys: int) -> None:
+        self._views.append({"buffer": 0, "byteOffset": self.length, "byteLength": length, **keys})
+        self.length += padded(length)
+
+    def json(self, bounds: list[Bounds]) -> bytes:
+        """The JSON part, given each chunk's smallest and largest coordinates."""
+        return json_bytes(self._document(bounds))
+
+    def _document(self, bounds: list[Bounds]) -> dict[str, object]:
+        accessors: list[dict[str, object]] = []
+        meshes: list[dict[str, object]] = []
+        for chunk, size in enumerate(self._chunk_sizes):
+            used: dict[str, int] = {}
+            first_view = self._shared_views + chunk * len(self._attributes)
+            for place, attribute in enumerate(self._attributes):
+                used[attribute.semantic] = len(accessors)
+                accessors.append(accessor(first_view + place, FLOAT, size * SIDES, attribute.type))
+            accessors[used["POSITION"]] |= {"min": bounds[chunk][0], "max": bounds[chunk][1]}
+            if self._options.ids:
+                used[CORNER.semantic] = len(accessors)
+                accessors.append(accessor(2, FLOAT, size * SIDES, CORNER.type))
+            accessors.append(accessor(1, UNSIGNED_INT, size * len(FAN) * 3, "SCALAR"))
+            meshes.append(
+                {"primitives": [{"attributes": used, "indices": len(accessors) - 1, "material": 0}]}
+            )
+        chunks = range(len(self._chunk_sizes))
+        nodes: list[dict[str, object]] = [
+            {"name": "octasplat", "rotation": HALF_TURN_ABOUT_X, "children": [1 + chunk for chunk in chunks]},
+            *({"name": f"octagons_{chunk:02d}", "mesh": chunk} for chunk in chunks),
+        ]
+        return {
+            "asset": {"version": "2.0", "generator": "octasplat", "extras": self._extras},
+            "extensionsUsed": ["KHR_materials_unlit"],
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": nodes,
+            "meshes": meshes,
+            "materials": [_material(self._options.opaque)],
+            "textures": [{"sampler": 0, "source": 0}],
+            "samplers": [
+                {"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
+            ],
+            "images": [{"name": "radial_alpha", "mimeType": "image/png", "bufferView": 0}],
+            "accessors": accessors,
+            "bufferViews": self._views,
+            "buffers": [{"byteLength": self.length}],
+        }
+
+
+def _material(opaque: bool) -> dict[str, object]:
+    transparency: dict[str, object] = {"alphaMode": "BLEND"}
+    if opaque:
+        transparency = {"alphaMode": "MASK", "alphaCutoff": OPAQUE_CUTOFF}
+    return {
+        "name": "octagons",
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicFactor": 0.0,
+            "roughnessFactor": 1.0,
+        },
+        "extensions": {"KHR_materials_unlit": {}},
+        **transparency,
+        "doubleSided": True,
+    }

@@ -1,0 +1,70 @@
+"""Scenes and meshes read from files of any known format."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from engine.errors import SceneFileError
+from engine.events import Listener, StageFinished, StageStarted, ignore
+from engine.files.mesh import Mesh
+from engine.files.registry import importer_for, mesh_reader_for
+from engine.gaussians.flattening import ImportReport, flatten
+from engine.gaussians.model import FlatGaussians
+
+FOLDER_FILES = ("scene.ply", "meta.json")
+"""What a folder is read by: the scene of a run, or the description of an unpacked SOG."""
+
+
+def read_scene(
+    path: Path, format: str | None = None, *, drop_invalid: bool = False, listener: Listener = ignore
+) -> tuple[FlatGaussians, ImportReport]:
+    """Read the Gaussians of a file of any known format, or of the folder of a run, and flatten them.
+
+    Args:
+        path: the file, or a folder with ``scene.ply`` or with the ``meta.json`` of an unpacked SOG.
+        format: the name of its format; by default the file shows it.
+        drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
+        listener: told when reading begins and ends (stage ``read``).
+
+    Returns:
+        Flat Gaussians, and what flattening and reading lost.
+
+    Raises:
+        SceneFileError: the file cannot be read; the text names it and says why.
+    """
+    source = _file_of(path)
+    importer = importer_for(source, format)
+    listener(StageStarted("read"))
+    began = time.monotonic()
+    cloud = importer.read(source)
+    scene = flatten(cloud, source, drop_invalid=drop_invalid)
+    listener(StageFinished("read", time.monotonic() - began))
+    return scene
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a PLY, OBJ or GLB mesh.
+
+    Raises:
+        SceneFileError: another suffix, a file that cannot be read, is damaged or compressed, or has vertices
+            that are not finite.
+    """
+    mesh = mesh_reader_for(path).read(path)
+    if len(mesh) == 0:
+        raise SceneFileError(f"{path}: holds no vertices.")
+    bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+    if bad:
+        raise SceneFileError(f"{path}: {bad} of {len(mesh)} vertices are not finite; save the mesh again.")
+    if len(mesh.triangles) and not (mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh)):
+        raise SceneFileError(f"{path}: a face names a vertex that is not there; the file is damaged.")
+    return mesh
+
+
+def _file_of(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    for name in FOLDER_FILES:
+        if (path / name).exists():
+            return path / name
+    raise SceneFileError(f"{path}: is a folder without a scene; it should hold {' or '.join(FOLDER_FILES)}.")

@@ -1,0 +1,196 @@
+"""The one registry of file formats: Gaussians in and out, meshes in, surfaces out.
+
+A format is a module of this package that holds all that can be done with it and calls `register`; nothing
+else has to know of it.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, TypeVar
+
+from engine.errors import SceneFileError
+from engine.files.format_table import Entry, FormatTable
+from engine.files.mesh import Mesh
+from engine.files.options import ExportOptions
+from engine.gaussians.flattening import GaussianCloud
+from engine.gaussians.model import FlatGaussians
+from engine.surface.mesh import TriangleMesh
+
+HEAD_BYTES = 4096
+
+SceneReader = Callable[[Path], GaussianCloud]
+SceneWriter = Callable[[FlatGaussians, Path, ExportOptions], tuple[Path, ...]]
+
+
+@dataclass(frozen=True)
+class Importer(Entry):
+    """One format of Gaussians to read.
+
+    Attributes:
+        name: what ``format=`` calls it.
+        patterns: file names that it takes where the file's first bytes do not decide.
+        description: one line for help texts.
+        read: reads the Gaussians as the file has them, in the world frame of the 3DGS family (y down).
+        recognises: whether a file that begins with these bytes (up to ``HEAD_BYTES``) is of this format.
+    """
+
+    noun: ClassVar[str] = "import"
+    description: str
+    read: SceneReader
+    recognises: Callable[[bytes], bool] = lambda _head: False
+
+
+@dataclass(frozen=True)
+class Exporter(Entry):
+    """One format in which a scene is written, as Gaussians or as octagons.
+
+    Attributes:
+        name: what ``format=`` calls it.
+        patterns: file names that it takes by default.
+        description: one line for help texts.
+        write: writes the Gaussians to the path and returns every file written, the path itself first.
+        lacking: what is missing on this machine to write it, to be read after the file's name, or None.
+    """
+
+    noun: ClassVar[str] = "export"
+    description: str
+    write: SceneWriter
+    lacking: Callable[[], str | None] = lambda: None
+
+
+@dataclass(frozen=True)
+class MeshReader(Entry):
+    """One format of meshes to read: those that come back from an editor, or that drive a scene.
+
+    Attributes:
+        name: of the format.
+        patterns: file names that it takes.
+        read: reads all triangles.
+    """
+
+    noun: ClassVar[str] = "mesh"
+    read: Callable[[Path], Mesh]
+
+
+@dataclass(frozen=True)
+class SurfaceWriter(Entry):
+    """One format in which a surface is written.
+
+    Attributes:
+        name: of the format.
+        patterns: file names that it takes.
+        write: writes the surface and returns every file written, the path itself first.
+        textured: whether it can hold a texture.
+    """
+
+    noun: ClassVar[str] = "surface"
+    write: Callable[[TriangleMesh, Path], tuple[Path, ...]]
+    textured: bool
+
+
+_TABLE = FormatTable(__name__.rpartition(".")[0])
+E = TypeVar("E", bound=Entry)
+
+
+def register(entry: E) -> E:
+    """Add what can be done with a format; its name must be new among entries of its class."""
+    _TABLE.register(entry)
+    return entry
+
+
+def importers() -> tuple[Importer, ...]:
+    """All formats of Gaussians that are read, by name."""
+    return _TABLE.all(Importer)
+
+
+def exporters() -> tuple[Exporter, ...]:
+    """All formats in which scenes are written, by name."""
+    return _TABLE.all(Exporter)
+
+
+def importer_for(path: Path, format: str | None = None) -> Importer:
+    """The format called ``format``, or else the one that ``path``'s first bytes or its name show.
+
+    What a file begins with decides, then its name, so that a file under a wrong name is read all the same.
+
+    Raises:
+        SceneFileError: the file cannot be opened, or no format has that name, those bytes or that file name.
+    """
+    if format is not None:
+        return _TABLE.named(Importer, format, path)
+    head = _head(path)
+    for importer in importers():
+        if importer.recognises(head):
+            return importer
+    found = _TABLE.by_file_name(Importer, path)
+    if found is None:
+        choices = _TABLE.choices(Importer)
+        raise SceneFileError(f"{path}: is no scene of a known format; the formats are {choices}.")
+    return found
+
+
+def exporter_for(path: Path, format: str | None = None) -> Exporter:
+    """The format called ``format``, or else the one that ``path``'s name asks for.
+
+    ``.ply`` means a Gaussian PLY, except ``mesh.ply``, ``*.mesh.ply``, ``*_mesh.ply`` and ``*-mesh.ply``,
+    which mean the octagon mesh. Upper and lower case are the same.
+
+    Raises:
+        SceneFileError: no format has that name or takes that file name; the text lists those that exist.
+    """
+    if format is not None:
+        return _TABLE.named(Exporter, format, path)
+    found = _TABLE.by_file_name(Exporter, path)
+    if found is None:
+        choices = _TABLE.choices(Exporter)
+        raise SceneFileError(f"{path}: no export format takes this file name; the formats are {choices}.")
+    return found
+
+
+def writable_formats() -> tuple[str, ...]:
+    """Names of the formats that this machine can write, as of now."""
+    return tuple(exporter.name for exporter in exporters() if exporter.lacking() is None)
+
+
+def check_writable(names: Iterable[str]) -> None:
+    """Make sure that files of these names can be written on this machine, before any long work.
+
+    Raises:
+        SceneFileError: no format takes a name, or what its format needs is missing; the text says what to do.
+    """
+    for name in names:
+        lacking = exporter_for(Path(name)).lacking()
+        if lacking is not None:
+            raise SceneFileError(f"{name}: {lacking}.")
+
+
+def mesh_reader_for(path: Path) -> MeshReader:
+    """The mesh format that ``path``'s name shows.
+
+    Raises:
+        SceneFileError: there is none.
+    """
+    found = _TABLE.by_file_name(MeshReader, path)
+    if found is None:
+        suffixes = _TABLE.suffixes(MeshReader)
+        raise SceneFileError(f"{path}: is no mesh that is read here; save it as {suffixes}.")
+    return found
+
+
+def surface_writer_for(path: Path) -> SurfaceWriter | None:
+    """The format in which a surface is written to ``path``, as its name says; None where there is none."""
+    return _TABLE.by_file_name(SurfaceWriter, path)
+
+
+def surface_suffixes() -> str:
+    """What names of surfaces may end in, as in ".glb, .ply or .obj"."""
+    return _TABLE.suffixes(SurfaceWriter)
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as handle:
+            return handle.read(HEAD_BYTES)
+    except OSError as error:
+        raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error

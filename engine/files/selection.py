@@ -1,0 +1,54 @@
+"""What all splat formats share: which Gaussians go out, whether they can, and in which blocks."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from engine.errors import SceneFileError
+from engine.files.options import ExportOptions
+from engine.gaussians.model import FlatGaussians
+
+ROWS_AT_ONCE = 65536
+LARGEST_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3
+
+
+def selected(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> FlatGaussians:
+    """The Gaussians not fainter than ``options.min_opacity``, all finite; ``path`` names the file in errors.
+
+    Raises:
+        SceneFileError: nothing to write, or values that are not finite.
+    """
+    if len(gaussians) == 0:
+        raise SceneFileError(f"{path}: not written, as there are no Gaussians.")
+    if not gaussians.is_finite():
+        raise SceneFileError(f"{path}: not written, as some Gaussians hold values that are not finite.")
+    if options.min_opacity > 0.0:
+        count = len(gaussians)
+        gaussians = gaussians.select(gaussians.opacities >= options.min_opacity)
+        if not len(gaussians):
+            raise SceneFileError(f"{path}: not written; all {count} Gaussians are below min_opacity.")
+    return gaussians
+
+
+def check_scales(scene: FlatGaussians, path: Path) -> None:
+    """Raise for standard deviations beyond float32, which only formats that hold their logarithm can write.
+
+    Raises:
+        SceneFileError: some are.
+    """
+    if len(scene) and float(scene.log_scales.max()) >= LARGEST_LOG_SCALE:
+        raise SceneFileError(f"{path}: not written, as some Gaussians are too large for float32.")
+
+
+def blocks(scene: FlatGaussians) -> Iterator[FlatGaussians]:
+    """The scene in order, a few thousand Gaussians at a time, without copying it."""
+    for start in range(0, len(scene), ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
+        yield FlatGaussians(
+            scene.means_world[part],
+            scene.quats_wxyz[part],
+            scene.log_scales[part],
+            scene.opacity_logits[part],
+            scene.sh[part],
+        )

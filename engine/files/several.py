@@ -1,0 +1,43 @@
+"""Several files of one scene; one that cannot be written takes none of the others along."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from engine.errors import OctasplatError
+from engine.files.exporting import export_scene
+from engine.files.options import ExportOptions
+from engine.gaussians.model import FlatGaussians
+
+
+def export_files(
+    gaussians: FlatGaussians,
+    folder: Path,
+    names: Sequence[str],
+    options: ExportOptions,
+    on_done: Callable[[int], None],
+) -> str | None:
+    """Write ``gaussians`` to files in ``folder``, all of them that can be written.
+
+    Args:
+        gaussians: the scene.
+        folder: where to.
+        names: of the files; they say the formats.
+        options: of all of them.
+        on_done: told how many files have been dealt with, after each; it may raise to stop.
+
+    Returns:
+        What could not be written and why, in a sentence for each file, or None.
+    """
+    failed: list[str] = []
+    for done, name in enumerate(names, start=1):
+        try:
+            export_scene(gaussians, folder / name, options)
+        except OctasplatError as error:
+            failed.append(str(error).replace(f"{folder / name}", name).rstrip("."))
+        except Exception as error:  # noqa: BLE001 - a fault of one format costs none of the others
+            failed.append(f"{name}: {type(error).__name__}: {error}")
+        on_done(done)
+    if not failed:
+        return None
+    count = f"{len(failed)} of {len(names)} files" if len(names) > 1 else "The file"
+    return f"{count} could not be written: {'; '.join(failed)}."

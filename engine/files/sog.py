@@ -1,0 +1,267 @@
+"""SOG of PlayCanvas: lossless images of quantised parameters with a ``meta.json``, zipped or in a folder.
+
+Version 2 looks scales and colours up in code books; the older layout without a version spreads them between
+bounds. Positions have 16 bits in sign(x) ln(1 + |x|); higher harmonics are entries of a palette. Written by
+the program splat-transform, where that is.
+"""
+
+import json
+import tempfile
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from engine.errors import SceneFileError
+from engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
+from engine.files.gaussian_ply import write_gaussian_ply
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, Importer, register
+from engine.files.selection import selected
+from engine.files.splat_transform import convert, lacking
+from engine.gaussians.flattening import GaussianCloud
+from engine.gaussians.model import FlatGaussians
+from engine.writing import replacing
+
+META = "meta.json"
+PALETTE_COLUMNS = 64
+FIRST_QUAT_TAG = 252
+"""Alpha 252 to 255 says which of w, x, y, z is left out."""
+MAX_FILE_BYTES = 1 << 31
+_REST_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
+
+
+class _Part(BaseModel):
+    """What ``meta.json`` says of one parameter, in either version."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    files: list[str]
+    shape: list[int] = Field(default_factory=list)
+    mins: list[float] | float = Field(default_factory=list)
+    maxs: list[float] | float = Field(default_factory=list)
+    codebook: list[float] | None = None
+    bands: int | None = Field(default=None, ge=0, le=3)
+
+
+class _Meta(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    version: int = 1
+    count: int | None = Field(default=None, ge=0)
+    means: _Part
+    scales: _Part
+    quats: _Part
+    sh0: _Part
+    shN: _Part | None = None
+    antialias: bool = False
+
+
+Images = Callable[[str], UInt8[np.ndarray, "h w 4"]]
+
+
+def read(path: Path) -> GaussianCloud:
+    """Read a ``.sog`` bundle, or the ``meta.json`` beside its images.
+
+    Raises:
+        SceneFileError: the file is no SOG, an image is missing or too small, or a number is out of range.
+    """
+    try:
+        if not zipfile.is_zipfile(path):
+            return _decode(path, path.read_bytes(), _folder_images(path))
+        with zipfile.ZipFile(path) as bundle, tempfile.TemporaryDirectory(prefix="octasplat-") as folder:
+            return _decode(path, _member(path, bundle, META), _bundle_images(path, bundle, Path(folder)))
+    except (OSError, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
+        raise SceneFileError(f"{path}: is damaged or cannot be read ({error}).") from error
+
+
+def _folder_images(path: Path) -> Images:
+    def load(name: str) -> UInt8[np.ndarray, "h w 4"]:
+        return _pixels(path, name, path.parent / Path(name).name)
+
+    return load
+
+
+def _bundle_images(path: Path, bundle: zipfile.ZipFile, folder: Path) -> Images:
+    def load(name: str) -> UInt8[np.ndarray, "h w 4"]:
+        image = folder / Path(name).name
+        image.write_bytes(_member(path, bundle, name))
+        return _pixels(path, name, image)
+
+    return load
+
+
+def _member(path: Path, bundle: zipfile.ZipFile, name: str) -> bytes:
+    """A file of the bundle, at its root or in its only folder."""
+    names = [info for info in bundle.infolist() if info.filename.rpartition("/")[2] == Path(name).name]
+    if not names:
+        raise SceneFileError(f"{path}: is no SOG bundle; it lacks {name}.")
+    if names[0].file_size > MAX_FILE_BYTES:
+        raise SceneFileError(f"{path}: its {name} would unpack to {names[0].file_size} bytes.")
+    return bundle.read(names[0])
+
+
+def _pixels(path: Path, name: str, image: Path) -> UInt8[np.ndarray, "h w 4"]:
+    """The bytes of an image as they are stored, as RGBA."""
+    import OpenImageIO as oiio  # which the front end has not
+
+    if not image.exists():
+        raise SceneFileError(f"{path}: its image {name} is missing.")
+    as_stored = oiio.ImageSpec()
+    as_stored["oiio:UnassociatedAlpha"] = 1
+    source = oiio.ImageInput.open(str(image), as_stored)
+    if source is None:
+        raise SceneFileError(f"{path}: its image {name} cannot be read ({oiio.geterror()}).")
+    try:
+        pixels = source.read_image(format=oiio.UINT8)
+        if pixels is None:
+            raise SceneFileError(f"{path}: its image {name} is damaged ({source.geterror()}).")
+    finally:
+        source.close()
+    if pixels.shape[2] < 3:
+        raise SceneFileError(f"{path}: its image {name} should be RGB or RGBA.")
+    if pixels.shape[2] == 3:
+        return np.concatenate([pixels, np.full_like(pixels[:, :, :1], 255)], axis=2)
+    return np.ascontiguousarray(pixels[:, :, :4])
+
+
+def _decode(path: Path, text: bytes, images: Images) -> GaussianCloud:
+    try:
+        meta = _Meta.model_validate(json.loads(text))
+    except (ValidationError, ValueError, RecursionError) as error:
+        words = " ".join(str(error).split())[:200]
+        raise SceneFileError(f"{path}: its {META} does not describe a SOG ({words}).") from error
+    if meta.version not in (1, 2):
+        raise SceneFileError(f"{path}: is SOG version {meta.version}; versions 1 and 2 are read.")
+    count = meta.count if meta.count is not None else (meta.means.shape or [0])[0]
+    if count <= 0:
+        raise SceneFileError(f"{path}: holds no Gaussians.")
+
+    def rgba(part: _Part, number: int = 0) -> UInt8[np.ndarray, "n 4"]:
+        if len(part.files) <= number:
+            raise SceneFileError(f"{path}: its {META} names too few images.")
+        pixels = images(part.files[number]).reshape(-1, 4)
+        if len(pixels) < count:
+            raise SceneFileError(
+                f"{path}: its image {part.files[number]} holds {len(pixels)} of {count} Gaussians."
+            )
+        return pixels[:count]
+
+    low, high = rgba(meta.means)[:, :3], rgba(meta.means, 1)[:, :3]
+    curved = _spread(path, meta.means, (low.astype(np.float64) + 256.0 * high) / 65535.0)
+    colour = rgba(meta.sh0)
+    if meta.version == 2:
+        scales = _look_up(path, meta.scales, rgba(meta.scales)[:, :3])
+        constant = _look_up(path, meta.sh0, colour[:, :3])
+        logits = logits_from_bytes(colour[:, 3])
+    else:
+        scales = _spread(path, meta.scales, rgba(meta.scales)[:, :3] / 255.0).astype(np.float32)
+        both = _spread(path, meta.sh0, colour / 255.0).astype(np.float32)
+        constant, logits = both[:, :3], both[:, 3]
+    sh = constant[:, None, :]
+    if meta.shN is not None:
+        sh = np.concatenate([sh, _rest(path, meta.shN, images, rgba(meta.shN, 1))], axis=1)
+    return GaussianCloud(
+        means_world=(np.sign(curved) * np.expm1(np.abs(curved))).astype(np.float32),
+        quats_wxyz=_rotations(rgba(meta.quats)),
+        log_scales=scales,
+        opacity_logits=np.ascontiguousarray(logits),
+        sh=np.ascontiguousarray(sh),
+        notes=("The scene was trained with antialiasing, which is not modelled here.",) * meta.antialias,
+    )
+
+
+def _spread(path: Path, part: _Part, share: np.ndarray) -> np.ndarray:
+    """Numbers in [0, 1] between the bounds of their channel."""
+    low, high = _numbers(path, part.mins), _numbers(path, part.maxs)
+    if not len(low) == len(high) == share.shape[1]:
+        raise SceneFileError(f"{path}: its {META} should give {share.shape[1]} bounds for {part.files[0]}.")
+    spread: np.ndarray = low + (high - low) * share
+    return spread
+
+
+def _look_up(path: Path, part: _Part, codes: np.ndarray) -> Float32[np.ndarray, "*shape"]:
+    book = _numbers(path, part.codebook or [])
+    if len(book) != 256:
+        raise SceneFileError(f"{path}: the code book for {part.files[0]} should have 256 entries.")
+    return book.astype(np.float32)[codes]
+
+
+def _numbers(path: Path, values: Sequence[float] | float) -> np.ndarray:
+    numbers: np.ndarray = np.asarray(values, dtype=np.float64).reshape(-1)
+    if not np.isfinite(numbers).all():
+        raise SceneFileError(f"{path}: its {META} holds numbers that are not finite.")
+    return numbers
+
+
+def _rotations(rgba: UInt8[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
+    """Three components as bytes, and a tag for the left-out one; other tags mean no rotation."""
+    small = (rgba[:, :3] / 255.0 * 2.0 - 1.0) * SQRT_HALF
+    quats = from_smallest_three(small, np.maximum(rgba[:, 3].astype(np.int64) - FIRST_QUAT_TAG, 0))
+    quats[rgba[:, 3] < FIRST_QUAT_TAG] = (1.0, 0.0, 0.0, 0.0)
+    return quats
+
+
+def _rest(
+    path: Path, part: _Part, images: Images, labels: UInt8[np.ndarray, "n 4"]
+) -> Float32[np.ndarray, "n k 3"]:
+    """Higher harmonics: each Gaussian names an entry of the palette, of which 64 lie in a row."""
+    pixels = images(part.files[0])
+    rows, width = pixels.shape[:2]
+    k = width // PALETTE_COLUMNS
+    if k not in _REST_COUNTS.values() or k == 0 or width % PALETTE_COLUMNS:
+        raise SceneFileError(
+            f"{path}: its image {part.files[0]} is {width} pixels wide, not 192, 512 or 960."
+        )
+    if part.bands is not None and _REST_COUNTS[part.bands] != k:
+        raise SceneFileError(f"{path}: its image {part.files[0]} does not fit {part.bands} bands.")
+    if part.codebook is not None:
+        palette = _look_up(path, part, pixels[:, :, :3])
+    else:
+        low, high = _numbers(path, part.mins), _numbers(path, part.maxs)
+        if len(low) != 1 or len(high) != 1:
+            raise SceneFileError(f"{path}: its {META} should give one bound for {part.files[0]}.")
+        palette = (low + (high - low) * (pixels[:, :, :3] / 255.0)).astype(np.float32)
+    palette = palette.reshape(rows * PALETTE_COLUMNS, k, 3)
+    entry = labels[:, 0].astype(np.int64) + 256 * labels[:, 1].astype(np.int64)
+    if len(entry) and int(entry.max()) >= len(palette):
+        raise SceneFileError(
+            f"{path}: some Gaussians name harmonics beyond the {len(palette)} of its palette."
+        )
+    return palette[entry]
+
+
+def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write a bundled SOG; the program puts the Gaussians into an order of its own.
+
+    Raises:
+        SceneFileError: nothing to write, values that are not finite, or the program is missing or fails.
+        OSError: the file cannot be written.
+    """
+    scene = selected(gaussians, path, options)
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, replacing(path) as temporary:
+        source, target = Path(folder) / "scene.ply", Path(folder) / "scene.sog"
+        write_gaussian_ply(scene, source)
+        try:
+            convert(source, target)
+        except SceneFileError as error:
+            raise SceneFileError(str(error).replace(str(target), str(path), 1)) from error
+        temporary.write_bytes(target.read_bytes())
+    return (path,)
+
+
+def _recognises(head: bytes) -> bool:
+    return head.startswith(b"PK\x03\x04")
+
+
+register(
+    Importer(
+        "sog", ("*.sog", META), "SOG of PlayCanvas, bundled or as a folder's meta.json", read, _recognises
+    )
+)
+register(
+    Exporter("sog", ("*.sog",), "SOG of PlayCanvas, the smallest; needs splat-transform", write, lacking)
+)

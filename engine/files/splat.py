@@ -1,0 +1,76 @@
+""".splat: 32 bytes a Gaussian without a header; colour and opacity are bytes, harmonics are missing."""
+
+from pathlib import Path
+
+import numpy as np
+
+from engine.colour import rounded_bytes
+from engine.errors import SceneFileError
+from engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, Importer, register
+from engine.files.selection import blocks, check_scales, selected
+from engine.gaussians.flattening import GaussianCloud
+from engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from engine.writing import replacing
+
+SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
+
+
+def read(path: Path) -> GaussianCloud:
+    """Read all Gaussians; scales are standard deviations, rotations are 128 + 128 q.
+
+    Raises:
+        SceneFileError: the size is not a multiple of 32 bytes, or the file cannot be read.
+    """
+    try:
+        size = path.stat().st_size
+        if size % SPLAT.itemsize:
+            raise SceneFileError(
+                f"{path}: is no .splat, or is truncated; its {size} bytes are not a multiple of 32."
+            )
+        rows = np.fromfile(path, dtype=SPLAT)
+    except OSError as error:
+        raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scales = np.log(rows["scale"])
+    return GaussianCloud(
+        means_world=rows["mean"].astype(np.float32),
+        quats_wxyz=((rows["quat_wxyz"].astype(np.float32) - 128.0) / 128.0).astype(np.float32),
+        log_scales=log_scales.astype(np.float32),
+        opacity_logits=logits_from_bytes(rows["rgba"][:, 3]),
+        sh=sh0_from_rgb(rows["rgba"][:, :3] / 255.0),
+    )
+
+
+def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write the Gaussians in their order; the flat axis is the first, with a standard deviation of 1e-5.
+
+    Raises:
+        SceneFileError: nothing to write, or values that are not finite.
+        OSError: the file cannot be written.
+    """
+    gaussians = selected(gaussians, path, options)
+    check_scales(gaussians, path)
+    with replacing(path) as temporary, temporary.open("wb") as handle:
+        for block in blocks(gaussians):
+            handle.write(_rows(block).data)
+    return (path,)
+
+
+def _rows(some: FlatGaussians) -> np.ndarray:
+    rows = np.empty(len(some), dtype=SPLAT)
+    rows["mean"] = some.means_world
+    rows["scale"][:, 0] = FLAT_SCALE
+    rows["scale"][:, 1:] = some.scales
+    rows["rgba"][:, :3] = rounded_bytes(some.base_rgb_srgb.astype(np.float64) * 255.0)
+    rows["rgba"][:, 3] = rounded_bytes(some.opacities.astype(np.float64) * 255.0)
+    unit = unit_quats(some.quats_wxyz)
+    # A byte reaches from -1 to 127/128, so a component near 1 is written as its negative.
+    largest = np.take_along_axis(unit, np.argmax(np.abs(unit), axis=1)[:, None], axis=1)
+    rows["quat_wxyz"] = rounded_bytes(np.where(largest > 0, -unit, unit) * 128.0 + 128.0)
+    return rows
+
+
+register(Importer("splat", ("*.splat",), "32 bytes a Gaussian (antimatter15)", read))
+register(Exporter("splat", ("*.splat",), "32 bytes a Gaussian for web viewers (antimatter15)", write))

@@ -1,0 +1,170 @@
+"""SPZ (Niantic), about 15 bytes a Gaussian: versions 2, 3 and 4 in, 3, which every viewer reads, or 4 out."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from engine.colour import rounded_bytes
+from engine.errors import SceneFileError
+from engine.files.encodings import (
+    SQRT_HALF,
+    from_smallest_three,
+    half_turn_points,
+    half_turn_quats,
+    half_turn_sh,
+    half_turned,
+    logits_from_bytes,
+    smallest_three,
+)
+from engine.files.gaussian_ply import MAX_SH_DEGREE
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, Importer, register
+from engine.files.selection import blocks, selected
+from engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, read_spz, write_spz
+from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud
+from engine.gaussians.model import FlatGaussians
+from engine.writing import replacing
+
+COLOUR_SCALE = 0.15
+"""Constant harmonics h are written as the byte 255 (0.15 h + 0.5)."""
+LOG_SCALE_STEPS = 16.0
+LOG_SCALE_OFFSET = 10.0
+FRACTIONAL_BITS = 12
+"""The least precision of positions where they fit: 1/4096 of a unit."""
+SMALL_QUANTILE = 0.05
+STEPS_PER_SIGMA = 8.0
+"""Positions get as many more bits as it takes to place a small Gaussian this finely."""
+SH_STEPS = (8, 16)
+"""Steps of the coefficients of degree 1 and of the others, in 1/128; coarser steps compress better."""
+
+
+def read(path: Path) -> GaussianCloud:
+    """Read all Gaussians and turn them from y up to y down.
+
+    Raises:
+        SceneFileError: the file is no SPZ, is damaged, or of an unknown version.
+    """
+    file = read_spz(path)
+    if file.count == 0:
+        raise SceneFileError(f"{path}: holds no Gaussians.")
+    positions, opacities, colours, scales, rotations, harmonics = (
+        np.frombuffer(stream, np.uint8).reshape(file.count, -1) for stream in file.streams
+    )
+    kept = (min(file.sh_degree, MAX_SH_DEGREE) + 1) ** 2
+    rest = (harmonics.reshape(file.count, -1, 3)[:, : kept - 1].astype(np.float32) - 128.0) / 128.0
+    constant = (colours.astype(np.float32) / 255.0 - 0.5) / COLOUR_SCALE
+    sh = np.concatenate([constant[:, None, :], rest], axis=1).astype(np.float32)
+    quats = _first_three(rotations) if file.version == 2 else _smallest_three(rotations)
+    notes = []
+    if file.sh_degree > MAX_SH_DEGREE:
+        notes.append(f"Harmonics of degree {file.sh_degree} were left out; degree 3 is the highest here.")
+    if file.flags & ANTIALIASED:
+        notes.append("The scene was trained with antialiasing, which is not modelled here.")
+    return GaussianCloud(
+        means_world=half_turn_points(_fixed_point(positions, file.fractional_bits)),
+        quats_wxyz=half_turn_quats(quats),
+        log_scales=scales.astype(np.float32) / LOG_SCALE_STEPS - LOG_SCALE_OFFSET,
+        opacity_logits=logits_from_bytes(opacities[:, 0]),
+        sh=half_turn_sh(sh),
+        notes=tuple(notes),
+    )
+
+
+def _fixed_point(packed: np.ndarray, fractional_bits: int) -> Float32[np.ndarray, "n 3"]:
+    """Three little-endian bytes a coordinate, two's complement."""
+    parts = packed.reshape(len(packed), 3, 3).astype(np.int32)
+    values = parts[:, :, 0] | (parts[:, :, 1] << 8) | (parts[:, :, 2] << 16)
+    signed = np.where(values >= 1 << 23, values - (1 << 24), values)
+    return (signed / float(1 << fractional_bits)).astype(np.float32)
+
+
+def _first_three(packed: np.ndarray) -> Float32[np.ndarray, "n 4"]:
+    """Version 2: x, y, z as bytes; w is what is missing to length 1."""
+    xyz = packed.astype(np.float64) / 127.5 - 1.0
+    w = np.sqrt(np.maximum(0.0, 1.0 - np.sum(xyz**2, axis=1)))
+    return np.concatenate([w[:, None], xyz], axis=1).astype(np.float32)
+
+
+def _smallest_three(packed: np.ndarray) -> Float32[np.ndarray, "n 4"]:
+    """Two bits for the place of the largest of x, y, z, w; ten each, the sign first, for the others."""
+    words = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1).astype(np.int64)
+    small = (fields & 511) * (SQRT_HALF / 511.0) * np.where(fields & 512, -1.0, 1.0)
+    xyzw = from_smallest_three(small, (words >> 30).astype(np.int64))
+    return np.ascontiguousarray(xyzw[:, [3, 0, 1, 2]])
+
+
+def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write the Gaussians in their order, turned to y up.
+
+    Raises:
+        SceneFileError: nothing to write, values that are not finite, or positions beyond what 24 bits hold.
+        OSError: the file cannot be written.
+    """
+    scene = selected(gaussians, path, options)
+    bits = _fractional_bits(scene, path)
+    streams = [bytearray() for _ in range(6)]
+    for block in blocks(scene):
+        for stream, data in zip(streams, _packed(half_turned(block), bits), strict=True):
+            stream += data
+    packed = tuple(bytes(stream) for stream in streams)
+    file = SpzFile(options.spz_version, len(scene), scene.sh_degree, bits, 0, packed)
+    with replacing(path) as temporary:
+        write_spz(temporary, file)
+    return (path,)
+
+
+def _packed(scene: FlatGaussians, bits: int) -> tuple[bytes, ...]:
+    """The six attributes of a block that is y up."""
+    log_scales = np.concatenate([np.full((len(scene), 1), FLAT_LOG_SCALE), scene.log_scales], axis=1)
+    return (
+        _packed_positions(scene.means_world.astype(np.float64) * (1 << bits)),
+        rounded_bytes(scene.opacities.astype(np.float64) * 255.0).tobytes(),
+        rounded_bytes((scene.sh[:, 0].astype(np.float64) * COLOUR_SCALE + 0.5) * 255.0).tobytes(),
+        rounded_bytes((log_scales.astype(np.float64) + LOG_SCALE_OFFSET) * LOG_SCALE_STEPS).tobytes(),
+        _packed_rotations(scene),
+        _packed_harmonics(scene),
+    )
+
+
+def _fractional_bits(scene: FlatGaussians, path: Path) -> int:
+    largest = float(np.abs(scene.means_world).max())
+    fits = int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0 / 256.0))))
+    if fits < 0:
+        raise SceneFileError(
+            f"{path}: not written; SPZ holds positions up to {2**23 - 1} units, one lies at {largest:.3g}."
+        )
+    small = float(np.quantile(scene.log_scales.min(axis=1).astype(np.float64), SMALL_QUANTILE))
+    wanted = int(np.ceil(np.log2(STEPS_PER_SIGMA) - small / np.log(2.0)))
+    return min(max(wanted, FRACTIONAL_BITS), fits, 23)
+
+
+def _packed_positions(steps: Float[np.ndarray, "n 3"]) -> bytes:
+    whole = np.ascontiguousarray(np.rint(steps).astype("<i4"))
+    return whole.view(np.uint8).reshape(*steps.shape, 4)[:, :, :3].tobytes()
+
+
+def _packed_rotations(scene: FlatGaussians) -> bytes:
+    small, largest = smallest_three(scene.quats_wxyz[:, [1, 2, 3, 0]])
+    sizes = np.minimum(np.rint(np.abs(small) / SQRT_HALF * 511.0), 511.0).astype(np.uint32)
+    fields = sizes | (np.uint32(512) * (small < 0).astype(np.uint32))
+    words = (largest.astype(np.uint32) << 30) | (fields[:, 0] << 20) | (fields[:, 1] << 10) | fields[:, 2]
+    return words.astype("<u4").tobytes()
+
+
+def _packed_harmonics(scene: FlatGaussians) -> bytes:
+    if scene.sh_degree == 0:
+        return b""
+    steps = np.full((scene.sh.shape[1] - 1, 1), SH_STEPS[1], dtype=np.float64)
+    steps[:3] = SH_STEPS[0]
+    bins = np.rint(scene.sh[:, 1:].astype(np.float64) * 128.0 / steps)
+    return rounded_bytes(bins * steps + 128.0).tobytes()
+
+
+def _recognises(head: bytes) -> bool:
+    return head.startswith((MAGIC, GZIP_MAGIC))
+
+
+register(Importer("spz", ("*.spz",), "SPZ of Niantic, versions 2 to 4", read, _recognises))
+register(Exporter("spz", ("*.spz",), "SPZ of Niantic, 15 bytes a Gaussian, for web viewers", write))

@@ -1,0 +1,53 @@
+"""Textures as PNG in memory: the one that carries the Gaussian fall-off, and those of surfaces."""
+
+import struct
+import tempfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from engine.colour import to_bytes
+
+
+def radial_alpha(size: int, q: float) -> Float64[np.ndarray, "s s"]:
+    """exp(-rho^2 / 2) at the texel centres of a square spanning [-sqrt(Q), sqrt(Q)] standard deviations."""
+    squares = (2.0 * (np.arange(size) + 0.5) / size - 1.0) ** 2
+    result: np.ndarray = np.exp(-0.5 * q * (squares[:, None] + squares))
+    return result
+
+
+def white_with_alpha_png(size: int, q: float) -> bytes:
+    """The fall-off as alpha of a white RGBA image, as glTF wants it."""
+    pixels = np.full((size, size, 4), 255, dtype=np.uint8)
+    pixels[..., 3] = to_bytes(radial_alpha(size, q))
+    return _png(pixels, colour_type=6)
+
+
+def grey_png(size: int, q: float) -> bytes:
+    """The fall-off as a grey image, as MTL's ``map_d`` wants it (it takes the luminance)."""
+    return _png(to_bytes(radial_alpha(size, q))[..., None], colour_type=0)
+
+
+def png_bytes(rgb_srgb: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """An image as it stands in a PNG file."""
+    from engine.render.images import write_png  # loads the image library, which the front end has not
+
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder:
+        path = Path(folder) / "texture.png"
+        write_png(path, rgb_srgb.astype(np.float32) / np.float32(255))
+        return path.read_bytes()
+
+
+def _png(pixels: UInt8[np.ndarray, "h w c"], colour_type: int) -> bytes:
+    """An 8-bit PNG in memory: the image library here writes to named files only."""
+    height, width, channels = pixels.shape
+    rows = np.zeros((height, 1 + width * channels), dtype=np.uint8)  # each row begins with filter 0: none
+    rows[:, 1:] = pixels.reshape(height, -1)
+    header = struct.pack(">IIBBBBB", width, height, 8, colour_type, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 9)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )

@@ -1,0 +1,136 @@
+"""Export as USD: a ``ParticleField`` with the Gaussian surflet kernel, by definition a flat Gaussian.
+
+The kernel is exp(-|p|^2 / 2) in the local xy plane and nothing off it, so the normal becomes the local z
+axis; the scale along it has no meaning and is the flat 1e-5. The data are turned to y up. Needs the package
+usd-core (the extra ``usd``).
+"""
+
+import importlib.metadata
+import importlib.util
+import tempfile
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from engine.colour import srgb_to_linear
+from engine.errors import SceneFileError
+from engine.files.encodings import half_turned, unit_quats
+from engine.files.options import ExportOptions
+from engine.files.registry import Exporter, register
+from engine.files.selection import check_scales, selected
+from engine.gaussians.flattening import turned
+from engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from engine.writing import replacing
+
+ROOT, FIELD = "/octasplat", "/octasplat/gaussians"
+COLOUR_SPACE = "srgb_rec709_scene"
+EXTENT_SIGMAS = 3.0
+SCHEMAS = (
+    "ParticleFieldPositionAttributeAPI",
+    "ParticleFieldOrientationAttributeAPI",
+    "ParticleFieldScaleAttributeAPI",
+    "ParticleFieldOpacityAttributeAPI",
+    "ParticleFieldKernelGaussianSurfletAPI",
+    "ParticleFieldSphericalHarmonicsAttributeAPI",
+)
+
+
+def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
+    """Write ``.usda`` (text), ``.usd`` or ``.usdc`` (binary), or ``.usdz`` (a package).
+
+    Raises:
+        SceneFileError: usd-core is missing or too old, nothing to write, or values that are not finite.
+        OSError: the file cannot be written.
+    """
+    scene = half_turned(selected(gaussians, path, options))
+    check_scales(scene, path)
+    pxr = _usd(path)
+    suffix = ".usdc" if path.suffix.lower() in (".usdz", ".usd") else path.suffix.lower()
+    with tempfile.TemporaryDirectory(prefix="octasplat-") as folder, replacing(path) as temporary:
+        layer = Path(folder) / f"scene{suffix}"
+        _write_stage(pxr, scene, layer)
+        if path.suffix.lower() == ".usdz":
+            package = Path(folder) / "scene.usdz"
+            if not pxr["UsdUtils"].CreateNewUsdzPackage(pxr["Sdf"].AssetPath(str(layer)), str(package)):
+                raise SceneFileError(f"{path}: not written; usd-core could not make the package.")
+            layer = package
+        temporary.write_bytes(layer.read_bytes())
+    return (path,)
+
+
+def lacking() -> str | None:
+    """What is missing to write USD, without loading it; whether an old copy will do shows when it is used."""
+    if importlib.util.find_spec("pxr") is None:
+        return "needs the package usd-core; install it with pip install 'usd-core>=26.5'"
+    try:
+        version = importlib.metadata.version("usd-core")
+    except importlib.metadata.PackageNotFoundError:  # USD of another package
+        return None
+    numbers = tuple(int(part) for part in version.split(".")[:2] if part.isdigit())
+    return None if numbers >= (26, 5) else f"usd-core {version} is too old; install usd-core 26.5 or later"
+
+
+def _usd(path: Path) -> dict[str, ModuleType]:
+    try:
+        from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdVol, Vt
+    except ImportError as error:
+        raise SceneFileError(f"{path}: {lacking() or error}.") from error
+    if not hasattr(UsdVol, "ParticleField"):
+        raise SceneFileError(f"{path}: this usd-core has no ParticleField; install usd-core 26.5 or later.")
+    return {
+        "Sdf": Sdf,
+        "Usd": Usd,
+        "UsdGeom": UsdGeom,
+        "UsdUtils": UsdUtils,
+        "UsdVol": UsdVol,
+        "Vt": Vt,
+    }
+
+
+def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path) -> None:
+    usd, geom, vol, vt = (pxr[name] for name in ("Usd", "UsdGeom", "UsdVol", "Vt"))
+    stage = usd.Stage.CreateNew(str(layer))
+    geom.SetStageUpAxis(stage, geom.Tokens.y)
+    geom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(geom.Xform.Define(stage, ROOT).GetPrim())
+    prim = vol.ParticleField.Define(stage, FIELD).GetPrim()
+    for schema in SCHEMAS:
+        prim.ApplyAPI(getattr(vol, schema))
+    usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOUR_SPACE)
+
+    def attribute(name: str, values: Any) -> None:
+        prim.GetAttribute(name).Set(values)
+
+    axis_z = np.ones(len(scene), dtype=np.int64)  # the columns of R become r2, r3, r1
+    quats = unit_quats(turned(scene.quats_wxyz, axis_z)).astype(np.float32)
+    scales = np.concatenate([scene.scales, np.full((len(scene), 1), FLAT_SCALE, np.float32)], axis=1)
+    attribute("positions", vt.Vec3fArray.FromNumpy(np.ascontiguousarray(scene.means_world)))
+    # usd-core keeps quaternions in memory as x, y, z, w.
+    attribute("orientations", vt.QuatfArray.FromNumpy(np.ascontiguousarray(quats[:, [1, 2, 3, 0]])))
+    attribute("scales", vt.Vec3fArray.FromNumpy(scales))
+    attribute("opacities", vt.FloatArray.FromNumpy(scene.opacities))
+    attribute("radiance:sphericalHarmonicsDegree", scene.sh_degree)
+    flat_sh = np.ascontiguousarray(scene.sh.reshape(-1, 3))
+    attribute("radiance:sphericalHarmonicsCoefficients", vt.Vec3fArray.FromNumpy(flat_sh))
+    reach = EXTENT_SIGMAS * scene.scales.max(axis=1, keepdims=True)
+    extent = np.stack([(scene.means_world - reach).min(axis=0), (scene.means_world + reach).max(axis=0)])
+    attribute("extent", vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
+    fallback = geom.Gprim(prim)
+    colours = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0.0, 1.0))
+    fallback.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(vt.Vec3fArray.FromNumpy(colours))
+    fallback.CreateDisplayOpacityPrimvar(geom.Tokens.vertex).Set(vt.FloatArray.FromNumpy(scene.opacities))
+    prim.GetAttribute("primvars:displayColor").SetColorSpace("lin_rec709_scene")
+    stage.GetRootLayer().Save()
+
+
+register(
+    Exporter(
+        "usd",
+        ("*.usdz", "*.usdc", "*.usda", "*.usd"),
+        "USD ParticleField with the surflet kernel; needs usd-core",
+        write,
+        lacking,
+    )
+)

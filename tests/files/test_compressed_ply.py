@@ -1,0 +1,123 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cloud_difference import difference
+
+from engine.errors import SceneFileError
+from engine.files import importer_for, read_scene
+from engine.files.ply_container import PlyWriteElement, write_ply
+from engine.gaussians.flattening import GaussianCloud
+
+Make = Callable[..., GaussianCloud]
+CHUNK = 256
+SH_C0 = 0.28209479177387814
+
+
+def pack_unit(values: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    word = np.zeros(len(values), np.uint64)
+    for place, size in enumerate(bits):
+        steps = (1 << size) - 1
+        field = np.rint(np.clip(values[:, place], 0, 1) * steps).astype(np.uint64)
+        word = (word << np.uint64(size)) | field
+    return word.astype(np.uint32)
+
+
+def write_compressed(path: Path, cloud: GaussianCloud, *, colour_bounds: bool = True) -> None:
+    """The encoder of the format, chunk by chunk."""
+    n = len(cloud.means_world)
+    rgb = 0.5 + SH_C0 * cloud.sh[:, 0]
+    groups = {"": cloud.means_world, "scale_": cloud.log_scales, "rgb": rgb}
+    names = {"": "xyz", "scale_": "xyz", "rgb": "rgb"}
+    chunk_rows: list[dict[str, float]] = []
+    shares = {key: np.zeros_like(values) for key, values in groups.items()}
+    for start in range(0, n, CHUNK):
+        part = slice(start, start + CHUNK)
+        row: dict[str, float] = {}
+        for key, values in groups.items():
+            low, high = values[part].min(axis=0), values[part].max(axis=0)
+            if key == "rgb" and not colour_bounds:
+                shares[key][part] = values[part]
+                continue
+            shares[key][part] = (values[part] - low) / np.maximum(high - low, 1e-9)
+            prefix = "" if key == "rgb" else key
+            for axis, name in enumerate(names[key]):
+                row[f"min_{prefix}{name}"], row[f"max_{prefix}{name}"] = low[axis], high[axis]
+        chunk_rows.append(row)
+    opacity = 1 / (1 + np.exp(-cloud.opacity_logits))
+    quats = cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)
+    rotation = np.zeros(n, np.uint32)
+    for i, q in enumerate(quats):
+        largest = int(np.argmax(np.abs(q)))
+        q = q if q[largest] > 0 else -q
+        others = np.delete(q, largest) / np.sqrt(2) + 0.5
+        rotation[i] = (largest << 30) | int(pack_unit(others[None], (10, 10, 10))[0])
+    vertices = np.empty(
+        n, dtype=[(f"packed_{what}", "<u4") for what in ("position", "rotation", "scale", "color")]
+    )
+    vertices["packed_position"] = pack_unit(shares[""], (11, 10, 11))
+    vertices["packed_rotation"] = rotation
+    vertices["packed_scale"] = pack_unit(shares["scale_"], (11, 10, 11))
+    vertices["packed_color"] = pack_unit(np.column_stack([shares["rgb"], opacity]), (8, 8, 8, 8))
+    chunks = np.array([tuple(row.values()) for row in chunk_rows], dtype=[(k, "<f4") for k in chunk_rows[0]])
+    elements = [
+        PlyWriteElement("chunk", len(chunks), chunks.dtype, [chunks]),
+        PlyWriteElement("vertex", n, vertices.dtype, [vertices]),
+    ]
+    rest = cloud.sh[:, 1:].transpose(0, 2, 1).reshape(n, -1)
+    if rest.shape[1]:
+        table = np.empty(n, dtype=[(f"f_rest_{k}", "u1") for k in range(rest.shape[1])])
+        for k in range(rest.shape[1]):
+            table[f"f_rest_{k}"] = np.clip(np.floor((rest[:, k] / 8 + 0.5) * 256), 0, 255)
+        elements.append(PlyWriteElement("sh", n, table.dtype, [table]))
+    write_ply(path, elements)
+
+
+@pytest.mark.parametrize(("degree", "count"), [(0, 1), (1, 256), (2, 257), (3, 700)])
+def test_values_come_back_within_their_quantum(
+    make_cloud: Make, tmp_path: Path, degree: int, count: int
+) -> None:
+    cloud = make_cloud(count, degree)
+    path = tmp_path / "a.compressed.ply"
+    write_compressed(path, cloud)
+    assert importer_for(path).name == "compressed-ply"
+    back = importer_for(path).read(path)
+    # Half a step: 6 units / 1023, 5 / 1023 in ln, sqrt(2) / 1023 a component, one colour / 255, 8 / 256.
+    difference(back, cloud).assert_below(
+        position=0.5 * 6 / 1023 * 1.001,
+        rotation_degrees=0.25,
+        log_scale=0.5 * 5 / 1023 * 1.001,
+        opacity=0.502 / 255,
+        sh=max(0.502 / 255 / SH_C0, 8 / 512 * 1.001),
+    )
+
+
+def test_older_files_without_bounds_of_colours(make_cloud: Make, tmp_path: Path) -> None:
+    cloud = make_cloud(300)
+    write_compressed(tmp_path / "a.ply", cloud, colour_bounds=False)
+    assert importer_for(tmp_path / "a.ply").name == "compressed-ply"
+    back, report = read_scene(tmp_path / "a.ply")
+    assert (report.count, report.flattened) == (300, 300)
+    np.testing.assert_allclose(back.base_rgb_srgb, 0.5 + SH_C0 * cloud.sh[:, 0], atol=0.502 / 255)
+
+
+def test_files_that_do_not_hold_together(make_cloud: Make, tmp_path: Path) -> None:
+    path = tmp_path / "a.compressed.ply"
+    write_compressed(path, make_cloud(300, 1))
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"element chunk 2", b"element chunk 1"))
+    with pytest.raises(SceneFileError, match="has 1 chunks for 300 Gaussians"):
+        read_scene(path)
+    path.write_bytes(whole.replace(b"max_scale_y", b"top_scale_y"))
+    with pytest.raises(SceneFileError, match="lacks the property max_scale_y"):
+        read_scene(path)
+    path.write_bytes(whole.replace(b"f_rest_8", b"f_rest_9"))
+    with pytest.raises(SceneFileError, match="element 'sh' should hold"):
+        read_scene(path)
+    path.write_bytes(whole.replace(b"uint packed_scale", b"float packed_scale"))
+    with pytest.raises(SceneFileError, match="packed_scale should be of type uint"):
+        read_scene(path)
+    path.write_bytes(whole[:-5])
+    with pytest.raises(SceneFileError, match="is truncated"):
+        read_scene(path)

@@ -1,0 +1,199 @@
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from engine.colour import srgb_to_linear
+from engine.errors import SceneFileError
+from engine.files import export_scene, importer_for, read_scene
+from engine.gaussians.frames import rotation_matrices
+from engine.gaussians.harmonics import sh_basis
+from engine.gaussians.model import FlatGaussians
+
+Make = Callable[..., FlatGaussians]
+KHR = "KHR_gaussian_splatting"
+TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+HALF_TURN = np.diag([1.0, -1.0, -1.0])
+
+
+def parts(path: Path) -> tuple[dict[str, Any], bytes]:
+    data = path.read_bytes()
+    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
+    length, kind = struct.unpack_from("<I4s", data, 12)
+    size, binary = struct.unpack_from("<I4s", data, 20 + length)
+    assert (kind, binary, length % 4, size % 4) == (b"JSON", b"BIN\0", 0, 0)
+    assert 28 + length + size == len(data)
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def join(path: Path, document: dict[str, Any], binary: bytes) -> Path:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(binary), len(text), b"JSON")
+    path.write_bytes(head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    return path
+
+
+def attribute(document: dict[str, Any], binary: bytes, name: str) -> np.ndarray:
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"][name]]
+    view = document["bufferViews"][accessor["bufferView"]]
+    kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+    width = TYPES[accessor["type"]]
+    raw = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    values = np.frombuffer(raw, kind).reshape(-1, width)
+    assert len(values) == accessor["count"]
+    return values
+
+
+def test_attributes_are_those_of_the_specification(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(70000)  # more than one block; degree 1
+    export_scene(scene, tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    primitive = document["meshes"][0]["primitives"][0]
+    assert document["extensionsUsed"] == [KHR] and "extensionsRequired" not in document
+    assert primitive["mode"] == 0
+    assert primitive["extensions"][KHR]["kernel"] == "ellipse"
+    assert primitive["extensions"][KHR]["colorSpace"] == "srgb_rec709_display"
+    assert set(primitive["attributes"]) == {
+        "POSITION", "COLOR_0", f"{KHR}:ROTATION", f"{KHR}:SCALE", f"{KHR}:OPACITY",
+        f"{KHR}:SH_DEGREE_0_COEF_0", *(f"{KHR}:SH_DEGREE_1_COEF_{n}" for n in range(3)),
+    }  # fmt: skip
+    positions = attribute(document, binary, "POSITION")
+    np.testing.assert_array_equal(positions, scene.means_world * np.float32([1, -1, -1]))
+    bounds = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(np.float32(bounds["min"]), positions.min(axis=0))
+    np.testing.assert_array_equal(np.float32(bounds["max"]), positions.max(axis=0))
+    rotation = attribute(document, binary, f"{KHR}:ROTATION")
+    np.testing.assert_allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-6)
+    scale = attribute(document, binary, f"{KHR}:SCALE")
+    np.testing.assert_array_equal(scale[:, 0], np.float32(1e-5))
+    np.testing.assert_array_equal(scale[:, 1:], scene.scales)
+    frames = rotation_matrices(rotation[:, [3, 0, 1, 2]].astype(np.float64))
+    covariance = np.einsum("nij,nj,nkj->nik", frames[:, :, 1:], scale[:, 1:] ** 2, frames[:, :, 1:])
+    ours = HALF_TURN @ scene.rotations.astype(np.float64)[:, :, 1:]
+    np.testing.assert_allclose(
+        covariance, np.einsum("nij,nj,nkj->nik", ours, scene.scales**2, ours), atol=1e-5
+    )
+    np.testing.assert_array_equal(attribute(document, binary, f"{KHR}:OPACITY")[:, 0], scene.opacities)
+    colour = attribute(document, binary, "COLOR_0") / 255
+    linear = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0, 1))
+    np.testing.assert_allclose(colour[:, :3], linear, atol=0.502 / 255)
+
+
+def test_colours_seen_from_a_direction_turn_with_the_scene(make_scene: Make, tmp_path: Path) -> None:
+    base = make_scene(50)
+    sh = np.random.default_rng(0).standard_normal((50, 16, 3)).astype(np.float32)
+    scene = FlatGaussians(base.means_world, base.quats_wxyz, base.log_scales, base.opacity_logits, sh)
+    export_scene(scene, tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    names = [f"{KHR}:SH_DEGREE_{d}_COEF_{n}" for d in range(4) for n in range(2 * d + 1)]
+    written = np.stack([attribute(document, binary, name) for name in names], axis=1)
+    directions = np.random.default_rng(1).standard_normal((50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ours = np.einsum("nk,nkc->nc", sh_basis(directions, 3), sh)
+    theirs = np.einsum("nk,nkc->nc", sh_basis(directions @ HALF_TURN, 3), written)
+    np.testing.assert_allclose(theirs, ours, atol=1e-5)
+
+
+def test_node_transforms_are_applied(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(40)
+    export_scene(scene, tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    quarter = [0.0, float(np.sqrt(0.5)), 0.0, float(np.sqrt(0.5))]  # about y
+    document["nodes"] = [
+        {"children": [1], "rotation": quarter, "translation": [1.0, 2.0, 3.0]},
+        {"mesh": 0, "scale": [2.0, 2.0, 2.0]},
+    ]
+    back, _ = read_scene(join(tmp_path / "b.glb", document, binary))
+    turn = HALF_TURN @ np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]) @ HALF_TURN
+    expected = 2 * scene.means_world @ turn.T + HALF_TURN @ (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(back.means_world, expected, atol=1e-5)
+    np.testing.assert_allclose(back.scales, 2 * scene.scales, rtol=1e-5)
+    cosines = np.einsum("nij,nij->nj", back.rotations, turn @ scene.rotations.astype(np.float64))
+    np.testing.assert_allclose(np.abs(cosines), 1, atol=1e-5)
+    direction = np.array([[0.6, 0.0, -0.8]])
+    np.testing.assert_allclose(
+        np.einsum("mk,nkc->nc", sh_basis(direction @ turn.T, 1), back.sh),
+        np.einsum("mk,nkc->nc", sh_basis(direction, 1), scene.sh),
+        atol=1e-5,
+    )
+    document["nodes"][1]["scale"] = [2.0, 1.0, 2.0]
+    with pytest.raises(SceneFileError, match="scales them unevenly"):
+        read_scene(join(tmp_path / "b.glb", document, binary))
+
+
+def test_several_primitives_and_quantised_attributes(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(30)
+    export_scene(scene, tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    first = document["meshes"][0]["primitives"][0]
+    opacity = np.rint(scene.opacities * 65535).astype("<u2")
+    rotation = np.rint(attribute(document, binary, f"{KHR}:ROTATION") * 32767).astype("<i2")
+    padded = np.zeros((30, 2), "<u2")
+    padded[:, 0] = opacity
+    document["bufferViews"] += [
+        {"buffer": 0, "byteOffset": len(binary), "byteLength": 120, "byteStride": 4},
+        {"buffer": 0, "byteOffset": len(binary) + 120, "byteLength": 240},
+    ]
+    views = len(document["bufferViews"])
+    document["accessors"] += [
+        {"bufferView": views - 2, "componentType": 5123, "normalized": True, "count": 30, "type": "SCALAR"},
+        {"bufferView": views - 1, "componentType": 5122, "normalized": True, "count": 30, "type": "VEC4"},
+    ]
+    accessors = len(document["accessors"])
+    own = {f"{KHR}:OPACITY": accessors - 2, f"{KHR}:ROTATION": accessors - 1}
+    kept = {name: number for name, number in first["attributes"].items() if "DEGREE_1" not in name}
+    document["meshes"][0]["primitives"] = [
+        first,
+        {**first, "attributes": {**kept, **own}},
+        {"attributes": {}},
+    ]
+    path = join(tmp_path / "b.glb", document, binary + padded.tobytes() + rotation.tobytes())
+    back, report = read_scene(path)
+    assert (report.count, report.sh_degree, report.flattened) == (60, 1, 0)
+    np.testing.assert_array_equal(back.means_world[30:], back.means_world[:30])
+    np.testing.assert_array_equal(back.sh[30:, 1:], 0)
+    np.testing.assert_allclose(back.opacities[30:], scene.opacities, atol=1e-5)
+    np.testing.assert_allclose(back.rotations[30:], back.rotations[:30], atol=2e-4)
+
+
+def test_linear_colours_are_converted_and_told(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(30)
+    export_scene(scene, tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    document["meshes"][0]["primitives"][0]["extensions"][KHR]["colorSpace"] = "lin_rec709_display"
+    back, report = read_scene(join(tmp_path / "b.glb", document, binary))
+    assert back.sh_degree == 0 and "linear" in report.notes[0]
+    inside = (scene.base_rgb_srgb > 0.05) & (scene.base_rgb_srgb < 1)
+    again = srgb_to_linear(back.base_rgb_srgb)
+    np.testing.assert_allclose(again[inside], scene.base_rgb_srgb[inside], atol=1e-5)
+
+
+def test_what_is_no_splat_is_refused(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(30)
+    export_scene(scene, tmp_path / "mesh.glb")
+    assert importer_for(tmp_path / "mesh.glb").name == "khr-glb"
+    with pytest.raises(SceneFileError, match=r"mesh\.glb: holds no splats .*octasplat edit"):
+        read_scene(tmp_path / "mesh.glb")
+    export_scene(scene, tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    whole = (tmp_path / "a.splats.glb").read_bytes()
+    for cut in (6, 25, len(whole) // 2, len(whole) - 4):
+        (tmp_path / "b.glb").write_bytes(whole[:cut])
+        with pytest.raises(SceneFileError, match=r"b\.glb: "):
+            read_scene(tmp_path / "b.glb")
+    splats = document["meshes"][0]["primitives"][0]
+    splats["extensions"][KHR]["extensions"] = {"KHR_gaussian_splatting_compression_spz_2": {}}
+    with pytest.raises(SceneFileError, match="compression_spz_2, which is not read"):
+        read_scene(join(tmp_path / "b.glb", document, binary))
+    del splats["extensions"][KHR]["extensions"], splats["attributes"][f"{KHR}:SCALE"]
+    with pytest.raises(SceneFileError, match=r"damaged or not understood .*SCALE"):
+        read_scene(join(tmp_path / "b.glb", document, binary))
+    document, binary = parts(tmp_path / "a.splats.glb")
+    document["accessors"][0]["count"] = 10**9
+    with pytest.raises(SceneFileError, match="damaged or not understood"):
+        read_scene(join(tmp_path / "b.glb", document, binary))

@@ -1,0 +1,198 @@
+"""Meshes as other programs write them."""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from engine.errors import SceneFileError
+from engine.files import mesh_obj, read_mesh
+from engine.files.ply_container import COUNT_SUFFIX, PlyWriteElement, list_field, write_ply
+
+
+def obj(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "mesh.obj"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def glb(tmp_path: Path, document: dict[str, Any], binary: bytes) -> Path:
+    text = json.dumps(document).encode()
+    text = text.ljust(-(-len(text) // 4) * 4)
+    content = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0")
+    path = tmp_path / "mesh.glb"
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(content) + len(binary)) + content + binary)
+    return path
+
+
+TWO_QUADS = """# a comment
+# octasplat_q 4.5
+mtllib none.mtl
+o thing
+v 0 0 0 1 1 1
+v 1 0 0 1 1 1
+v 1 1 0 1 1 1
+v 0 1 0 1 1 1
+vn 0 0 1
+v -1e-3 +2.5 1E+1
+v .5 -.5 3
+vt 0 0
+vt 1.0 0.0
+vt 1 1
+vt 0 1
+s off
+f 1/1/1 2/2/1 3/3/1 4/4/1
+f 5 6 1
+f -1 -2 -3
+"""
+
+
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
+@pytest.mark.parametrize("block", [1 << 26, 64])
+def test_obj_with_all_kinds_of_lines(tmp_path: Path, monkeypatch, line_end: str, block: int) -> None:
+    monkeypatch.setattr(mesh_obj, "BLOCK_BYTES", block)
+    mesh = read_mesh(obj(tmp_path, TWO_QUADS.replace("\n", line_end)))
+    np.testing.assert_array_equal(mesh.vertices[4:], [[-1e-3, 2.5, 10], [0.5, -0.5, 3]])
+    np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2], [0, 2, 3], [4, 5, 0], [5, 4, 3]])
+    np.testing.assert_array_equal(mesh.uv[:4], [[0, 0], [1, 0], [1, 1], [0, 1]])
+    assert np.isnan(mesh.uv[4:]).all()
+    assert mesh.q == 4.5 and mesh.gid is None
+
+
+def test_obj_without_texture_numbers_or_with_empty_ones(tmp_path: Path) -> None:
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\nf 3 2 1\n"
+    mesh = read_mesh(obj(tmp_path, text))
+    np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2], [2, 1, 0]])
+    assert mesh.uv is None
+
+
+def test_obj_faces_whose_counts_add_up_by_chance(tmp_path: Path) -> None:
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 1 1\nv 1 1 1\nf 1 2 3 4\nf 1 2 3\nf 1 2 3 4 5\n"
+    mesh = read_mesh(obj(tmp_path, text))
+    np.testing.assert_array_equal(
+        mesh.triangles, [[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 1, 2], [0, 2, 3], [0, 3, 4]]
+    )
+
+
+def test_obj_rounding_follows_the_digits(tmp_path: Path) -> None:
+    assert read_mesh(obj(tmp_path, "v 0.123 1.5 2\nv 0 0 0\n")).rounding == pytest.approx(5e-4)
+    assert read_mesh(obj(tmp_path, "v 0.123456 1.5 2\n")).rounding == pytest.approx(5e-7)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("hello\n", "no line that begins with 'v'"),
+        ("v 0 0 x\n", "'v' holds something that is no number"),
+        ("v 0 0\n", "fewer than three"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "names a vertex that is not there"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -9\n", "names a vertex that is not there"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf a b c\n", "'f' holds something that is no number"),
+        ("v 0 0 nan\n", "not finite"),
+    ],
+)
+def test_damaged_obj(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(SceneFileError, match=r"mesh\.obj.*" + message):
+        read_mesh(obj(tmp_path, text))
+
+
+def triangle_document(**changes: Any) -> tuple[dict[str, Any], bytes]:
+    positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
+    gid = np.array([7, 7, 7], "<f4")
+    corner = np.array([0, 1, 2], np.uint8)
+    binary = positions.tobytes() + gid.tobytes() + corner.tobytes().ljust(4, b"\0")
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"rotation": [2**-0.5, 0, 0, 2**-0.5], "translation": [0, 0, 10], "children": [1]},
+            {"mesh": 0, "scale": [2, 3, 4]},
+            {"mesh": 0},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "_GID": 1, "_CORNER": 2}}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 0, "byteOffset": 36, "componentType": 5126, "count": 3, "type": "SCALAR"},
+            {"bufferView": 0, "byteOffset": 48, "componentType": 5121, "count": 3, "type": "SCALAR"},
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": 52}],
+        "buffers": [{"byteLength": 52}],
+    }
+    # One view without a stride holds all three, which is legal while each is tightly packed.
+    return document | changes, binary
+
+
+def test_glb_nodes_move_their_meshes_and_only_the_scene_counts(tmp_path: Path) -> None:
+    mesh = read_mesh(glb(tmp_path, *triangle_document()))
+    np.testing.assert_allclose(mesh.vertices, [[0, 0, 10], [2, 0, 10], [0, 0, 13]], atol=1e-12)
+    np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2]])
+    np.testing.assert_array_equal(mesh.gid, [7, 7, 7])
+    np.testing.assert_array_equal(mesh.corner, [0, 1, 2])
+    assert mesh.uv is None and mesh.radius is None
+
+
+def test_glb_node_with_a_matrix(tmp_path: Path) -> None:
+    matrix = [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 5, 6, 7, 1]  # column by column
+    document, binary = triangle_document(nodes=[{"mesh": 0, "matrix": matrix}])
+    np.testing.assert_allclose(
+        read_mesh(glb(tmp_path, document, binary)).vertices, [[5, 6, 7], [5, 7, 7], [4, 6, 7]]
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"extensionsUsed": ["KHR_draco_mesh_compression"]}, "without compression"),
+        ({"nodes": [{"children": [0]}]}, "circle"),
+        ({"accessors": []}, "damaged"),
+        ({"bufferViews": [{"buffer": 0, "byteOffset": 40, "byteLength": 52}]}, "damaged"),
+        ({"buffers": [{"byteLength": 52, "uri": "mesh.bin"}]}, "another file"),
+        ({"meshes": 3}, "damaged"),
+        ({"scenes": [{"nodes": []}]}, "holds no vertices"),
+    ],
+)
+def test_damaged_glb(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(SceneFileError, match=r"mesh\.glb.*" + message):
+        read_mesh(glb(tmp_path, *triangle_document(**changes)))
+
+
+def test_truncated_glb(tmp_path: Path) -> None:
+    path = glb(tmp_path, *triangle_document())
+    path.write_bytes(path.read_bytes()[:-8])
+    with pytest.raises(SceneFileError, match="truncated"):
+        read_mesh(path)
+
+
+def test_ply_polygons_become_fans(tmp_path: Path) -> None:
+    vertices = np.zeros(4, dtype=[(name, "<f8") for name in "xyz"])
+    vertices["x"] = [0, 1, 1, 0]
+    faces = np.zeros(1, dtype=list_field("vertex_index", "i4", 4))
+    faces["vertex_index"], faces["vertex_index" + COUNT_SUFFIX] = [0, 1, 2, 3], 4
+    path = tmp_path / "mesh.ply"
+    write_ply(
+        path,
+        [
+            PlyWriteElement("vertex", 4, vertices.dtype, [vertices]),
+            PlyWriteElement("face", 1, faces.dtype, [faces]),
+        ],
+    )
+    mesh = read_mesh(path)
+    np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2], [0, 2, 3]])
+    np.testing.assert_array_equal(mesh.vertices[:, 0], [0, 1, 1, 0])
+
+
+def test_ply_of_gaussians_is_no_mesh(tmp_path: Path) -> None:
+    rows = np.zeros(2, dtype=[(name, "<f4") for name in ("x", "y", "z", "f_dc_0")])
+    path = tmp_path / "scene.ply"
+    write_ply(path, [PlyWriteElement("vertex", 2, rows.dtype, [rows])])
+    with pytest.raises(SceneFileError, match="is a file of Gaussians, not a mesh"):
+        read_mesh(path)
+
+
+def test_other_suffixes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SceneFileError, match=r"save it as \.glb, \.ply or \.obj"):
+        read_mesh(tmp_path / "mesh.fbx")

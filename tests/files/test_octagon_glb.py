@@ -1,0 +1,245 @@
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from engine.colour import srgb_to_linear
+from engine.errors import SceneFileError
+from engine.files import ExportOptions, export_scene, gltf
+from engine.files.octagon_glb_layout import OPAQUE_CUTOFF
+from engine.files.spatial import kd_chunks
+from engine.files.textures import radial_alpha
+from engine.gaussians.frames import rotation_matrices
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.octagon import octagon_corners_world, octagon_radii
+
+Make = Callable[..., FlatGaussians]
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+class Glb:
+    """A GLB file taken apart by the letter of the specification."""
+
+    def __init__(self, path: Path) -> None:
+        data = path.read_bytes()
+        assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
+        length, kind = struct.unpack_from("<I4s", data, 12)
+        assert kind == b"JSON" and length % 4 == 0
+        self.json = json.loads(data[20 : 20 + length])
+        size, kind = struct.unpack_from("<I4s", data, 20 + length)
+        assert kind == b"BIN\0" and size % 4 == 0 and 28 + length + size == len(data)
+        self.bin = data[28 + length :]
+        assert self.json["buffers"] == [{"byteLength": size}]
+
+    def view(self, index: int) -> bytes:
+        view = self.json["bufferViews"][index]
+        assert view["byteOffset"] % 4 == 0
+        return self.bin[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+
+    def accessor(self, index: int) -> np.ndarray:
+        accessor = self.json["accessors"][index]
+        kind = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
+        width = WIDTHS[accessor["type"]]
+        values = np.frombuffer(self.view(accessor["bufferView"]), kind)[: accessor["count"] * width]
+        assert len(values) == accessor["count"] * width
+        return values.reshape(-1, width) if width > 1 else values
+
+    def primitives(self) -> list[dict[str, np.ndarray]]:
+        """Attributes and indices of every mesh, in the order of the nodes."""
+        result = []
+        for child in self.json["nodes"][0]["children"]:
+            (primitive,) = self.json["meshes"][self.json["nodes"][child]["mesh"]]["primitives"]
+            arrays = {name: self.accessor(index) for name, index in primitive["attributes"].items()}
+            result.append(arrays | {"indices": self.accessor(primitive["indices"])})
+        return result
+
+    def texture(self, folder: Path) -> np.ndarray:
+        png = folder / "texture.png"
+        png.write_bytes(self.view(self.json["images"][0]["bufferView"]))
+        as_stored = oiio.ImageSpec()
+        as_stored["oiio:UnassociatedAlpha"] = 1
+        return oiio.ImageBuf(str(png), 0, 0, as_stored).get_pixels(oiio.UINT8) / 255.0
+
+
+def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Sampling with linear filter and clamp to edge, as GPUs do it."""
+    size = len(image)
+    x = np.clip(uv * size - 0.5, 0, size - 1)
+    low = np.minimum(x.astype(int), size - 2)
+    f = (x - low)[..., None]
+    u, v = low[:, 0], low[:, 1]
+    top = image[v, u] * (1 - f[:, 0]) + image[v, u + 1] * f[:, 0]
+    bottom = image[v + 1, u] * (1 - f[:, 0]) + image[v + 1, u + 1] * f[:, 0]
+    return top * (1 - f[:, 1]) + bottom * f[:, 1]
+
+
+@pytest.mark.parametrize("q", [4.0, 9.21, 11.345])
+def test_texture_times_vertex_colour_is_the_gaussian(make_scene: Make, tmp_path: Path, q: float) -> None:
+    scene = make_scene(400)
+    export_scene(scene, tmp_path / "a.glb", ExportOptions(q=q))
+    glb = Glb(tmp_path / "a.glb")
+    (arrays,) = glb.primitives()
+    texture = glb.texture(tmp_path)
+    np.testing.assert_array_equal(texture[..., :3], 1.0)
+    triangles = arrays["indices"].reshape(-1, 3)
+    weights = np.random.default_rng(0).dirichlet([0.7] * 3, size=len(triangles))
+
+    def interpolate(name: str) -> np.ndarray:
+        return np.einsum("tk,tkc->tc", weights, arrays[name].astype(np.float64)[triangles])
+
+    ids = arrays["_GID"][triangles[:, 0]].astype(int)
+    offsets = interpolate("POSITION") - scene.means_world[ids]
+    local = np.einsum("tji,tj->ti", scene.rotations[ids].astype(np.float64), offsets)
+    rho2 = np.sum((local[:, 1:] / scene.scales[ids]) ** 2, axis=1)
+    assert rho2.max() > 0.9 * q
+    colour = interpolate("COLOR_0") * bilinear(texture, interpolate("TEXCOORD_0"))
+    expected = scene.opacities[ids] * np.exp(-rho2 / 2)
+    np.testing.assert_allclose(colour[:, 3], expected, atol=0.003)
+    linear = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0, 1))[ids]
+    np.testing.assert_allclose(colour[:, :3], linear, atol=1e-6)
+
+
+def test_linear_filtering_of_the_texture_errs_by_no_more_than_theory_says() -> None:
+    uv = np.random.default_rng(0).uniform(0.02, 0.98, (5000, 2))
+    q = 9.21
+    exact = np.exp(-0.5 * q * np.sum((2 * uv - 1) ** 2, axis=1))
+    for size in (128, 2048):
+        error = np.abs(bilinear(radial_alpha(size, q)[..., None], uv)[:, 0] - exact).max()
+        assert error < q / size**2  # two axes, each h^2 / 8 times the second derivative 4 Q
+
+
+def test_chunks_hold_every_octagon_exactly_once(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(20000)
+    export_scene(scene, tmp_path / "a.glb")
+    parts = Glb(tmp_path / "a.glb").primitives()
+    assert len(parts) == 64
+    radii = octagon_radii(scene.opacities)
+    corners = octagon_corners_world(scene, radii)
+    seen: list[np.ndarray] = []
+    for arrays in parts:
+        ids = arrays["_GID"].reshape(-1, 8).astype(int)
+        assert (ids == ids[:, :1]).all()
+        seen.append(ids[:, 0])
+        np.testing.assert_array_equal(arrays["POSITION"].reshape(-1, 8, 3), corners[ids[:, 0]])
+        np.testing.assert_array_equal(
+            arrays["_CORNER"].reshape(-1, 8), np.broadcast_to(np.arange(8), ids.shape)
+        )
+        indices = arrays["indices"].reshape(-1, 6, 3)
+        first = 8 * np.arange(len(indices))[:, None]
+        np.testing.assert_array_equal(indices[:, :, 0], np.broadcast_to(first, indices.shape[:2]))
+        np.testing.assert_array_equal(indices[:, :, 1], first + np.arange(1, 7))
+        np.testing.assert_array_equal(indices[:, :, 2], first + np.arange(2, 8))
+    np.testing.assert_array_equal(np.sort(np.concatenate(seen)), np.flatnonzero(radii > 0))
+
+
+def test_chunks_are_compact_and_of_equal_size() -> None:
+    points = np.random.default_rng(0).uniform(0, 1, (64 * 300 + 5, 3)).astype(np.float32)
+    chunks = kd_chunks(points, 64)
+    assert len(chunks) == 64
+    assert {len(chunk) for chunk in chunks} <= {300, 301}
+    volumes = [float(np.prod(np.ptp(points[chunk], axis=0))) for chunk in chunks]
+    assert sum(volumes) < 1.0 and max(volumes) < 3 / 64
+    assert len(kd_chunks(points[:511], 64)) == 1
+    assert len(kd_chunks(np.zeros((1024, 3), np.float32), 64)) == 4
+
+
+def test_json_says_what_viewers_need(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(2000)
+    export_scene(scene, tmp_path / "a.glb")
+    glb = Glb(tmp_path / "a.glb")
+    document = glb.json
+    assert document["asset"]["generator"] == "octasplat"
+    assert document["asset"]["extras"]["octasplat_gaussians"] == 2000
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    (material,) = document["materials"]
+    assert material["alphaMode"] == "BLEND" and material["doubleSided"] is True
+    assert material["extensions"] == {"KHR_materials_unlit": {}}
+    assert document["samplers"] == [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]
+    for primitive, arrays in zip(document["meshes"], glb.primitives(), strict=True):
+        position = document["accessors"][primitive["primitives"][0]["attributes"]["POSITION"]]
+        np.testing.assert_array_equal(np.float32(position["min"]), arrays["POSITION"].min(axis=0))
+        np.testing.assert_array_equal(np.float32(position["max"]), arrays["POSITION"].max(axis=0))
+    image_view = document["images"][0]["bufferView"]
+    assert "target" not in document["bufferViews"][image_view]
+
+
+def test_root_node_turns_y_down_into_y_up(make_scene: Make, tmp_path: Path) -> None:
+    export_scene(make_scene(10), tmp_path / "a.glb")
+    document = Glb(tmp_path / "a.glb").json
+    assert document["scenes"][document["scene"]]["nodes"] == [0]
+    x, y, z, w = document["nodes"][0]["rotation"]
+    np.testing.assert_allclose(
+        rotation_matrices(np.array([[w, x, y, z]]))[0], np.diag([1.0, -1.0, -1.0]), atol=1e-15
+    )
+    assert all(set(node) == {"name", "mesh"} for node in document["nodes"][1:])
+
+
+def test_ids_can_be_left_out(make_scene: Make, tmp_path: Path) -> None:
+    export_scene(make_scene(600), tmp_path / "a.glb", ExportOptions(ids=False))
+    for arrays in Glb(tmp_path / "a.glb").primitives():
+        assert set(arrays) == {"POSITION", "COLOR_0", "TEXCOORD_0", "indices"}
+
+
+def test_more_than_a_glb_can_hold_is_refused_before_writing(
+    make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene(100)
+    export_scene(scene, tmp_path / "a.glb")
+    size = (tmp_path / "a.glb").stat().st_size
+    monkeypatch.setattr(gltf, "MAX_BYTES", size)
+    export_scene(scene, tmp_path / "b.glb")
+    monkeypatch.setattr(gltf, "MAX_BYTES", size - 1)
+    with pytest.raises(SceneFileError, match=r"c\.glb: not written; .*min_opacity.*mesh PLY"):
+        export_scene(scene, tmp_path / "c.glb")
+    assert not (tmp_path / "c.glb").exists()
+
+
+def test_a_scene_too_large_for_one_file_goes_into_several(
+    make_scene: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = make_scene(5000)
+    export_scene(scene, tmp_path / "whole.glb")
+    whole = Glb(tmp_path / "whole.glb")
+    limit = int(0.45 * (tmp_path / "whole.glb").stat().st_size)
+    monkeypatch.setattr(gltf, "MAX_BYTES", limit)
+    written = export_scene(scene, tmp_path / "a.glb")
+    assert [path.name for path in written] == ["a.glb", "a.part2.glb", "a.part3.glb"]
+    assert all(path.stat().st_size <= limit for path in written)
+    parts = [Glb(path) for path in written]
+    assert [part.json["asset"]["extras"]["octasplat_part"] for part in parts] == [[1, 3], [2, 3], [3, 3]]
+    assert all(part.json["asset"]["extras"]["octasplat_gaussians"] == 5000 for part in parts)
+    assert "octasplat_part" not in whole.json["asset"]["extras"]
+    together = [arrays for part in parts for arrays in part.primitives()]
+    for ours, expected in zip(together, whole.primitives(), strict=True):
+        for name in expected:
+            np.testing.assert_array_equal(ours[name], expected[name])
+
+
+@pytest.mark.parametrize(("chunks", "expected"), [(1, 1), (4, 4), (7, 4), (4096, 8)])
+def test_as_many_chunks_as_asked_for(make_scene: Make, tmp_path: Path, chunks: int, expected: int) -> None:
+    export_scene(make_scene(3000), tmp_path / "a.glb", ExportOptions(chunks=chunks))
+    assert len(Glb(tmp_path / "a.glb").primitives()) == expected
+
+
+def test_the_opaque_variant_cuts_alpha_and_loses_nothing_above_the_cut(
+    make_scene: Make, tmp_path: Path
+) -> None:
+    scene = make_scene(2000)
+    export_scene(scene, tmp_path / "a.glb", ExportOptions(opaque=True, chunks=1))
+    glb = Glb(tmp_path / "a.glb")
+    (material,) = glb.json["materials"]
+    assert material["alphaMode"] == "MASK" and material["alphaCutoff"] == OPAQUE_CUTOFF
+    (arrays,) = glb.primitives()
+    ids = arrays["_GID"][::8].astype(int)
+    np.testing.assert_array_equal(ids, np.flatnonzero(scene.opacities > OPAQUE_CUTOFF))
+    # Half way along an edge an octagon is narrowest; alpha must have fallen to the cut there, but not far.
+    middles = 0.5 * (
+        arrays["TEXCOORD_0"] + np.roll(arrays["TEXCOORD_0"].reshape(-1, 8, 2), 1, 1).reshape(-1, 2)
+    )
+    rho2 = ExportOptions().q * np.sum((2 * middles.astype(np.float64) - 1) ** 2, axis=1)
+    alpha = arrays["COLOR_0"][:, 3] * np.exp(-rho2 / 2)
+    np.testing.assert_allclose(alpha, OPAQUE_CUTOFF, rtol=1e-4)
