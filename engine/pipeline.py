@@ -18,7 +18,7 @@ import numpy as np
 
 import engine
 from engine.config import ReconstructionConfig, read_config
-from engine.errors import ConfigError, DamagedCheckpoint, DatasetError, OutputError
+from engine.errors import CheckpointError, ConfigError, DamagedCheckpoint, DatasetError, OutputError
 from engine.evaluate.held_out import evaluate_held_out
 from engine.events import (
     JsonLinesListener,
@@ -35,7 +35,21 @@ from engine.export.registry import export_scene
 from engine.files import write_json
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
+from engine.run_folder import (
+    CACHE,
+    CHECKPOINTS,
+    CONFIG,
+    EVENTS,
+    HELD_OUT,
+    SCENE,
+    TRAINING,
+    VIEWS,
+    found_model,
+    photographs_folder,
+    run_scene,
+)
 from engine.scene import Dataset, write_held_out
+from engine.scene.views_file import ViewsRecord, read_views, write_views
 from engine.threads import use_threads
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count, most_gaussians
@@ -43,10 +57,6 @@ from engine.train.dense_points import dense_points
 from engine.train.initialise import from_points, from_rays
 from engine.train.trainer import Trainer, fresh_state, trace_settings
 
-CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING = (
-    "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json",
-)  # fmt: skip
-CHECKPOINTS, CACHE = "checkpoints", "cache"
 MIN_POINTS = 50
 """Fewer sparse points than this are no use to begin from; random ones are taken."""
 
@@ -64,7 +74,7 @@ def reconstruct(
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
     The folder then holds ``scene.ply``, the meshes, ``metrics.json``, ``report.html``, ``renders/``,
-    ``checkpoints/``, ``config.json``, ``held_out.json`` and ``events.jsonl``.
+    ``checkpoints/``, ``config.json``, ``held_out.json``, ``views.json`` and ``events.jsonl``.
 
     Args:
         scene: folder with photographs and a COLMAP model, see :meth:`engine.scene.Dataset.open`.
@@ -79,24 +89,42 @@ def reconstruct(
         DatasetError: the photographs or the model cannot be used.
         OutputError: ``output`` holds something else or cannot be written.
         ConfigError: with ``resume``, other settings than the run's.
+        CheckpointError: with ``resume``, other photographs or another model than the run's.
         TrainingFailure: training collapsed.
         Cancelled: stopped as asked.
     """
     began = time.perf_counter()
     use_threads(threads)
     is_new = _claim_output(scene, output, config, resume)
-    events = JsonLinesListener(output / EVENTS)
+    recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
+    events = JsonLinesListener(output / EVENTS, hold=recorded is not None)
+
+    def accept(found: ViewsRecord) -> None:
+        """Go on with the photographs of the run only; until here nothing has been written."""
+        if recorded is not None and (difference := recorded.difference(found)) is not None:
+            raise CheckpointError(
+                f"{output} was made from other photographs or another model than {scene} holds "
+                f"({difference}); name the folder that it was made from, or another output folder."
+            )
+        events.release()
+
     tell = broadcast([events, listener])
     try:
         with _stage("load", tell):
             try:
-                dataset = _open_dataset(scene, output, config, threads, tell)
+                dataset = _open_dataset(
+                    scene, output, config, threads, tell, accept=None if recorded is None else accept
+                )
             except DatasetError:
                 if is_new:  # so that the corrected command finds the folder free
                     (output / CONFIG).unlink()
                     (output / EVENTS).unlink()
                 raise
             write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
+            if recorded is None:
+                write_views(output / VIEWS, dataset.record)
+            if run_scene(output) != scene.resolve():  # the photographs have moved
+                _write_config(scene, output, config)
         if not (output / SCENE).exists():
             with _stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)):
                 gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
@@ -140,29 +168,21 @@ def evaluate(
         raise OutputError(
             f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."
         )
-    dataset = _open_dataset(scene or run_scene(output), output, config, threads, listener)
+    dataset = _open_dataset(
+        photographs_folder(output, scene),
+        output,
+        config,
+        threads,
+        listener,
+        model_folder=found_model(output, scene),
+    )
+    if (output / VIEWS).exists():
+        difference = read_views(output / VIEWS).difference(dataset.record)
+        if difference is not None:
+            listener(Warned(f"{output} was made from other photographs or another model ({difference})."))
     with _stage("evaluate", listener, len(dataset.test_indices)):
         _evaluate(dataset, output, config, threads, listener)
     return output / "metrics.json"
-
-
-def run_scene(output: Path) -> Path:
-    """The scene folder that a run was made from.
-
-    Raises:
-        ConfigError: ``output`` is no run.
-    """
-    try:
-        return Path(json.loads((output / CONFIG).read_text(encoding="utf-8"))["scene"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{output / CONFIG} cannot be read ({error}); name the folder of a run.") from None
-
-
-def open_run_dataset(output: Path, *, scene: Path | None = None, threads: int = 0) -> Dataset:
-    """The photographs of a run, as it used them."""
-    return _open_dataset(
-        scene or run_scene(output), output, read_config(output / CONFIG), threads, lambda _event: None
-    )
 
 
 def versions() -> dict[str, str]:
@@ -185,11 +205,6 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
     Returns:
         Whether the run is new.
     """
-    content = {
-        "scene": str(scene.resolve()),
-        "reconstruction": config.model_dump(mode="json"),
-        "versions": versions(),
-    }
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder for the results.")
     if (output / CONFIG).exists():
@@ -202,8 +217,6 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
                 f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
                 "or name another folder."
             )
-        if run_scene(output) != scene.resolve():  # the photographs have moved
-            write_json(output / CONFIG, content)
         return False
     if output.is_dir() and any(not path.name.startswith(".") for path in output.iterdir()):
         raise OutputError(f"{output} is not empty and holds no run; name an empty or a new folder.")
@@ -211,7 +224,7 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
         output.mkdir(parents=True, exist_ok=True)
         for left in output.glob(".*.partial.*"):  # by a run that was killed while it wrote
             left.unlink()
-        write_json(output / CONFIG, content)
+        _write_config(scene, output, config)
     except OSError as error:
         raise OutputError(
             f"{output} cannot be written to ({error.strerror or error}); name another folder."
@@ -219,8 +232,24 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
     return True
 
 
+def _write_config(scene: Path, output: Path, config: ReconstructionConfig) -> None:
+    content = {
+        "scene": str(scene.resolve()),
+        "reconstruction": config.model_dump(mode="json"),
+        "versions": versions(),
+    }
+    write_json(output / CONFIG, content)
+
+
 def _open_dataset(
-    scene: Path, output: Path, config: ReconstructionConfig, threads: int, tell: Listener
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    *,
+    model_folder: Path | None = None,
+    accept: Callable[[ViewsRecord], None] | None = None,
 ) -> Dataset:
     dataset = Dataset.open(
         scene,
@@ -229,6 +258,8 @@ def _open_dataset(
         test_every=config.test_every,
         held_out=config.held_out,
         masks=config.masks,
+        model_folder=model_folder,
+        accept=accept,
         threads=threads,
         progress=lambda done, total: tell(StageProgress("load", done, total)),
     )
@@ -239,8 +270,7 @@ def _open_dataset(
 
 def _fingerprint(dataset: Dataset, config: TrainConfig) -> str:
     """Names the settings and the photographs that a checkpoint belongs to."""
-    views = [(v.name, v.width_px, v.height_px, v.origin_world.tolist()) for v in dataset.views]
-    text = json.dumps([config.model_dump(mode="json"), views, dataset.train_indices.tolist()])
+    text = json.dumps([config.model_dump(mode="json"), dataset.record.fingerprint()])
     return hashlib.sha256(text.encode()).hexdigest()
 
 

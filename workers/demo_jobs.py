@@ -6,7 +6,7 @@ from typing import Any
 
 from engine.config import ReconstructionConfig, read_config, resolve_config
 from engine.errors import ConfigError
-from engine.pipeline import CONFIG
+from engine.run_folder import CONFIG
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from workers.jobs import run_reconstruction
 from workers.progress import show_progress, staged

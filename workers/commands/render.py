@@ -42,7 +42,11 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
 @click.option(
     "--max-side", type=click.IntRange(min=16), metavar="PX", help="Views: longer side of the images."
 )
-@click.option("--scene", type=click.Path(path_type=Path), help="Where the run's photographs are now.")
+@click.option(
+    "--scene",
+    type=click.Path(path_type=Path),
+    help="Take the cameras of the photographs in this folder.  [default: those the run keeps]",
+)
 @threads_option
 @quiet_option
 def render(**options: Any) -> None:

@@ -13,7 +13,7 @@ from workers.kinds.options import (
 )
 from workers.kinds.table import JobKind, register, validated
 
-_RUN_FILES = ("scene.ply", "config.json", "held_out.json", "training.json", "events.jsonl")
+_RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl")
 
 
 def register_all() -> None:

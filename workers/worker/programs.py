@@ -12,9 +12,9 @@ from engine.export.options import ExportOptions
 from engine.export.registry import export_scene
 from engine.files import write_json
 from engine.gaussians.ply import read_gaussian_ply
-from engine.pipeline import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
+from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from workers.kinds.options import ExportJobOptions, ReconstructOptions, RenderJobOptions
 from workers.progress import staged, stopping
 from workers.worker.preview import Previews
