@@ -10,8 +10,7 @@ import hashlib
 import importlib.metadata
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +23,7 @@ from engine.events import (
     JsonLinesListener,
     Listener,
     RunFinished,
-    StageFinished,
     StageProgress,
-    StageStarted,
     Warned,
     broadcast,
 )
@@ -50,6 +47,7 @@ from engine.run_folder import (
 )
 from engine.scene import Dataset, write_held_out
 from engine.scene.views_file import ViewsRecord, read_views, write_views
+from engine.stages import StageClock, stage
 from engine.threads import use_threads
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count, most_gaussians
@@ -110,7 +108,7 @@ def reconstruct(
 
     tell = broadcast([events, listener])
     try:
-        with _stage("load", tell):
+        with stage("load", tell):
             try:
                 dataset = _open_dataset(
                     scene, output, config, threads, tell, accept=None if recorded is None else accept
@@ -126,13 +124,13 @@ def reconstruct(
             if run_scene(output) != scene.resolve():  # the photographs have moved
                 _write_config(scene, output, config)
         if not (output / SCENE).exists():
-            with _stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)):
-                gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
+            with stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)) as clock:
+                gaussians = _train(dataset, output, config.train, threads, tell, should_stop, clock)
                 write_gaussian_ply(gaussians, output / SCENE)
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
-            with _stage("evaluate", tell, len(dataset.test_indices)):
+            with stage("evaluate", tell, len(dataset.test_indices)):
                 _evaluate(dataset, output, config, threads, tell)
-        with _stage("export", tell, len(config.exports)):
+        with stage("export", tell, len(config.exports)):
             _export(output, config, tell)
         dataset.release_pages()
         outputs = tuple(
@@ -180,7 +178,7 @@ def evaluate(
         difference = read_views(output / VIEWS).difference(dataset.record)
         if difference is not None:
             listener(Warned(f"{output} was made from other photographs or another model ({difference})."))
-    with _stage("evaluate", listener, len(dataset.test_indices)):
+    with stage("evaluate", listener, len(dataset.test_indices)):
         _evaluate(dataset, output, config, threads, listener)
     return output / "metrics.json"
 
@@ -189,14 +187,6 @@ def versions() -> dict[str, str]:
     """Versions of everything that can change a result."""
     names = ("embreex", "numba", "numpy", "scipy", "pycolmap", "OpenImageIO", "flip-evaluator")
     return {"octasplat": engine.__version__, **{name: importlib.metadata.version(name) for name in names}}
-
-
-@contextmanager
-def _stage(name: str, tell: Listener, steps: int = 0) -> Iterator[None]:
-    tell(StageStarted(name, steps))
-    began = time.perf_counter()
-    yield
-    tell(StageFinished(name, time.perf_counter() - began))
 
 
 def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
@@ -281,6 +271,7 @@ def _train(
     threads: int,
     tell: Listener,
     should_stop: Callable[[], bool],
+    clock: StageClock,
 ) -> FlatGaussians:
     folder = output / CHECKPOINTS
     fingerprint = _fingerprint(dataset, config)
@@ -288,6 +279,9 @@ def _train(
     if state is None:
         first = initial_gaussians(dataset, config, threads=use_threads(threads))
         state = fresh_state(first, config.seed)
+        state.seconds = clock.seconds()
+    else:
+        clock.add(state.seconds)
     trainer = Trainer(
         dataset,
         config,
@@ -299,7 +293,7 @@ def _train(
         should_stop=should_stop,
     )
     gaussians = trainer.run()
-    write_json(output / TRAINING, {"seconds": trainer.state.seconds, "iterations": trainer.state.iteration})
+    write_json(output / TRAINING, {"seconds": clock.stop(), "iterations": trainer.state.iteration})
     return gaussians
 
 
