@@ -26,7 +26,10 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
 )
 @click.option("--turntable", is_flag=True, help="One turn round the scene.")
 @click.option(
-    "--path", "camera_path", type=click.Path(path_type=Path), help="The cameras of a JSON file, see the docs."
+    "--path",
+    "camera_path",
+    type=click.Path(path_type=Path),
+    help="The cameras of a JSON file; docs/cameras.md tells its format.",
 )
 @click.option("--frames", type=click.IntRange(min=1), help="Turntable: number of images.  [default: 120]")
 @click.option("--seconds", type=click.FloatRange(0, min_open=True), help="Turntable: duration instead.")
