@@ -172,7 +172,7 @@ def evaluate(
         config,
         threads,
         listener,
-        model_folder=found_model(output, scene),
+        model_folder=found_model(output),
     )
     if (output / VIEWS).exists():
         difference = read_views(output / VIEWS).difference(dataset.record)

@@ -6,7 +6,6 @@ from pathlib import Path
 from engine.config import read_config
 from engine.errors import ConfigError, DatasetError
 from engine.scene import load_scene
-from engine.scene.colmap import holds_model
 from engine.scene.views_file import SplitViewpoints, read_views, scene_viewpoints
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
@@ -64,13 +63,14 @@ def run_viewpoints(
     if scene is None and (output / VIEWS).exists():
         return read_views(output / VIEWS).viewpoints(max_side)
     photographs = load_scene(
-        photographs_folder(output, scene), max_side=max_side, model_folder=found_model(output, scene)
+        photographs_folder(output, scene), max_side=max_side, model_folder=found_model(output)
     )
     return scene_viewpoints(photographs, config.test_every, config.held_out)
 
 
-def found_model(output: Path, scene: Path | None) -> Path | None:
-    """The folder of the poses that a job found for photographs without any, where ``scene`` holds none."""
-    if scene is None or holds_model(scene) or not (output / POSES).is_dir():
-        return None
-    return output / POSES
+def found_model(output: Path) -> Path | None:
+    """The folder of the poses that were found for the photographs of a run, if they had to be."""
+    for folder in (output / POSES, output / POSES / "sparse" / "0"):
+        if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    return None

@@ -80,16 +80,6 @@ def find_model_folder(root: Path) -> Path:
     )
 
 
-def holds_model(root: Path) -> bool:
-    """Whether a scene has a COLMAP model, whole or not."""
-    return any(
-        (root / name / f"{part}{suffix}").is_file()
-        for name in MODEL_FOLDERS
-        for part in _PARTS
-        for suffix in (".bin", ".txt")
-    )
-
-
 def read_colmap_model(root: Path, folder: Path | None = None) -> ColmapModel:
     """Read the COLMAP model of the scene in ``root``, or the one in ``folder`` if given.
 
