@@ -6,13 +6,12 @@ neither torch nor numba, so that a front end can use it.
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
-from engine.errors import Cancelled
 from engine.writing import telling_of_room
 
 
@@ -148,38 +147,30 @@ def broadcast(listeners: Iterable[Listener]) -> Listener:
     return send
 
 
-def stopping(listener: Listener, should_stop: Callable[[], bool]) -> Listener:
-    """``listener``, but stopping the work at its next event if so asked; training does it by itself.
+class JsonLinesListener:
+    """Appends each event, stamped with Unix time in seconds, as one line to a file.
 
-    The returned listener raises :class:`engine.errors.Cancelled`.
+    Args:
+        path: the file.
+        hold: leave the file as it is, and keep the events, until :meth:`release` is called.
     """
 
-    def listen(event: Event) -> None:
-        listener(event)
-        if isinstance(event, StageProgress) and should_stop():
-            raise Cancelled(f"Stopped at the stage {event.stage!r}; the same command with --resume goes on.")
-
-    return listen
-
-
-@contextmanager
-def staged(name: str, tell: Listener, steps: int = 0) -> Iterator[Callable[[int, int], None]]:
-    """Announce a stage and its end; yields its progress callback (steps done, steps in all)."""
-    tell(StageStarted(name, steps))
-    began = time.monotonic()
-    yield lambda done, total: tell(StageProgress(name, done, total))
-    tell(StageFinished(name, time.monotonic() - began))
-
-
-class JsonLinesListener:
-    """Appends each event, stamped with Unix time in seconds, as one line to a file."""
-
-    def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    def __init__(self, path: Path, *, hold: bool = False) -> None:
         self._path = path
-        self._file: IO[str] = path.open("a", encoding="utf-8")
-        if self._file.tell() and not path.read_bytes().endswith(b"\n"):
+        self._held: list[str] = []
+        self._file: IO[str] | None = None
+        if not hold:
+            self.release()
+
+    def release(self) -> None:
+        """Write what was held, and from now on each event at once."""
+        if self._file is not None:
+            return
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = self._path.open("a", encoding="utf-8")
+        if self._file.tell() and not self._path.read_bytes().endswith(b"\n"):
             self._file.write("\n")  # a kill cut the last line short; the next event begins a new one
+        self._write("".join(self._held))
 
     def __call__(self, event: Event) -> None:
         """Write ``event`` and flush, so that a reader beside the run sees whole lines.
@@ -187,11 +178,20 @@ class JsonLinesListener:
         Raises:
             NoSpaceLeft: there is no room for it.
         """
-        with telling_of_room(self._path):
-            self._file.write(json.dumps({"time": round(time.time(), 3), **event.as_dict()}) + "\n")
-            self._file.flush()
+        line = json.dumps({"time": round(time.time(), 3), **event.as_dict()}) + "\n"
+        if self._file is None:
+            self._held.append(line)
+        else:
+            self._write(line)
 
     def close(self) -> None:
         """Close the file; the listener must not be called afterwards."""
-        with suppress(OSError):  # what could not be written was told when it was to be
-            self._file.close()
+        if self._file is not None:
+            with suppress(OSError):  # what could not be written was told when it was to be
+                self._file.close()
+
+    def _write(self, text: str) -> None:
+        assert self._file is not None
+        with telling_of_room(self._path):
+            self._file.write(text)
+            self._file.flush()

@@ -8,13 +8,13 @@ or killed goes on where it was.
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 from engine.config import ReconstructionConfig, read_config
 from engine.errors import (
     Cancelled,
+    CheckpointError,
     ConfigError,
     DamagedCheckpoint,
     DatasetError,
@@ -26,9 +26,7 @@ from engine.events import (
     JsonLinesListener,
     Listener,
     RunFinished,
-    StageFinished,
     StageProgress,
-    StageStarted,
     Warned,
     broadcast,
 )
@@ -36,7 +34,22 @@ from engine.files import ExportOptions, check_writable
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
 from engine.gaussians.model import FlatGaussians
+from engine.run_folder import (
+    CACHE,
+    CHECKPOINTS,
+    CONFIG,
+    EVENTS,
+    HELD_OUT,
+    SCENE,
+    TRAINING,
+    VIEWS,
+    found_model,
+    photographs_folder,
+    run_scene,
+)
 from engine.scene import Dataset, write_held_out
+from engine.scene.views_file import ViewsRecord, read_views, write_views
+from engine.stages import StageClock, stage
 from engine.threads import use_threads
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
@@ -48,11 +61,6 @@ from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 from engine.versions import versions
 from engine.writing import write_json
-
-CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING = (
-    "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json",
-)  # fmt: skip
-CHECKPOINTS, CACHE = "checkpoints", "cache"
 
 
 def reconstruct(
@@ -68,7 +76,7 @@ def reconstruct(
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
     The folder then holds ``scene.ply``, the meshes, ``metrics.json``, ``report.html``, ``renders/``,
-    ``checkpoints/``, ``config.json``, ``held_out.json`` and ``events.jsonl``.
+    ``checkpoints/``, ``config.json``, ``held_out.json``, ``views.json`` and ``events.jsonl``.
 
     Args:
         scene: folder with photographs and a COLMAP model, see :meth:`engine.scene.Dataset.open`.
@@ -84,6 +92,7 @@ def reconstruct(
         OutputError: ``output`` holds something else or cannot be written.
         ConfigError: settings that the photographs rule out or, with ``resume``, other ones than the run's.
         SceneFileError: a file of ``exports`` could not be written on this machine; told before the training.
+        CheckpointError: with ``resume``, other photographs or another model than the run's.
         TrainingFailure: training collapsed.
         ExportFailed: some of ``exports`` could not be written; all the rest is there.
         Cancelled: stopped as asked.
@@ -93,12 +102,25 @@ def reconstruct(
     began = time.perf_counter()
     use_threads(threads)
     is_new = _claim_output(scene, output, config, resume)
-    events = JsonLinesListener(output / EVENTS)
+    recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
+    events = JsonLinesListener(output / EVENTS, hold=recorded is not None)
+
+    def accept(found: ViewsRecord) -> None:
+        """Go on with the photographs of the run only; until here nothing has been written."""
+        if recorded is not None and (difference := recorded.difference(found)) is not None:
+            raise CheckpointError(
+                f"{output} was made from other photographs or another model than {scene} holds "
+                f"({difference}); name the folder that it was made from, or another output folder."
+            )
+        events.release()
+
     tell = broadcast([events, listener])
     try:
-        with _stage("load", tell):
+        with stage("load", tell):
             try:
-                dataset = _open_dataset(scene, output, config, threads, tell)
+                dataset = _open_dataset(
+                    scene, output, config, threads, tell, accept=None if recorded is None else accept
+                )
                 BatchSource(dataset, config.train)  # refuses settings that do not suit the photographs
             except (DatasetError, ConfigError):
                 if is_new:  # so that the corrected command finds the folder free
@@ -106,20 +128,24 @@ def reconstruct(
                     (output / EVENTS).unlink()
                 raise
             write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
+            if recorded is None:
+                write_views(output / VIEWS, dataset.record)
+            if run_scene(output) != scene.resolve() or read_config(output / CONFIG) != config:
+                _write_config(scene, output, config)  # the photographs have moved, or other files are wanted
         if not (output / SCENE).exists():
-            with _stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)):
-                gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
+            with stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)) as clock:
+                gaussians = _train(dataset, output, config.train, threads, tell, should_stop, clock)
                 write_gaussian_ply(gaussians, output / SCENE)
         unmeasured: Exception | None = None
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
             try:
-                with _stage("evaluate", tell, len(dataset.test_indices)):
+                with stage("evaluate", tell, len(dataset.test_indices)):
                     _evaluate(dataset, output, config, threads, tell)
             except Cancelled:
                 raise
             except Exception as error:  # noqa: BLE001 - raised below, after the files are written
                 unmeasured = error
-        with _stage("export", tell, len(config.exports)):
+        with stage("export", tell, len(config.exports)):
             failed = _export(output, config, tell)
         if unmeasured is not None:
             raise unmeasured
@@ -159,37 +185,21 @@ def evaluate(
         raise OutputError(
             f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."
         )
-    dataset = _open_dataset(scene or run_scene(output), output, config, threads, listener)
-    with _stage("evaluate", listener, len(dataset.test_indices)):
+    dataset = _open_dataset(
+        photographs_folder(output, scene),
+        output,
+        config,
+        threads,
+        listener,
+        model_folder=found_model(output),
+    )
+    if (output / VIEWS).exists():
+        difference = read_views(output / VIEWS).difference(dataset.record)
+        if difference is not None:
+            listener(Warned(f"{output} was made from other photographs or another model ({difference})."))
+    with stage("evaluate", listener, len(dataset.test_indices)):
         _evaluate(dataset, output, config, threads, listener)
     return output / "metrics.json"
-
-
-def run_scene(output: Path) -> Path:
-    """The scene folder that a run was made from.
-
-    Raises:
-        ConfigError: ``output`` is no run.
-    """
-    try:
-        return Path(json.loads((output / CONFIG).read_text(encoding="utf-8"))["scene"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{output / CONFIG} cannot be read ({error}); name the folder of a run.") from None
-
-
-def open_run_dataset(output: Path, *, scene: Path | None = None, threads: int = 0) -> Dataset:
-    """The photographs of a run, as it used them."""
-    return _open_dataset(
-        scene or run_scene(output), output, read_config(output / CONFIG), threads, lambda _event: None
-    )
-
-
-@contextmanager
-def _stage(name: str, tell: Listener, steps: int = 0) -> Iterator[None]:
-    tell(StageStarted(name, steps))
-    began = time.perf_counter()
-    yield
-    tell(StageFinished(name, time.perf_counter() - began))
 
 
 def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
@@ -198,11 +208,6 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
     Returns:
         Whether the run is new.
     """
-    content = {
-        "scene": str(scene.resolve()),
-        "reconstruction": config.model_dump(mode="json"),
-        "versions": versions(),
-    }
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; name a folder for the results.")
     if (output / CONFIG).exists():
@@ -216,9 +221,6 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
                 f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
                 "or name another folder."
             )
-        # The photographs have moved, or other files are wanted.
-        if run_scene(output) != scene.resolve() or before != config:
-            write_json(output / CONFIG, content)
         return False
     if output.is_dir() and any(not path.name.startswith(".") for path in output.iterdir()):
         raise OutputError(f"{output} is not empty and holds no run; name an empty or a new folder.")
@@ -226,7 +228,7 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
         output.mkdir(parents=True, exist_ok=True)
         for left in output.glob(".*.partial.*"):  # by a run that was killed while it wrote
             left.unlink()
-        write_json(output / CONFIG, content)
+        _write_config(scene, output, config)
     except OSError as error:
         raise OutputError(
             f"{output} cannot be written to ({error.strerror or error}); name another folder."
@@ -234,8 +236,24 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
     return True
 
 
+def _write_config(scene: Path, output: Path, config: ReconstructionConfig) -> None:
+    content = {
+        "scene": str(scene.resolve()),
+        "reconstruction": config.model_dump(mode="json"),
+        "versions": versions(),
+    }
+    write_json(output / CONFIG, content)
+
+
 def _open_dataset(
-    scene: Path, output: Path, config: ReconstructionConfig, threads: int, tell: Listener
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    *,
+    model_folder: Path | None = None,
+    accept: Callable[[ViewsRecord], None] | None = None,
 ) -> Dataset:
     dataset = Dataset.open(
         scene,
@@ -244,6 +262,8 @@ def _open_dataset(
         test_every=config.test_every,
         held_out=config.held_out,
         masks=config.masks,
+        model_folder=model_folder,
+        accept=accept,
         threads=threads,
         progress=lambda done, total: tell(StageProgress("load", done, total)),
     )
@@ -259,6 +279,7 @@ def _train(
     threads: int,
     tell: Listener,
     should_stop: Callable[[], bool],
+    clock: StageClock,
 ) -> FlatGaussians:
     folder = output / CHECKPOINTS
     fingerprint = run_fingerprint(dataset, config)
@@ -266,6 +287,9 @@ def _train(
     if state is None:
         first = initial_gaussians(dataset, config, threads=use_threads(threads))
         state = fresh_state(first, config.seed)
+        state.seconds = clock.seconds()
+    else:
+        clock.add(state.seconds)
     trainer = Trainer(
         dataset,
         config,
@@ -277,7 +301,7 @@ def _train(
         should_stop=should_stop,
     )
     gaussians = trainer.run()
-    write_json(output / TRAINING, {"seconds": trainer.state.seconds, "iterations": trainer.state.iteration})
+    write_json(output / TRAINING, {"seconds": clock.stop(), "iterations": trainer.state.iteration})
     return gaussians
 
 

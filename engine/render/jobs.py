@@ -15,7 +15,7 @@ from engine.render.names import render_names
 from engine.render.paths import Turntable, fit_turntable
 from engine.render.renderer import RenderedImage, render_rays
 from engine.render.video import VideoWriter
-from engine.scene import Camera, SceneModel, View
+from engine.scene import Camera, PosedView, Viewpoints
 from engine.trace.protocol import Tracer
 
 Rays = tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]
@@ -41,7 +41,7 @@ class Shot:
     rays: Callable[[], Rays]
 
 
-def view_shots(scene: SceneModel, indices: Int64[np.ndarray, " n"]) -> tuple[Shot, ...]:
+def view_shots(scene: Viewpoints, indices: Int64[np.ndarray, " n"]) -> tuple[Shot, ...]:
     """The views of photographs, with their lenses, named like them."""
     names = render_names([view.name for view in scene.views])
     views = [(names[index], scene.views[index]) for index in indices]
@@ -69,7 +69,7 @@ def turntable_cameras(
     )
 
 
-def scene_turntable(scene: SceneModel) -> Turntable:
+def scene_turntable(scene: Viewpoints) -> Turntable:
     """The turntable that fits where the photographs were taken.
 
     Raises:
@@ -80,7 +80,7 @@ def scene_turntable(scene: SceneModel) -> Turntable:
     return fit_turntable(centres, rotations[:, 2], -rotations[:, 1])
 
 
-def scene_fov_y_degrees(scene: SceneModel) -> float:
+def scene_fov_y_degrees(scene: Viewpoints) -> float:
     """The angle from the top to the bottom of the first photograph, kept within what a pinhole shows well."""
     camera = scene.cameras[scene.views[0].camera_index]
     middle = camera.width_px / 2
@@ -186,7 +186,7 @@ def _rendered(
         progress(number + 1, len(shots))
 
 
-def _view_rays(view: View, camera: Camera) -> Rays:
+def _view_rays(view: PosedView, camera: Camera) -> Rays:
     """All rays of a view; pixels that the camera cannot un-project look along its axis."""
     width, height = view.width_px, view.height_px
     directions_world = np.empty((height, width, 3), np.float32)

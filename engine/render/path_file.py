@@ -1,19 +1,4 @@
-"""Camera paths as JSON files, to be drawn elsewhere and rendered here.
-
-::
-
-    {
-      "width": 1280, "height": 720, "fps": 30,
-      "frames": [
-        {"camera_to_world": [[...], [...], [...], [0, 0, 0, 1]], "fov_y_degrees": 50},
-        {"camera_to_world": [[...], [...], [...], [0, 0, 0, 1]], "fx": 900, "fy": 900, "cx": 640, "cy": 360}
-      ]
-    }
-
-``camera_to_world`` is a rigid 4x4 matrix by rows in COLMAP's world; the camera looks along its +z axis with x
-right and y down. A frame has either ``fov_y_degrees``, the angle from the top to the bottom edge, or focal
-lengths ``fx`` and ``fy`` in pixels; ``cx`` and ``cy`` default to the image's middle.
-"""
+"""Camera paths as JSON files, to be drawn elsewhere and rendered here; see ``docs/cameras.md``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -85,7 +70,9 @@ def read_camera_path(path: Path) -> CameraPath:
     except OSError as error:
         raise ConfigError(f"Cannot read the camera path {path}: {error.strerror or error}.") from error
     except ValidationError as error:
-        raise ConfigError(f"The camera path {path} is not valid: {_first(error)}.") from error
+        raise ConfigError(
+            f"The camera path {path} is not valid: {_first(error)} (docs/cameras.md tells the format)."
+        ) from error
     return CameraPath(content.fps, tuple(_camera(content, frame) for frame in content.frames))
 
 

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from engine.scene.cameras import Camera
-from engine.scene.model import SceneModel, SparsePoints, View, scene_extent
+from engine.scene.model import PosedView, SceneModel, SparsePoints, View, Viewpoints, scene_extent
 from engine.scene.split import split_views, write_held_out
 
 if TYPE_CHECKING:
@@ -20,9 +20,11 @@ _HEAVY = {"Dataset": "engine.scene.dataset", "load_scene": "engine.scene.load"}
 __all__ = [
     "Camera",
     "Dataset",
+    "PosedView",
     "SceneModel",
     "SparsePoints",
     "View",
+    "Viewpoints",
     "load_scene",
     "scene_extent",
     "split_views",

@@ -2,13 +2,14 @@
 
 ``rgb.bin`` holds the colours of all views one after the other, row by row, as uint8 or, if any photograph
 is deeper, uint16; ``alpha.bin`` and ``mask.bin`` hold one byte a pixel and exist only where they are needed.
-``pixels.json`` says from which files they were made.
+``pixels.json`` says from which files they were made: by digests of their contents, and by a stamp of their
+folder, sizes and times, which spares reading them again.
 """
 
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -23,9 +24,10 @@ from engine.scene.image_info import ImageInfo
 from engine.scene.images import read_mask, read_photo
 from engine.scene.mapped import MappedArray
 from engine.scene.model import SceneModel, View
+from engine.scene.views_file import FileDigests
 from engine.writing import replacing, write_json
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Raised whenever the contents of the cache files change for the same photographs."""
 
 DECODING_BYTES = 2 << 30
@@ -43,6 +45,7 @@ class PixelCache:
         alpha: 255 where opaque, one value a pixel.
         mask: 255 where valid, one value a pixel.
         offsets: first pixel of every view, and the count of all pixels at the end.
+        digests: of the files of every view.
         warnings: one sentence each on what is odd but usable.
     """
 
@@ -50,17 +53,38 @@ class PixelCache:
     alpha: MappedArray
     mask: MappedArray
     offsets: Int64[np.ndarray, " views_and_end"]
+    digests: tuple[FileDigests, ...]
     warnings: tuple[str, ...]
 
 
+def file_digests(scene: SceneModel, folder: Path, *, threads: int = 0) -> tuple[FileDigests, ...]:
+    """Digests of the files of every view, from the cache in ``folder`` where it is that of just these files.
+
+    Raises:
+        DatasetError: a file cannot be read.
+    """
+    index = _read_index(folder, sum(view.width_px * view.height_px for view in scene.views))
+    if index is not None and index["stamp"] == _stamp(scene):
+        return tuple(FileDigests(*pair) for pair in index["digests"])
+    with ThreadPoolExecutor(threads if threads > 0 else os.cpu_count() or 1) as pool:
+        return tuple(pool.map(_digests, scene.views))
+
+
 def open_pixel_cache(
-    scene: SceneModel, folder: Path, *, threads: int = 0, progress: Progress | None = None
+    scene: SceneModel,
+    folder: Path,
+    digests: Sequence[FileDigests] | None = None,
+    *,
+    threads: int = 0,
+    progress: Progress | None = None,
 ) -> PixelCache:
     """Map the pixels of ``scene``, decoding them into ``folder`` first unless they are there already.
 
     Args:
         scene: the scene.
         folder: folder of the cache files.
+        digests: of the files of every view, if they are known; files that only moved, or were copied, are
+            then not decoded again.
         threads: decoding threads; 0 takes one a processor. Fewer run where photographs are huge.
         progress: told (photographs done, photographs in all) while decoding.
 
@@ -70,12 +94,19 @@ def open_pixel_cache(
     """
     sizes = [view.width_px * view.height_px for view in scene.views]
     offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    fingerprint = _fingerprint(scene)
-    index = _read_index(folder, fingerprint, int(offsets[-1]))
+    stamp, sizes_px = _stamp(scene), [[view.width_px, view.height_px] for view in scene.views]
+    known = None if digests is None else [(each.photograph, each.mask) for each in digests]
+    index = _read_index(folder, int(offsets[-1]))
+    if index is not None and index["stamp"] != stamp:
+        if [(*pair,) for pair in index["digests"]] == known and index["sizes_px"] == sizes_px:
+            index["stamp"] = stamp
+            write_json(folder / "pixels.json", index)
+        else:
+            index = None
     if index is None:
-        _build(scene, folder, offsets, fingerprint, threads, progress)
-        index = _read_index(folder, fingerprint, int(offsets[-1]))
-        if index is None:
+        _build(scene, folder, offsets, stamp, threads, progress)
+        index = _read_index(folder, int(offsets[-1]))
+        if index is None or index["stamp"] != stamp:
             raise OutputError(
                 f"The pixel cache in {folder} changed while it was written; use another folder."
             )
@@ -85,12 +116,16 @@ def open_pixel_cache(
         alpha=_plane(folder / "alpha.bin", index["alpha"]),
         mask=_plane(folder / "mask.bin", index["mask"]),
         offsets=offsets,
+        digests=tuple(FileDigests(*pair) for pair in index["digests"]),
         warnings=tuple(index["warnings"]),
     )
 
 
 class _Index(TypedDict):
-    fingerprint: str
+    version: int
+    stamp: str
+    digests: list[tuple[str, str | None]]
+    sizes_px: list[list[int]]
     bits: int
     alpha: bool
     mask: bool
@@ -101,8 +136,9 @@ def _plane(path: Path, exists: bool) -> MappedArray:
     return MappedArray.open(path, np.uint8) if exists else MappedArray.empty(np.uint8)
 
 
-def _fingerprint(scene: SceneModel) -> str:
-    sources: list[object] = [CACHE_VERSION, str(scene.root.resolve())]
+def _stamp(scene: SceneModel) -> str:
+    """Names the files by their places, sizes and times, and the size of the views."""
+    sources: list[object] = [str(scene.root.resolve())]
     for view in scene.views:
         for path in (view.image_path, view.mask_path):
             if path is None:
@@ -114,14 +150,27 @@ def _fingerprint(scene: SceneModel) -> str:
     return hashlib.sha256(json.dumps(sources).encode()).hexdigest()
 
 
-def _read_index(folder: Path, fingerprint: str, pixels: int) -> _Index | None:
-    """The index, if it belongs to the scene and the files are as long as it says."""
+def _digests(view: View) -> FileDigests:
+    photograph = _sha256(view.image_path)
+    return FileDigests(photograph, None if view.mask_path is None else _sha256(view.mask_path))
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as handle:
+            return hashlib.file_digest(handle, "sha256").hexdigest()
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read ({error.strerror}); replace the file.") from error
+
+
+def _read_index(folder: Path, pixels: int) -> _Index | None:
+    """The index, if it is of this version and the files are as long as it and the count of pixels say."""
     try:
         index: _Index = json.loads((folder / "pixels.json").read_text(encoding="utf-8"))
         expected = {"rgb.bin": 3 * pixels * index["bits"] // 8}
         expected |= {f"{name}.bin": pixels for name in ("alpha", "mask") if index[name]}
         whole = all((folder / name).stat().st_size == size for name, size in expected.items())
-        return index if whole and index["fingerprint"] == fingerprint else None
+        return index if whole and index["version"] == CACHE_VERSION else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -130,7 +179,7 @@ def _build(
     scene: SceneModel,
     folder: Path,
     offsets: Int64[np.ndarray, " views_and_end"],
-    fingerprint: str,
+    stamp: str,
     threads: int,
     progress: Progress | None,
 ) -> None:
@@ -166,7 +215,10 @@ def _build(
     black = [view.name for view, summary in zip(scene.views, summaries, strict=True) if summary.is_masked_out]
     warnings = [f"{len(black)} masks hold no valid (white) pixel, e.g. that of {black[0]}."] if black else []
     index: _Index = {
-        "fingerprint": fingerprint,
+        "version": CACHE_VERSION,
+        "stamp": stamp,
+        "digests": [(each.digests.photograph, each.digests.mask) for each in summaries],
+        "sizes_px": [[view.width_px, view.height_px] for view in scene.views],
         "bits": bits,
         "alpha": "alpha" in planes and transparent,
         "mask": "mask" in planes,
@@ -177,6 +229,7 @@ def _build(
 
 @dataclass(frozen=True)
 class _Summary:
+    digests: FileDigests
     is_transparent: bool
     is_masked_out: bool
 
@@ -210,6 +263,7 @@ def _decode_all(
 
 def _decode_view(view: View, info: ImageInfo, offset: int, bits: int, files: dict[str, int]) -> _Summary:
     width, height = view.width_px, view.height_px
+    digests = _digests(view)  # the file is then at hand for the decoder
     rgb, alpha = read_photo(view.image_path, width, height, bits)
     if rgb.shape != (height, width, 3):
         raise DatasetError(
@@ -226,6 +280,7 @@ def _decode_view(view: View, info: ImageInfo, offset: int, bits: int, files: dic
             mask = read_mask(view.mask_path, (info.width_px, info.height_px), width, height)
         _write_at(files["mask"], mask, offset)
     return _Summary(
+        digests=digests,
         is_transparent=alpha is not None and int(alpha.min()) < 255,
         is_masked_out=mask is not None and int(mask.max()) < 128,
     )

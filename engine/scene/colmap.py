@@ -80,13 +80,13 @@ def find_model_folder(root: Path) -> Path:
     )
 
 
-def read_colmap_model(root: Path) -> ColmapModel:
-    """Read the COLMAP model of the scene in ``root``.
+def read_colmap_model(root: Path, folder: Path | None = None) -> ColmapModel:
+    """Read the COLMAP model of the scene in ``root``, or the one in ``folder`` if given.
 
     Raises:
         DatasetError: there is no model, it is damaged, or it holds values that are not finite.
     """
-    folder = find_model_folder(root)
+    folder = folder or find_model_folder(root)
     check_binary_model(folder)
     try:
         reconstruction = pycolmap.Reconstruction(str(folder))

@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, Int, Int64
 
 from engine.errors import DatasetError
 from engine.scene import kernels
-from engine.scene.cache import PixelCache, open_pixel_cache
+from engine.scene.cache import PixelCache, file_digests, open_pixel_cache
 from engine.scene.cameras import Camera
 from engine.scene.directions import (
     MAX_TABLE_BYTES,
@@ -20,8 +20,9 @@ from engine.scene.directions import (
     rows_at_once,
 )
 from engine.scene.load import load_scene
-from engine.scene.model import SceneModel, SparsePoints, View, scene_extent
+from engine.scene.model import SceneModel, SparsePoints, View
 from engine.scene.split import split_views
+from engine.scene.views_file import ViewsRecord, views_record
 
 MaskUse = Literal["ignore", "alpha"]
 
@@ -39,6 +40,7 @@ class Dataset:
         points: sparse point cloud.
         train_indices: views to train on.
         test_indices: views held out.
+        record: what the photographs and their model are, to be compared with those of another time.
         warnings: one sentence each on what is odd but usable.
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
@@ -65,6 +67,7 @@ class Dataset:
         self.train_indices, self.test_indices = split_views(
             [view.name for view in scene.views], test_every, held_out
         )
+        self.record: ViewsRecord = views_record(scene, cache.digests, self.test_indices)
         self.has_masks: bool = len(cache.mask.values) > 0
         self._mask_is_alpha = masks == "alpha"
         if self._mask_is_alpha and not self.has_masks:
@@ -98,7 +101,7 @@ class Dataset:
                 f"{int(lacks_rays.sum())} cameras ({', '.join(models)}) cannot un-project parts of their "
                 "images; these pixels do not count."
             )
-        self.extent: float = scene_extent(origins[self.train_indices], scene.points)
+        self.extent: float = self.record.extent_world
         self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
             self._sizes[self.train_indices].prod(axis=1)
         )
@@ -113,6 +116,8 @@ class Dataset:
         test_every: int = 8,
         held_out: Sequence[str] | None = None,
         masks: MaskUse = "ignore",
+        model_folder: Path | None = None,
+        accept: Callable[[ViewsRecord], None] | None = None,
         threads: int = 0,
         progress: Callable[[int, int], None] | None = None,
         max_table_bytes: int = MAX_TABLE_BYTES,
@@ -128,6 +133,8 @@ class Dataset:
             held_out: names of the views to hold out instead.
             masks: ``ignore`` gives pixels outside the mask the weight 0; ``alpha`` multiplies the mask into
                 alpha, for an object on a transparent background.
+            model_folder: where the COLMAP model is, if not in ``root``.
+            accept: told what was found before anything is written; to refuse it, it raises.
             threads: decoding threads; 0 takes one a processor.
             progress: told (photographs done, photographs in all) while decoding.
             max_table_bytes: limit on the ray tables of cameras that are not pinholes.
@@ -137,16 +144,19 @@ class Dataset:
             OutputError: the cache cannot be written.
             ConfigError: a setting is out of range.
         """
-        scene = load_scene(root, max_side=max_side)
+        scene = load_scene(root, max_side=max_side, model_folder=model_folder)
         if masks == "alpha" and all(view.mask_path is None for view in scene.views):
             raise DatasetError(
                 f"Masks are to be the alpha, but {root / 'masks'} holds none of any photograph; put them "
                 f"there (as {scene.views[0].name}.png) or leave --masks alpha out."
             )
-        split_views(
-            [view.name for view in scene.views], test_every, held_out
-        )  # complain before the long work
-        cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)
+        # Complain before the long work.
+        _, test_indices = split_views([view.name for view in scene.views], test_every, held_out)
+        digests = None
+        if accept is not None:
+            digests = file_digests(scene, cache_dir, threads=threads)
+            accept(views_record(scene, digests, test_indices))
+        cache = open_pixel_cache(scene, cache_dir, digests, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
         return cls(scene, cache, tables, test_every=test_every, held_out=held_out, masks=masks)
 

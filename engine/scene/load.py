@@ -10,6 +10,7 @@ from engine.scene.colmap import ColmapModel, PosedImage, read_colmap_model
 from engine.scene.image_info import ImageInfo
 from engine.scene.images import read_image_info
 from engine.scene.model import SceneModel, View
+from engine.scene.views_file import capped_size
 
 MIN_VIEWS = 3
 """Fewer photographs than this do not make a scene."""
@@ -34,13 +35,14 @@ _IMAGE_SUFFIXES = frozenset(
 )
 
 
-def load_scene(root: Path, *, max_side: int | None = None) -> SceneModel:
+def load_scene(root: Path, *, max_side: int | None = None, model_folder: Path | None = None) -> SceneModel:
     """Read the model of a scene and the headers of its photographs, but no pixels.
 
     Args:
         root: folder with ``images/``, a COLMAP model (see :mod:`engine.scene.colmap`) and, if there are any,
             ``masks/<image name>.png``.
         max_side: cap on the longer side of the photographs, in pixels.
+        model_folder: where the COLMAP model is, if not in ``root``.
 
     Raises:
         DatasetError: something is missing, damaged or does not fit together.
@@ -52,7 +54,7 @@ def load_scene(root: Path, *, max_side: int | None = None) -> SceneModel:
         raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
     if not (root / "images").is_dir():
         raise DatasetError(f"{root} has no folder images; put the photographs into {root / 'images'}.")
-    model = read_colmap_model(root)
+    model = read_colmap_model(root, model_folder)
     if len(model.images) < MIN_VIEWS:
         raise DatasetError(
             f"The model in {model.folder} has {len(model.images)} posed images; "
@@ -86,17 +88,14 @@ def load_scene(root: Path, *, max_side: int | None = None) -> SceneModel:
         )
         infos.append(info)
     return SceneModel(
-        root, model.folder, tuple(views), tuple(infos), tuple(camera_indices), model.points, tuple(warnings)
+        views=tuple(views),
+        cameras=tuple(camera_indices),
+        root=root,
+        model_folder=model.folder,
+        image_infos=tuple(infos),
+        points=model.points,
+        warnings=tuple(warnings),
     )
-
-
-def capped_size(width_px: int, height_px: int, max_side: int | None) -> tuple[int, int]:
-    """Width and height after the cap on the longer side; never enlarged, never below one pixel."""
-    longer = max(width_px, height_px)
-    if max_side is None or longer <= max_side:
-        return width_px, height_px
-    ratio = max_side / longer
-    return max(1, round(width_px * ratio)), max(1, round(height_px * ratio))
 
 
 def _image_paths(root: Path, model: ColmapModel, warnings: list[str]) -> list[Path]:

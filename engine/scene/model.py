@@ -11,13 +11,11 @@ from engine.scene.image_info import ImageInfo
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """One posed photograph at its working size.
+class PosedView:
+    """Where one photograph was taken from, at its working size; all of it but the photograph.
 
     Attributes:
         name: name in the COLMAP model, relative to ``images/``, with forward slashes.
-        image_path: the photograph on disk.
-        mask_path: ``masks/<name>.png`` where there is one.
         camera_index: index into the cameras of the scene.
         rotation_cam_from_world: takes world to camera coordinates (x right, y down, z forward).
         translation_cam_from_world: ``x_cam = rotation @ x_world + translation``, world units.
@@ -26,8 +24,6 @@ class View:
     """
 
     name: str
-    image_path: Path
-    mask_path: Path | None
     camera_index: int
     rotation_cam_from_world: Float64[np.ndarray, "3 3"]
     translation_cam_from_world: Float64[np.ndarray, "3"]
@@ -38,6 +34,19 @@ class View:
     def origin_world(self) -> Float64[np.ndarray, "3"]:
         """Centre of projection, in world coordinates."""
         return -self.rotation_cam_from_world.T @ self.translation_cam_from_world
+
+
+@dataclass(frozen=True, eq=False)
+class View(PosedView):
+    """One posed photograph at its working size.
+
+    Attributes:
+        image_path: the photograph on disk.
+        mask_path: ``masks/<name>.png`` where there is one.
+    """
+
+    image_path: Path
+    mask_path: Path | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,24 +70,35 @@ class SparsePoints:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneModel:
+class Viewpoints:
+    """Where photographs were taken from, and through which lenses.
+
+    Attributes:
+        views: sorted by name.
+        cameras: cameras at the working size, without duplicates.
+    """
+
+    views: tuple[PosedView, ...]
+    cameras: tuple[Camera, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneModel(Viewpoints):
     """A scene before its pixels are read.
 
     Attributes:
+        views: posed photographs, sorted by name.
         root: folder of the scene.
         model_folder: folder of the COLMAP model in use.
-        views: posed photographs, sorted by name.
         image_infos: headers of the photographs, in the order of ``views``.
-        cameras: cameras at the working size, without duplicates.
         points: sparse point cloud.
         warnings: one sentence each on what is odd but usable.
     """
 
+    views: tuple[View, ...]
     root: Path
     model_folder: Path
-    views: tuple[View, ...]
     image_infos: tuple[ImageInfo, ...]
-    cameras: tuple[Camera, ...]
     points: SparsePoints
     warnings: tuple[str, ...]
 

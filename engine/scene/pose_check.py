@@ -61,7 +61,7 @@ def _shared(folder: Path, names: Sequence[str], poses: Float64[np.ndarray, "n 12
     shared = np.flatnonzero(counts[groups] > 1)
     if len(shared) == 0:
         return []
-    together = [names[int(index)] for index in np.flatnonzero(groups == groups[shared[0]])]
+    together = [names[index] for index in np.flatnonzero(groups == groups[shared[0]]).tolist()]
     return [
         f"{len(shared)} images of the model in {folder} have exactly the pose of another "
         f"({_some(together, ' = ')}); remove them if they were not taken from one place."

@@ -7,7 +7,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.jobs import gaussian_turntable
 from engine.render.paths import look_at
-from engine.scene import Camera, SceneModel, View
+from engine.scene import Camera, PosedView, Viewpoints
 
 MAX_SLOPE = 1.2
 """Lenses wider than this to a side (50 degrees) are cut there: a pinhole shows nothing well beyond."""
@@ -16,7 +16,7 @@ AROUND_FOV_DEGREES = 50.0
 
 
 def photograph_cameras(
-    scene: SceneModel, indices: Int64[np.ndarray, " n"], max_side: int
+    scene: Viewpoints, indices: Int64[np.ndarray, " n"], max_side: int
 ) -> tuple[RenderCamera, ...]:
     """Pinhole cameras in place of those of photographs, their images no larger than ``max_side``.
 
@@ -58,7 +58,7 @@ def _across(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
     return np.eye(3)[int(np.argmin(np.abs(direction)))]
 
 
-def _pinhole(view: View, camera: Camera, max_side: int) -> RenderCamera:
+def _pinhole(view: PosedView, camera: Camera, max_side: int) -> RenderCamera:
     width, height = view.width_px, view.height_px
     scale = min(1.0, max_side / max(width, height))
     width_px, height_px = max(1, round(width * scale)), max(1, round(height * scale))

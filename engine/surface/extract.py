@@ -1,8 +1,6 @@
 """From Gaussians and cameras to one coloured triangle mesh."""
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from scipy.spatial import cKDTree
 
-from engine.errors import Cancelled
-from engine.events import Listener, StageFinished, StageProgress, StageStarted, ignore
+from engine.events import Listener, ignore
 from engine.render.cameras import RenderCamera
+from engine.stages import counted_stage, stopping
 from engine.surface.clean import decimate, keep_large_components
 from engine.surface.colours import bake_colours
 from engine.surface.depth import render_depth_maps
@@ -74,31 +72,18 @@ def extract_surface(
         ConfigError: the region cannot be found, is empty or takes too much memory.
         Cancelled: stopped as asked.
     """
-
-    @contextmanager
-    def stage(name: str, steps: int) -> Iterator[Callable[[int, int], None]]:
-        listener(StageStarted(name, steps))
-        began = time.perf_counter()
-
-        def progress(done: int, total: int) -> None:
-            listener(StageProgress(name, done, total))
-            if should_stop():
-                raise Cancelled("Stopped; no surface was written.")
-
-        yield progress
-        listener(StageFinished(name, time.perf_counter() - began))
-
+    tell = stopping(listener, should_stop, "Stopped; no surface was written.")
     if not options.unbounded and options.bounds is None:
         focus(cameras)  # complain before the long work
-    with stage("depth", len(cameras)) as progress:
+    with counted_stage("depth", tell, len(cameras)) as progress:
         maps = render_depth_maps(tracer, cameras, options, scratch, progress)
     region = choose_region(maps, options)
-    with stage("fusing", 2 * len(cameras)) as progress:
+    with counted_stage("fusing", tell, 2 * len(cameras)) as progress:
         volume: Volume | None = fuse(maps, region, options, progress)
     del maps
     assert volume is not None
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
-    with stage("meshing", 4) as progress:
+    with counted_stage("meshing", tell, 4) as progress:
         mesh = surface_of(volume, options.min_weight)
         volume, found = None, len(mesh.faces)
         progress(1, 4)
@@ -114,9 +99,9 @@ def extract_surface(
     tolerance = TOLERANCE_VOXELS * region.voxel_world
     layout = None
     if options.texture_side is not None:
-        with stage("unwrapping", 0):
+        with counted_stage("unwrapping", tell, 0):
             layout = lay_out(mesh, options.texture_side)
-    with stage("colouring", 0) as progress:
+    with counted_stage("colouring", tell, 0) as progress:
         if layout is None or options.texture_side is None:
             normals = mesh.vertex_normals()
             rgb, seen = bake_colours(mesh.vertices_world, normals, mesh, cameras, tracer, tolerance, progress)

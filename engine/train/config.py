@@ -115,8 +115,11 @@ class TrainConfig(_Frozen):
     sh_degree: int = Field(2, ge=0, le=3)
     sh_every: int = Field(400, ge=1, description="iterations between raising the degree")
     max_gaussians: int = Field(
-        0, ge=0, description="0: one for each 50 pixels of the training views, 10,000 to 200,000"
+        0,
+        ge=0,
+        description="0: one for each 50 pixels of the training views or, of up to 10,000, for each 10",
     )
+    max_gaussians_auto: int = Field(200_000, ge=1, description="the most that 0 comes to in max_gaussians")
     initial_points: int = Field(100_000, ge=1, description="most points to begin from")
     lift_pixels: bool = Field(
         True, description="where the sparse model has fewer points, lift pixels of the photographs"
@@ -158,8 +161,14 @@ def iteration_count(config: TrainConfig, training_pixels: int) -> int:
 
 
 def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
-    """``config.max_gaussians``, or where that is 0 what so many pixels of training views can hold down."""
-    return config.max_gaussians or min(max(training_pixels // 50, 10_000), 200_000)
+    """``config.max_gaussians``, or where that is 0 what so many pixels of training views can hold down.
+
+    More than one for each 10 pixels learn the noise of the training views instead of the scene.
+    """
+    if config.max_gaussians:
+        return config.max_gaussians
+    wanted = max(training_pixels // 50, min(training_pixels // 10, 10_000), 1)
+    return min(wanted, config.max_gaussians_auto)
 
 
 def window_side_px(config: TrainConfig, longest_side_px: int) -> int:
@@ -194,7 +203,7 @@ def preset(name: str) -> TrainConfig:
             iterations=1000,
             sh_degree=1,
             sh_every=300,
-            max_gaussians=40_000,
+            max_gaussians_auto=40_000,
             rates=LearningRates(decay=0.3),
         )
     if name == "standard":
@@ -205,7 +214,7 @@ def preset(name: str) -> TrainConfig:
             sh_degree=0,
             rays=8192,
             window_rays=1,
-            max_gaussians=350_000,
+            max_gaussians_auto=350_000,
             initial_points=30_000,
             lift_pixels=False,
             initial_opacity=0.1,

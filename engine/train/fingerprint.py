@@ -9,6 +9,5 @@ from engine.train.config import TrainConfig
 
 def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:
     """Names the settings and the photographs that decide every byte of a training."""
-    views = [(v.name, v.width_px, v.height_px, v.origin_world.tolist()) for v in dataset.views]
-    text = json.dumps([config.model_dump(mode="json"), views, dataset.train_indices.tolist()])
+    text = json.dumps([config.model_dump(mode="json"), dataset.record.fingerprint()])
     return hashlib.sha256(text.encode()).hexdigest()

@@ -19,7 +19,7 @@ class TrainState:
         rng: the generator that draws batches and everything else that is random.
         densifier: what the densification strategy has observed, as of the last checkpoint.
         shading: parameters and optimiser state of the shading model, as of the last checkpoint.
-        seconds: training time so far, evaluation left out.
+        seconds: training time so far, with the making of the first Gaussians, without measuring.
         running_mse: smoothed squared error of the training rays.
         best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
         best_iteration: when that was.

@@ -194,6 +194,7 @@ _NAMED = {
     REPORT: (_FIGURES, "a browser; one file, to keep or to send"),
     CONFIG: (_RECORDS, "a text editor: every setting of the run"),
     HELD_OUT: (_RECORDS, "a text editor: the photographs that training never saw"),
+    "views.json": (_RECORDS, "octasplat render and surface, which need no photographs then"),
     "events.jsonl": (_RECORDS, "a text editor: what happened when, a line each"),
     "training.json": (_RECORDS, "a text editor"),
 }

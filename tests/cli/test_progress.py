@@ -15,8 +15,8 @@ from engine.events import (
     StageStarted,
     TrainingProgress,
     Warned,
-    stopping,
 )
+from engine.stages import stopping
 from workers.cli.progress import Bars, PlainLines
 from workers.cli.wording import clock, duration, rate
 

@@ -56,6 +56,14 @@ def test_plain_output_has_no_control_characters_and_names_the_results(run):
     assert "rays/s" in run.stdout
 
 
+def test_the_training_time_is_told_once_and_the_same(run):
+    (finished,) = [e for e in events(run.output) if e["kind"] == "stage_finished" and e["stage"] == "train"]
+    training = json.loads((run.output / "training.json").read_text())
+    assert finished["seconds"] == training["seconds"] == run.metrics()["seconds"]
+    told = re.findall(r"[Tt]rained (?:60 iterations )?in (\S+ (?:s|min))", run.stdout)
+    assert len(told) == 2 and len(set(told)) == 1, run.stdout
+
+
 def test_resume_of_a_finished_run_needs_no_settings(run, octasplat):
     before = (run.output / "scene.ply").read_bytes()
     result = octasplat("reconstruct", run.scene, "-o", run.output, "--resume", "--threads", 1)
@@ -99,9 +107,14 @@ def test_a_signal_stops_with_a_checkpoint_and_resume_completes(
         return  # the rest is the same
     result = octasplat("reconstruct", scene, "-o", output, "--resume", "--threads", 1)
     assert result.exit_code == 0, result.output
-    steps = [e["iteration"] for e in events(output) if e["kind"] == "training_progress"]
+    progress = [e for e in events(output) if e["kind"] == "training_progress"]
+    steps = [e["iteration"] for e in progress]
     assert steps == sorted(set(steps)), "iterations were done twice"
-    assert json.loads((output / "metrics.json").read_text())["iterations"] == 600
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["iterations"] == 600
+    (finished,) = [e for e in events(output) if e["kind"] == "stage_finished" and e["stage"] == "train"]
+    before = max(e["seconds"] for e in progress if e["iteration"] <= stopped_at)
+    assert finished["seconds"] == metrics["seconds"] > before > 0, "the time before the stop counts too"
 
 
 def test_a_signal_while_evaluating_stops_too(run, octasplat, monkeypatch):

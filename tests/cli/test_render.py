@@ -1,7 +1,9 @@
 """``octasplat render``."""
 
 import json
+import re
 import subprocess
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
@@ -86,6 +88,40 @@ def test_camera_path_as_video(run, octasplat, tmp_path):
     result = octasplat("render", run.output, "-o", tmp_path / "fly.mp4", "--path", path)
     assert result.exit_code == 0, result.output
     assert len(decode(tmp_path / "fly.mp4", 32, 24)) == 3
+
+
+def documented_path():
+    """The example of the document."""
+    text = (Path(__file__).resolve().parents[2] / "docs/cameras.md").read_text()
+    (example,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    return example
+
+
+def test_the_documented_camera_path_renders_and_both_of_its_lenses_agree(run, octasplat, tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(documented_path())
+    result = octasplat("render", run.output, "-o", tmp_path / "frames", "--path", path)
+    assert result.exit_code == 0, result.output
+    images = [read_image(tmp_path / f"frames/frame_{number:04d}.png") for number in (0, 1)]
+    assert all(image.shape == (48, 64, 3) and image.std() > 0.01 for image in images)
+    # The second lens is the first one's in pixels, as the document has it: f = 24 / tan 25 degrees.
+    content = json.loads(path.read_text())
+    second = content["frames"][1]
+    for name in ("fx", "fy", "cx", "cy"):
+        del second[name]
+    path.write_text(json.dumps({**content, "frames": [{**second, "fov_y_degrees": 50}]}))
+    result = octasplat("render", run.output, "-o", tmp_path / "again", "--path", path)
+    assert result.exit_code == 0, result.output
+    assert np.abs(read_image(tmp_path / "again/frame_0000.png") - images[1]).mean() < 0.01
+
+
+def test_what_is_no_camera_path_names_the_document(run, octasplat, tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(documented_path().replace("camera_to_world", "pose"))
+    result = octasplat("render", run.output, "-o", tmp_path / "frames", "--path", path)
+    assert result.exit_code == 1
+    assert str(path) in result.stderr and "docs/cameras.md" in result.stderr
+    assert "docs/cameras.md" in octasplat("render", "--help").stdout
 
 
 @pytest.mark.parametrize(

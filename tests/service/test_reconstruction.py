@@ -13,9 +13,11 @@ from typing import Any
 
 import psutil
 import pytest
+from click.testing import CliRunner
 
 from engine.pipeline import reconstruct
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from workers.cli.main import cli
 from workers.client.api import Api, ServiceError
 from workers.client.download import download_results
 from workers.client.submission import Submission, submit
@@ -109,7 +111,7 @@ def machine(short_root: Path, request: pytest.FixtureRequest) -> Iterator[Machin
 
 def contents(folder: Path) -> dict[str, bytes]:
     """The files that must not depend on what happened on the way."""
-    names = ("scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "held_out.json")
+    names = ("scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "held_out.json", "views.json")
     renders = [path.relative_to(folder).as_posix() for path in folder.glob("renders/**/*.png")]
     assert renders
     return {name: (folder / name).read_bytes() for name in (*names, *sorted(renders))}
@@ -149,6 +151,11 @@ def test_everything_is_killed_and_the_result_is_the_same(
     assert contents(tmp_path / "result") == contents(undisturbed)
     assert json.loads((tmp_path / "result" / "config.json").read_text())["scene"] == "scene"
     assert (tmp_path / "result" / "report.html") in again
+    rendered = CliRunner().invoke(
+        cli, ["render", str(tmp_path / "result"), "-o", str(tmp_path / "views"), "--threads", "1"]
+    )
+    assert rendered.exit_code == 0, rendered.output  # the photographs are not asked for
+    assert (tmp_path / "views" / "view_000.png").exists()
 
 
 def test_stop_and_start_go_on_and_other_kinds_use_the_result(

@@ -7,9 +7,10 @@ import pytest
 
 from engine.config import resolve_config
 from engine.files.gaussian_ply import read_gaussian_ply
-from engine.pipeline import SCENE, reconstruct
+from engine.pipeline import reconstruct
 from engine.render.cameras import RenderCamera
 from engine.render.images import read_channels
+from engine.run_folder import SCENE
 from engine.scene import SceneModel, load_scene
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.scene.generated.arrangement import TABLE_RADIUS, still_life

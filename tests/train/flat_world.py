@@ -26,7 +26,7 @@ class FlatWorld:
         self.origins = np.concatenate([rng.uniform(-0.5, 0.5, (count, 2)), np.full((count, 1), -2.0)], axis=1)
         self.side_px = side_px
         self.views = tuple(
-            View(f"{k}.png", Path(f"{k}.png"), None, 0, np.eye(3), -origin, side_px, side_px)
+            View(f"{k}.png", 0, np.eye(3), -origin, side_px, side_px, Path(f"{k}.png"), None)
             for k, origin in enumerate(self.origins)
         )
         self.train_indices = np.arange(held_out, count)

@@ -18,12 +18,19 @@ from engine.train.trainer import Trainer
 
 
 @pytest.mark.parametrize(
-    ("pixels", "count"), [(1_000, 10_000), (500_000, 10_000), (5_000_000, 100_000), (46_000_000, 200_000)]
+    ("pixels", "counts"),
+    [
+        (38_000, (3_800, 3_800, 3_800)),
+        (500_000, (10_000, 10_000, 10_000)),
+        (1_000_000, (20_000, 20_000, 20_000)),
+        (5_552_160, (40_000, 111_043, 111_043)),  # fox, 480 px
+        (46_000_000, (40_000, 200_000, 350_000)),
+    ],
 )
-def test_most_gaussians_follow_the_pixels(pixels: int, count: int) -> None:
-    assert most_gaussians(TrainConfig(), pixels) == count
-    assert most_gaussians(TrainConfig(max_gaussians=777), pixels) == 777
-    assert most_gaussians(preset("fast"), pixels) == 40_000
+def test_most_gaussians_follow_the_pixels(pixels: int, counts: tuple[int, ...]) -> None:
+    for name, count in zip(("fast", "standard", "paper"), counts, strict=True):
+        assert most_gaussians(preset(name), pixels) == count
+        assert most_gaussians(preset(name).model_copy(update={"max_gaussians": 777}), pixels) == 777
 
 
 @pytest.mark.parametrize(("longest_px", "side_px"), [(4, 1), (480, 32), (800, 53), (960, 64), (4000, 267)])

@@ -6,9 +6,9 @@ from typing import Any
 
 from engine.config import ReconstructionConfig, read_config, resolve_config
 from engine.errors import ConfigError
-from engine.events import staged
-from engine.pipeline import CONFIG
+from engine.run_folder import CONFIG
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.stages import counted_stage
 from workers.cli.progress import show_progress
 from workers.cli.reconstruction import run_reconstruction
 from workers.cli.signals import orderly_termination
@@ -36,7 +36,7 @@ def make_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) -> No
     with (
         orderly_termination(),
         show_progress(quiet=quiet) as listener,
-        staged("generate", listener, config.views) as progress,
+        counted_stage("generate", listener, config.views) as progress,
     ):
         write_generated_scene(root, config, progress)
 

@@ -6,8 +6,8 @@ import click
 
 from engine.config import ReconstructionConfig
 from engine.errors import Cancelled, ExportFailed, NoSpaceLeft
-from engine.events import stopping
 from engine.pipeline import reconstruct
+from engine.stages import stopping
 from workers.cli.progress import show_progress
 from workers.cli.signals import Stopped, stop_on_signals
 from workers.cli.wording import run_summary

@@ -10,10 +10,9 @@ from jaxtyping import Float64
 
 from engine.config import read_config
 from engine.errors import OutputError
-from engine.events import Listener, staged
+from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.gaussians.model import FlatGaussians
-from engine.pipeline import CONFIG, SCENE, run_scene
 from engine.render.cameras import RenderCamera
 from engine.render.jobs import (
     DEFAULT_FOV_Y_DEGREES,
@@ -29,7 +28,9 @@ from engine.render.jobs import (
 )
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
-from engine.scene import SceneModel, load_scene, scene_extent, split_views
+from engine.run_folder import CONFIG, SCENE, run_viewpoints
+from engine.scene.views_file import SplitViewpoints
+from engine.stages import counted_stage
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings
 from engine.train.config import trace_settings
@@ -48,9 +49,7 @@ class _Source:
     gaussians: FlatGaussians
     settings: TraceSettings
     background: str = "black"
-    photographs: SceneModel | None = None
-    train_indices: np.ndarray | None = None
-    test_indices: np.ndarray | None = None
+    viewpoints: SplitViewpoints | None = None
 
 
 def run_render(mode: str, options: dict[str, Any]) -> None:
@@ -86,7 +85,7 @@ def render_files(mode: str, options: dict[str, Any], listener: Listener) -> tupl
     tracer = CpuTracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
     background = background_colour(options["background"] or source.background)
-    with staged("render", listener) as progress:
+    with counted_stage("render", listener) as progress:
         if cameras is not None and output.suffix.lower() == ".mp4":
             render_video(tracer, cameras, output, fps, background, progress)
             return (output,)
@@ -112,19 +111,12 @@ def _read_run(options: dict[str, Any]) -> _Source:
     config = read_config(run / CONFIG)
     if not (run / SCENE).exists():
         raise OutputError(f"{run} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume.")
-    photographs = load_scene(
-        options["scene"] or run_scene(run), max_side=options["max_side"] or config.max_side
-    )
-    train, test = split_views([view.name for view in photographs.views], config.test_every, config.held_out)
-    origins = np.stack([photographs.views[index].origin_world for index in train])
-    extent = scene_extent(origins, photographs.points)
+    viewpoints = run_viewpoints(run, scene=options["scene"], max_side=options["max_side"])
     return _Source(
         read_gaussian_ply(run / SCENE)[0],
-        trace_settings(config.train, extent),
+        trace_settings(config.train, viewpoints.extent),
         config.evaluate_background,
-        photographs,
-        train,
-        test,
+        viewpoints,
     )
 
 
@@ -137,9 +129,9 @@ def _turntable(source: _Source, options: dict[str, Any], fps: float) -> tuple[Re
     if options["seconds"]:
         frames = max(1, round(options["seconds"] * fps))
     fov: float | None = options["fov"]
-    if source.photographs is not None:
-        table = scene_turntable(source.photographs)
-        fov = fov or scene_fov_y_degrees(source.photographs)
+    if source.viewpoints is not None:
+        table = scene_turntable(source.viewpoints)
+        fov = fov or scene_fov_y_degrees(source.viewpoints)
     else:
         fov = fov or DEFAULT_FOV_Y_DEGREES
         table = gaussian_turntable(source.gaussians, up_world=_axis(options["up"] or "-y"), fov_y_degrees=fov)
@@ -152,10 +144,11 @@ def _axis(name: str) -> Float64[np.ndarray, "3"]:
 
 
 def _views(source: _Source, which: str | None) -> tuple[Shot, ...]:
-    assert source.photographs is not None
-    assert source.train_indices is not None and source.test_indices is not None
-    every = np.arange(len(source.photographs.views))
-    indices = {"train": source.train_indices, "all": every}.get(which or "held-out", source.test_indices)
+    viewpoints = source.viewpoints
+    assert viewpoints is not None
+    every = np.arange(len(viewpoints.views))
+    chosen = {"train": viewpoints.train_indices, "all": every}
+    indices = chosen.get(which or "held-out", viewpoints.test_indices)
     if len(indices) == 0:
         raise OutputError("The run held out no views; ask for --views train or all.")
-    return view_shots(source.photographs, indices)
+    return view_shots(viewpoints, indices)

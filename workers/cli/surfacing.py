@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import ValidationError
 
 from engine.config import read_config
-from engine.errors import ConfigError, DatasetError, OutputError
+from engine.errors import ConfigError, OutputError
 from engine.files import check_surface_path, write_surface
 from engine.gaussians.model import FlatGaussians
-from engine.pipeline import CONFIG, SCENE, run_scene
 from engine.render.cameras import RenderCamera
-from engine.scene import load_scene, scene_extent, split_views
+from engine.run_folder import CONFIG, SCENE, run_viewpoints
+from engine.scene import load_scene
 from engine.surface.cameras import cameras_around, photograph_cameras
 from engine.surface.extract import ExtractedSurface, extract_surface
 from engine.surface.options import SurfaceOptions
@@ -88,20 +88,14 @@ def _cameras(
 ) -> tuple[tuple[RenderCamera, ...], TraceSettings]:
     """Where to render depth from, and with which settings of the tracer."""
     if is_run(source) and (source / CONFIG).exists():
-        config = read_config(source / CONFIG)
-        photographs = load_scene(scene or run_scene(source), max_side=config.max_side)
-        names = [view.name for view in photographs.views]
-        indices, _ = split_views(names, config.test_every, config.held_out)
-        origins = np.stack([photographs.views[index].origin_world for index in indices])
-        settings = trace_settings(config.train, scene_extent(origins, photographs.points))
-    elif scene is not None:
+        seen = run_viewpoints(source, scene=scene)
+        settings = trace_settings(read_config(source / CONFIG).train, seen.extent)
+        return photograph_cameras(seen, seen.train_indices, options.depth_side), settings
+    if scene is not None:
         photographs = load_scene(scene)
-        indices, settings = np.arange(len(photographs.views)), TraceSettings()
-    else:
-        return cameras_around(gaussians, options.depth_side), TraceSettings()
-    if len(indices) == 0:
-        raise DatasetError(f"{photographs.root} has no photographs to look from.")
-    return photograph_cameras(photographs, indices, options.depth_side), settings
+        every = np.arange(len(photographs.views))
+        return photograph_cameras(photographs, every, options.depth_side), TraceSettings()
+    return cameras_around(gaussians, options.depth_side), TraceSettings()
 
 
 def _summary(extracted: ExtractedSurface) -> str:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from engine.errors import OctasplatError
-from engine.events import Listener, Warned, ignore, staged
+from engine.events import Listener, Warned, ignore
+from engine.stages import counted_stage
 from workers.client.api import Api
 from workers.client.download import download_results
 from workers.client.upload import upload_scene
@@ -50,7 +51,7 @@ def submit(api: Api, what: Submission, listener: Listener = ignore) -> dict[str,
     """
     dataset_id = _as_id(str(what.scene))
     if dataset_id is None:
-        with staged("upload", listener) as progress:
+        with counted_stage("upload", listener) as progress:
             dataset = upload_scene(api, what.scene, progress=lambda d, t: progress(d >> 10, t >> 10))
         dataset_id = dataset["id"]
         for warning in dataset["facts"].get("warnings", ()):
@@ -105,7 +106,7 @@ def fetch(
 
     The stage ``download``, whose steps are kB, is told to ``listener``.
     """
-    with staged("download", listener) as progress:
+    with counted_stage("download", listener) as progress:
         return tuple(
             download_results(
                 api, job_id, folder, names=names, progress=lambda d, t: progress(d >> 10, t >> 10)

@@ -8,13 +8,14 @@ from typing import Any
 
 from engine.config import read_config
 from engine.errors import ExportFailed
-from engine.events import Event, StageFinished, StageProgress, broadcast, staged, stopping
+from engine.events import Event, StageFinished, StageProgress, broadcast
 from engine.files import ExportOptions
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.files.several import export_files
-from engine.pipeline import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
+from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
+from engine.stages import counted_stage, stopping
 from engine.writing import write_json
 from workers.work.kinds.options import ExportJobOptions, ReconstructOptions, RenderJobOptions
 from workers.work.places import Places
@@ -86,7 +87,7 @@ def export(task: Task) -> None:
     settings = ExportOptions(q=q, min_opacity=options.min_opacity, sh_pad_degree=options.sh_pad_degree)
     tell = stopping(task.listener, task.should_stop)
     count = len(options.files)
-    with staged("export", tell, count):
+    with counted_stage("export", tell, count):
         failed = export_files(
             gaussians,
             task.results,

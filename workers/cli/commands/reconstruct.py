@@ -34,7 +34,10 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
 )
 @click.option("--rays", type=int, metavar="N", help="Rays of one iteration.")
 @click.option(
-    "--max-gaussians", type=int, metavar="N", help="Most Gaussians; 0 for one per 50 pixels, up to 200,000."
+    "--max-gaussians",
+    type=int,
+    metavar="N",
+    help="Most Gaussians; 0, the default, asks the photographs' pixels.",
 )
 @click.option(
     "--sh-degree", type=click.IntRange(0, 3), help="Degree of the spherical harmonics of the colours."

@@ -26,7 +26,10 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
 )
 @click.option("--turntable", is_flag=True, help="One turn round the scene.")
 @click.option(
-    "--path", "camera_path", type=click.Path(path_type=Path), help="The cameras of a JSON file, see the docs."
+    "--path",
+    "camera_path",
+    type=click.Path(path_type=Path),
+    help="The cameras of a JSON file; docs/cameras.md tells its format.",
 )
 @click.option("--frames", type=click.IntRange(min=1), help="Turntable: number of images.  [default: 120]")
 @click.option("--seconds", type=click.FloatRange(0, min_open=True), help="Turntable: duration instead.")
@@ -42,7 +45,11 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
 @click.option(
     "--max-side", type=click.IntRange(min=16), metavar="PX", help="Views: longer side of the images."
 )
-@click.option("--scene", type=click.Path(path_type=Path), help="Where the run's photographs are now.")
+@click.option(
+    "--scene",
+    type=click.Path(path_type=Path),
+    help="Take the cameras of the photographs in this folder.  [default: those the run keeps]",
+)
 @threads_option
 @quiet_option
 def render(**options: Any) -> None:

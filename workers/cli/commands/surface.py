@@ -87,7 +87,7 @@ def _box(_context: click.Context, _parameter: click.Parameter, value: str | None
 @click.option(
     "--scene",
     type=click.Path(path_type=Path),
-    help="The photographs' folder, whose cameras to use: where it is now, or for a bare file of Gaussians.",
+    help="Take the cameras of the photographs in this folder.  [default: those a run keeps; else none]",
 )
 @threads_option
 @quiet_option

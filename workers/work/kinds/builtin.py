@@ -14,7 +14,7 @@ from workers.work.kinds.options import (
 )
 from workers.work.kinds.table import JobKind, register, validated
 
-_RUN_FILES = ("scene.ply", "config.json", "held_out.json", "training.json", "events.jsonl")
+_RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl")
 
 
 def register_all() -> None:

@@ -14,7 +14,7 @@ from engine.train.config import preset
 
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _TAKEN = frozenset(
-    {"scene.ply", "config.json", "held_out.json", "events.jsonl", "metrics.json", "report.html"}
+    {"scene.ply", "config.json", "held_out.json", "views.json", "events.jsonl", "metrics.json", "report.html"}
     | {"training.json", "renders", "checkpoints", "cache", "poses"}
 )  # fmt: skip
 

@@ -1,0 +1,236 @@
+"""``views.json``: what a run was made from, to tell other photographs from them and to do without them.
+
+For every photograph its name, size, pose and camera, whether it was held out, and digests of its file and of
+its mask's; for the sparse points one digest. Where the folder of the photographs lies is not part of it.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Int64
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from engine.errors import ConfigError
+from engine.scene.cameras import Camera
+from engine.scene.model import PosedView, SceneModel, SparsePoints, Viewpoints, scene_extent
+from engine.scene.split import split_views
+from engine.writing import write_text
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Row = tuple[_Finite, _Finite, _Finite]
+_Pixels = Annotated[int, Field(ge=1)]
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class FileDigests:
+    """SHA-256 of a photograph's file, and of its mask's if it has one; hexadecimal."""
+
+    photograph: str
+    mask: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class SplitViewpoints(Viewpoints):
+    """Viewpoints of a run.
+
+    Attributes:
+        train_indices: views trained on.
+        test_indices: views held out.
+        extent: radius of the training cameras in world units, see :func:`engine.scene.model.scene_extent`.
+    """
+
+    train_indices: Int64[np.ndarray, " train"]
+    test_indices: Int64[np.ndarray, " test"]
+    extent: float
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class _Camera(_Frozen):
+    model: str
+    params: tuple[_Finite, ...]
+    width_px: _Pixels
+    height_px: _Pixels
+
+
+class _View(_Frozen):
+    name: str
+    camera: Annotated[int, Field(ge=0)]
+    rotation_cam_from_world: tuple[_Row, _Row, _Row]
+    translation_cam_from_world: _Row
+    width_px: _Pixels
+    height_px: _Pixels
+    photograph_width_px: _Pixels
+    photograph_height_px: _Pixels
+    photograph_sha256: str
+    mask_sha256: str | None
+    held_out: bool
+
+
+class ViewsRecord(_Frozen):
+    """The content of ``views.json``; two are equal where photographs, masks, model and split are."""
+
+    format: Literal[1] = 1
+    extent_world: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    points_sha256: str
+    cameras: tuple[_Camera, ...]
+    views: Annotated[tuple[_View, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _cameras_exist(self) -> "ViewsRecord":
+        if any(view.camera >= len(self.cameras) for view in self.views):
+            raise ValueError("a view names a camera that is not there")
+        return self
+
+    def fingerprint(self) -> str:
+        """Names the content."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
+    def viewpoints(self, max_side: int | None) -> SplitViewpoints:
+        """The viewpoints at the size that ``max_side`` (px) gives the photographs; None keeps theirs."""
+        cameras: dict[Camera, int] = {}
+        views = []
+        for row in self.views:
+            at = self.cameras[row.camera]
+            width, height = capped_size(row.photograph_width_px, row.photograph_height_px, max_side)
+            camera = Camera(at.model, at.params, at.width_px, at.height_px).scaled_to(width, height)
+            views.append(
+                PosedView(
+                    name=row.name,
+                    camera_index=cameras.setdefault(camera, len(cameras)),
+                    rotation_cam_from_world=np.array(row.rotation_cam_from_world),
+                    translation_cam_from_world=np.array(row.translation_cam_from_world),
+                    width_px=width,
+                    height_px=height,
+                )
+            )
+        held_out = np.array([row.held_out for row in self.views])
+        return SplitViewpoints(
+            views=tuple(views),
+            cameras=tuple(cameras),
+            train_indices=np.flatnonzero(~held_out).astype(np.int64),
+            test_indices=np.flatnonzero(held_out).astype(np.int64),
+            extent=self.extent_world,
+        )
+
+    def difference(self, other: "ViewsRecord") -> str | None:
+        """What ``other`` has otherwise, in a few words; None if nothing."""
+        mine, others = {view.name: view for view in self.views}, {view.name: view for view in other.views}
+        if mine.keys() != others.keys():
+            missing, added = sorted(mine.keys() - others.keys()), sorted(others.keys() - mine.keys())
+            told = [f"{_some(missing)} missing"] * bool(missing) + [f"{_some(added)} added"] * bool(added)
+            return " and ".join(told)
+        pairs = [(name, self._aspects(view), other._aspects(others[name])) for name, view in mine.items()]
+        for what in pairs[0][1]:
+            names = [name for name, here, there in pairs if here[what] != there[what]]
+            if names:
+                return f"{_some(names)} with another {what}"
+        if self.points_sha256 != other.points_sha256:
+            return "other sparse points"
+        return None if self == other else "another split"
+
+    def _aspects(self, view: _View) -> dict[str, object]:
+        """What is compared of a view, by its name."""
+        return {
+            "file": view.photograph_sha256,
+            "mask": view.mask_sha256,
+            "pose": (view.rotation_cam_from_world, view.translation_cam_from_world),
+            "camera": self.cameras[view.camera],
+        }
+
+
+def views_record(
+    scene: SceneModel, digests: Sequence[FileDigests], test_indices: Int64[np.ndarray, " test"]
+) -> ViewsRecord:
+    """The record of a scene and its split.
+
+    Args:
+        scene: the scene.
+        digests: of the files of its views, in their order.
+        test_indices: views that are held out.
+    """
+    held_out = set(test_indices.tolist())
+    train = [index for index in range(len(scene.views)) if index not in held_out]
+    return ViewsRecord(
+        extent_world=_extent(scene, np.array(train)),
+        points_sha256=_points_digest(scene.points),
+        cameras=tuple(
+            _Camera(model=c.model, params=c.params, width_px=c.width_px, height_px=c.height_px)
+            for c in scene.cameras
+        ),
+        views=tuple(
+            _View(
+                name=view.name,
+                camera=view.camera_index,
+                rotation_cam_from_world=view.rotation_cam_from_world.tolist(),
+                translation_cam_from_world=view.translation_cam_from_world.tolist(),
+                width_px=view.width_px,
+                height_px=view.height_px,
+                photograph_width_px=info.width_px,
+                photograph_height_px=info.height_px,
+                photograph_sha256=files.photograph,
+                mask_sha256=files.mask,
+                held_out=index in held_out,
+            )
+            for index, (view, info, files) in enumerate(
+                zip(scene.views, scene.image_infos, digests, strict=True)
+            )
+        ),
+    )
+
+
+def scene_viewpoints(
+    scene: SceneModel, test_every: int, held_out: Sequence[str] | None = None
+) -> SplitViewpoints:
+    """The viewpoints of a scene whose photographs are at hand, split as by :func:`split_views`."""
+    train, test = split_views([view.name for view in scene.views], test_every, held_out)
+    return SplitViewpoints(scene.views, scene.cameras, train, test, _extent(scene, train))
+
+
+def write_views(path: Path, record: ViewsRecord) -> None:
+    """Write ``views.json``, atomically."""
+    write_text(path, record.model_dump_json(indent=1) + "\n")
+
+
+def read_views(path: Path) -> ViewsRecord:
+    """Read ``views.json``.
+
+    Raises:
+        ConfigError: the file is missing, damaged, or of another version.
+    """
+    try:
+        return ViewsRecord.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        fault = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error.strerror
+        raise ConfigError(f"{path} cannot be read ({fault}); delete it to do without.") from None
+
+
+def capped_size(width_px: int, height_px: int, max_side: int | None) -> tuple[int, int]:
+    """Width and height after the cap on the longer side; never enlarged, never below one pixel."""
+    longer = max(width_px, height_px)
+    if max_side is None or longer <= max_side:
+        return width_px, height_px
+    ratio = max_side / longer
+    return max(1, round(width_px * ratio)), max(1, round(height_px * ratio))
+
+
+def _extent(scene: SceneModel, train_indices: Int64[np.ndarray, " train"]) -> float:
+    return scene_extent(np.stack([scene.views[i].origin_world for i in train_indices]), scene.points)
+
+
+def _points_digest(points: SparsePoints) -> str:
+    digest = hashlib.sha256()
+    for values in (points.xyz_world, points.rgb_srgb, points.track_lengths, points.errors_px):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")

@@ -1,0 +1,61 @@
+"""The stages of long work, announced when they begin and end, and the time that each took."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from engine.errors import Cancelled
+from engine.events import Event, Listener, StageFinished, StageProgress, StageStarted
+
+
+class StageClock:
+    """The time of a stage, with that of runs before this one that were stopped in it."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._stopped: float | None = None
+
+    def add(self, earlier_seconds: float) -> None:
+        """Count seconds of an earlier run as well."""
+        self._began -= earlier_seconds
+
+    def seconds(self) -> float:
+        """The seconds until now, or until it was stopped."""
+        return time.perf_counter() - self._began if self._stopped is None else self._stopped
+
+    def stop(self) -> float:
+        """The seconds, which are the same from now on: a time told twice is to be one figure."""
+        self._stopped = self.seconds()
+        return self._stopped
+
+
+@contextmanager
+def stage(name: str, tell: Listener, steps: int = 0) -> Iterator[StageClock]:
+    """Announce a stage; yields its clock, which is stopped at the end if it was not before."""
+    tell(StageStarted(name, steps))
+    clock = StageClock()
+    yield clock
+    tell(StageFinished(name, clock.stop()))
+
+
+@contextmanager
+def counted_stage(name: str, tell: Listener, steps: int = 0) -> Iterator[Callable[[int, int], None]]:
+    """Announce a stage that counts; yields its progress callback (steps done, steps in all)."""
+    with stage(name, tell, steps):
+        yield lambda done, total: tell(StageProgress(name, done, total))
+
+
+def stopping(listener: Listener, should_stop: Callable[[], bool], message: str | None = None) -> Listener:
+    """``listener``, but stopping the work at its next event if so asked; training does it by itself.
+
+    The returned listener raises :class:`engine.errors.Cancelled` with ``message``, or one that names the
+    stage.
+    """
+
+    def listen(event: Event) -> None:
+        listener(event)
+        if isinstance(event, StageProgress) and should_stop():
+            told = f"Stopped at the stage {event.stage!r}; the same command with --resume goes on."
+            raise Cancelled(message or told)
+
+    return listen

@@ -1,0 +1,145 @@
+"""Results of a job on a machine without its photographs: what works there, and what asks for them and how."""
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engine.config import resolve_config
+from engine.render.images import read_image
+from workers.work.kinds import kind_named
+from workers.work.programs import reconstruct
+from workers.work.task import Task
+
+SETTINGS = (
+    "iterations=60", "rays=256", "max_gaussians=600", "initial_points=300", "probe_rays=256", "patch_side=16",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a job published, and a copy of the photographs that it never saw."""
+
+    folder: Path
+    photographs: Path
+
+
+@pytest.fixture(scope="module")
+def results(scene, tmp_path_factory) -> Results:
+    """Made by the program of the job kind itself, in a folder that is gone afterwards."""
+    root = tmp_path_factory.mktemp("job")
+    shutil.copytree(scene, root / "dataset")
+    config = resolve_config("fast", settings={"test_every": 4, "max_side": 48}, assignments=SETTINGS)
+    options = kind_named("reconstruct").options.model_validate(config.model_dump(mode="json"))
+    (root / "attempt").mkdir()
+    reconstruct(
+        Task(root / "attempt", options.model_dump(mode="json"), root / "dataset", "still life", threads=1)
+    )
+    downloaded = tmp_path_factory.mktemp("downloaded") / "results"
+    shutil.copytree(root / "attempt" / "results", downloaded)
+    shutil.rmtree(root)
+    return Results(downloaded, scene)
+
+
+def test_its_views_are_rendered_without_photographs(results, octasplat, tmp_path):
+    result = octasplat("render", results.folder, "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["view_000.png", "view_004.png"]
+    for path in (tmp_path / "out").iterdir():
+        evaluated = read_image(results.folder / "renders" / path.name)
+        assert np.abs(read_image(path) - evaluated).max() <= 2 / 255
+
+
+@pytest.mark.parametrize(("side", "shape"), [(24, (18, 24, 3)), (64, (48, 64, 3)), (640, (48, 64, 3))])
+def test_its_views_at_other_sizes_are_those_of_the_photographs(results, octasplat, tmp_path, side, shape):
+    for name, more in (("without", ()), ("with", ("--scene", results.photographs))):
+        result = octasplat(
+            "render", results.folder, "-o", tmp_path / name, "--views", "train", "--max-side", side, *more
+        )
+        assert result.exit_code == 0, result.output
+    names = sorted(path.name for path in (tmp_path / "with").iterdir())
+    assert len(names) == 6 and sorted(path.name for path in (tmp_path / "without").iterdir()) == names
+    for name in names:
+        alone = read_image(tmp_path / "without" / name)
+        assert alone.shape == shape
+        assert np.abs(alone - read_image(tmp_path / "with" / name)).max() <= 2 / 255
+
+
+def test_a_turntable_is_that_of_the_photographs(results, octasplat, tmp_path):
+    turn = ("--turntable", "--frames", 2, "--width", 32, "--height", 24)
+    for name, more in (("without", ()), ("with", ("--scene", results.photographs))):
+        result = octasplat("render", results.folder, "-o", tmp_path / name, *turn, *more)
+        assert result.exit_code == 0, result.output
+    for name in ("frame_0000.png", "frame_0001.png"):
+        assert (tmp_path / "without" / name).read_bytes() == (tmp_path / "with" / name).read_bytes()
+
+
+def test_a_surface_is_that_of_the_photographs(results, octasplat, tmp_path):
+    size = ("--resolution", 32, "--depth-side", 48, "--min-component", 0, "--quiet")
+    for name, more in (("without", ()), ("with", ("--scene", results.photographs))):
+        result = octasplat("surface", results.folder, "-o", tmp_path / f"{name}.ply", *size, *more)
+        assert result.exit_code == 0, result.output
+    assert (tmp_path / "without.ply").read_bytes() == (tmp_path / "with.ply").read_bytes()
+
+
+def test_evaluation_asks_for_the_photographs_by_its_option(results, octasplat, tmp_path):
+    before = {path.name for path in results.folder.iterdir()}
+    result = octasplat("evaluate", results.folder)
+    assert result.exit_code == 1
+    assert "still life" in result.stderr and "--scene FOLDER" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert {path.name for path in results.folder.iterdir()} == before
+
+
+def test_evaluation_with_the_photographs_gives_the_same_figures(results, octasplat, tmp_path):
+    copy = tmp_path / "results"
+    shutil.copytree(results.folder, copy)
+    result = octasplat("evaluate", copy, "--scene", results.photographs, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+    before, after = (json.loads((folder / "metrics.json").read_text()) for folder in (results.folder, copy))
+    assert after["views"] == before["views"]
+
+
+def test_evaluation_tells_of_other_photographs(results, octasplat, tmp_path):
+    copy, others = tmp_path / "results", tmp_path / "others"
+    shutil.copytree(results.folder, copy)
+    shutil.copytree(results.photographs, others)
+    shutil.copy(others / "images/view_001.png", others / "images/view_004.png")
+    result = octasplat("evaluate", copy, "--scene", others, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert "Warning:" in result.stderr and "view_004.png with another file" in result.stderr
+
+
+def test_poses_that_the_job_found_are_taken_for_bare_photographs(results, octasplat, tmp_path):
+    copy, bare = tmp_path / "results", tmp_path / "bare"
+    shutil.copytree(results.folder, copy)
+    shutil.copytree(results.photographs / "sparse/0", copy / "poses")
+    shutil.copytree(results.photographs / "images", bare / "images")
+    result = octasplat("evaluate", copy, "--scene", bare, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize("command", ["render", "surface"])
+def test_results_of_old_ask_for_the_photographs_by_the_option(results, octasplat, tmp_path, command):
+    copy = tmp_path / "results"
+    shutil.copytree(results.folder, copy)
+    (copy / "views.json").unlink()
+    result = octasplat(command, copy, "-o", tmp_path / "out.glb")
+    assert result.exit_code == 1
+    assert "--scene FOLDER" in result.stderr
+    assert not (tmp_path / "out.glb").exists()
+
+
+def test_damaged_views_are_named(results, octasplat, tmp_path):
+    copy = tmp_path / "results"
+    shutil.copytree(results.folder, copy)
+    text = (copy / "views.json").read_text()
+    (copy / "views.json").write_text(text[: len(text) // 2])
+    result = octasplat("render", copy, "-o", tmp_path / "out")
+    assert result.exit_code == 1
+    assert str(copy / "views.json") in result.stderr and result.stderr.count("\n") == 1
