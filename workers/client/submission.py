@@ -60,6 +60,8 @@ def submit(api: Api, what: Submission, *, quiet: bool = False) -> dict[str, Any]
         "priority": what.priority,
     }
     job: dict[str, Any] = api.post("/v1/jobs", body)
+    if not quiet and job.get("estimate"):
+        click.echo(f"Estimate: {job['estimate']['text']}, within a factor of two.", err=True)
     for note in job.get("notes", ()):
         click.echo(f"Note: {note}", err=True)
     return job
