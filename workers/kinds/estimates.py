@@ -24,8 +24,8 @@ _RAY_CPU_SECONDS = 5.9e-6
 _LEAST_RAY_CPU_SECONDS = 1.0e-6
 _RAY_POWER = 0.8
 _FAR_RAY_POWER = 0.45
-"""Powers of the number of Gaussians by which it grows: up to the 200,000 of the runs that it was fitted to, and
-beyond, where an iteration was measured with 100,000 and 1,000,000 (``benchmarks/growth.py``)."""
+"""Powers of the number of Gaussians by which it grows: up to the 200,000 of the runs that it was fitted to,
+and beyond, where an iteration was measured with 100,000 and 1,000,000 (``benchmarks/growth.py``)."""
 _FITTED_GAUSSIANS = 200_000
 _SINGLE_RAY_CPU_SECONDS = 10.8e-6
 """For a ray that comes alone, as the preset paper has them."""
