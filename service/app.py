@@ -13,7 +13,7 @@ from service.guards import BodyGuard, HostGuard, OriginGuard, SafeHeaders
 from service.hub import EventHub
 from service.making_room import RoomMaker
 from service.problems import ProblemDocument, add_problem_handlers
-from service.routes import artifacts, datasets, jobs, journal, metrics, system, webhooks
+from service.routes import artifacts, datasets, estimates, jobs, journal, metrics, system, webhooks
 from service.settings import ServiceSettings
 from service.state import Service
 from service.web import mount_pages
@@ -71,7 +71,8 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"},
     )
     for module_router in (
-        datasets.router, jobs.router, journal.router, artifacts.router, webhooks.router, system.router,
+        datasets.router, jobs.router, estimates.router,
+        journal.router, artifacts.router, webhooks.router, system.router,
         system.health_router, metrics.router,
     ):  # fmt: skip
         app.include_router(module_router)

@@ -23,9 +23,10 @@ def unwritable_formats(workers: Sequence[WorkerRow]) -> dict[str, str]:
 
     Without workers there are none: nobody can say what those that come will be able to write.
     """
-    if not workers:
+    takers = [row for row in workers if row.queues]  # others look after lost jobs only
+    if not takers:
         return {}
-    able = {str(name) for row in workers for name in row.facts.get("formats", _ALL)}
+    able = {str(name) for row in takers for name in row.facts.get("formats", _ALL)}
     return {exporter.name: exporter.description for exporter in exporters() if exporter.name not in able}
 
 

@@ -18,6 +18,7 @@ from workers.records.rows import (
     JobState,
     LogLine,
 )
+from workers.work.kinds.estimates import Estimate
 
 _ID = "01a1fcac-4f59-764b-97e6-1be68502c58f"
 _TIME = "2026-11-21T05:55:13.369313Z"
@@ -154,7 +155,9 @@ class NewJob(Strict):
     options: dict[str, Any] = Field(default_factory=dict, description="See GET /v1/options/{kind}.")
     label: str | None = Field(None, max_length=200)
     queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$", description="Workers that take this queue.")
-    priority: int = Field(0, ge=-100, le=100, description="Higher goes first.")
+    priority: int = Field(
+        0, ge=-100, le=100, description="Higher goes first; high ones are for administrators."
+    )
     webhook: JobWebhook | None = Field(None, description="Be told of this job; see POST /v1/webhooks.")
 
 
@@ -182,6 +185,43 @@ class RetryRequest(Strict):
         description="Settings in the place of the job's own. What changes the training needs `from: start`; "
         "a reconstruction goes on with other `exports`.",
     )
+
+
+class PhotographSizes(Strict):
+    """Photographs of one size."""
+
+    width_px: int = Field(ge=1, le=65_536)
+    height_px: int = Field(ge=1, le=65_536)
+    count: int = Field(1, ge=1, le=1_000_000)
+
+
+class NewEstimate(Strict):
+    """A job that might be asked for; of photographs that are not here yet their sizes are enough."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "options": {"preset": "fast"},
+                    "photographs": [{"width_px": 1920, "height_px": 1080, "count": 50}],
+                }
+            ]
+        },
+    )
+
+    kind: str = Field("reconstruct", max_length=40)
+    dataset_id: uuid.UUID | None = None
+    source_id: uuid.UUID | None = None
+    photographs: list[PhotographSizes] = Field(default_factory=list, max_length=1000)
+    options: dict[str, Any] = Field(default_factory=dict)
+    queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$")
+
+
+class EstimateView(BaseModel):
+    """What a job will take, within a factor of two; null where nobody knows."""
+
+    estimate: Estimate | None
 
 
 class JobError(BaseModel):
@@ -226,6 +266,14 @@ class JobView(BaseModel):
                     "psnr": 25.1,
                     "worker": "host-4711",
                     "queue_position": None,
+                    "estimate": {
+                        "cpu_seconds": 88.0,
+                        "seconds": 50.9,
+                        "cores": 2,
+                        "memory_bytes": 930000000,
+                        "finds_poses": False,
+                        "text": "about 51 s on 2 cores and 0.9 GB of memory",
+                    },
                     "notes": [],
                     "error": None,
                     "checkpoint": {"stage": "train", "step": 250},
@@ -260,6 +308,7 @@ class JobView(BaseModel):
     psnr: float | None = Field(description="Of the training so far, dB.")
     worker: str | None
     queue_position: int | None = Field(description="Jobs that go before it.")
+    estimate: Estimate | None = Field(description="What it was reckoned to take when it was accepted.")
     notes: list[str] = Field(
         description="What its owner should know while it waits, e.g. for want of a worker."
     )
@@ -373,6 +422,7 @@ class KindView(BaseModel):
     title: str
     needs: Literal["dataset", "result"]
     options: dict[str, Any] = Field(description="JSON Schema of its options.")
+    ceilings: dict[str, int] = Field(description="What options may ask for at most here, by their path.")
 
 
 class KindList(BaseModel):

@@ -8,6 +8,7 @@ from engine.errors import ConfigError
 from service.intake.receive import UploadLimits
 from workers.records.quotas import Quota
 from workers.settings import PREFIX, WorkerSettings
+from workers.work.kinds.demands import CEILINGS
 
 DEFAULT_PORT = 8642
 
@@ -26,6 +27,13 @@ class ServiceSettings(WorkerSettings):
         quota_bytes: contents that an owner may store, unless ``octasplat quota`` says otherwise.
         quota_datasets: datasets that an owner may have.
         quota_jobs: jobs of an owner that may be queued or running.
+        max_iterations: ceiling of the iterations of a training.
+        max_gaussians: ceiling of the Gaussians of a scene.
+        max_rays: ceiling of the rays of one iteration.
+        max_side_px: ceiling of the longer side that photographs may be asked for.
+        max_exports: ceiling of the files that one job writes in formats of its own.
+        max_render_pixels: ceiling of the pixels of all images of a render together.
+        max_priority: highest priority that whoever is no administrator may give.
         ping_seconds: how often a quiet stream of events gives a sign of life.
         max_streams: streams of events at once.
         pool_size: connections to the database.
@@ -41,6 +49,13 @@ class ServiceSettings(WorkerSettings):
     quota_bytes: int | None = Field(None, ge=0)
     quota_datasets: int | None = Field(None, ge=0)
     quota_jobs: int | None = Field(None, ge=0)
+    max_iterations: int = Field(100_000, ge=1)
+    max_gaussians: int = Field(5_000_000, ge=1)
+    max_rays: int = Field(1 << 20, ge=1)
+    max_side_px: int = Field(16_384, ge=16)
+    max_exports: int = Field(20, ge=1)
+    max_render_pixels: int = Field(4_000_000_000, ge=1)
+    max_priority: int = Field(10, ge=-100, le=100)
     ping_seconds: float = Field(15.0, gt=0)
     max_streams: int = Field(500, gt=0)
     pool_size: int = Field(12, gt=1)
@@ -59,6 +74,11 @@ class ServiceSettings(WorkerSettings):
     def quota(self) -> Quota:
         """What an owner may take who has no limits of their own."""
         return Quota(self.quota_bytes, self.quota_datasets, self.quota_jobs)
+
+    @property
+    def ceilings(self) -> dict[str, int]:
+        """By the names of :data:`workers.work.kinds.demands.CEILINGS`."""
+        return {name: getattr(self, f"max_{name}") for name in CEILINGS}
 
     def upload_limits(self) -> UploadLimits:
         """What the intake takes."""

@@ -60,7 +60,11 @@ class WorkerSettings(BaseSettings):
         poll_seconds: how often a worker looks whether its job was cancelled, and for new ones.
         silent_seconds: a job's program that says nothing for so long is killed and tried again.
         grace_seconds: how long a program may take to write its checkpoint when its worker has to stop.
-        memory_limit_bytes: a program that needs more is stopped; None sets no limit.
+        memory_limit_bytes: a job's program that needs more is stopped; None gives each job of a worker its
+            share of the machine's memory, 0 sets no limit.
+        max_job_hours: a job whose program has run for so long, over all of its attempts, is ended with what
+            it has finished; 0 sets no limit.
+        absent_queue_hours: a job that waits so long in a queue that no worker takes fails; 0 lets it wait.
         threads: of one job's program; 0 takes all cores.
         listen: hear of new jobs at once; False behind a pooler in transaction mode.
         kind_modules: further modules that register kinds of jobs.
@@ -89,7 +93,9 @@ class WorkerSettings(BaseSettings):
     poll_seconds: float = Field(1.0, gt=0)
     silent_seconds: float = Field(600.0, gt=0)
     grace_seconds: float = Field(30.0, gt=0)
-    memory_limit_bytes: int | None = Field(None, gt=0)
+    memory_limit_bytes: int | None = Field(None, ge=0)
+    max_job_hours: float = Field(48.0, ge=0)
+    absent_queue_hours: float = Field(72.0, ge=0)
     threads: int = Field(0, ge=0)
     listen: bool = True
     kind_modules: tuple[str, ...] = ()

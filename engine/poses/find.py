@@ -176,17 +176,18 @@ def _process(request: Request, noise: IO[bytes]) -> Iterator["subprocess.Popen[s
         encoding="utf-8",
         env=environment,
     )
+    stdin = process.stdin
+    assert stdin is not None
     try:
-        assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it is dead, which is told soon
-            process.stdin.write(request.model_dump_json() + "\n")
-            process.stdin.flush()
+            stdin.write(request.model_dump_json() + "\n")
+            stdin.flush()
         yield process
     finally:
         process.kill()
         process.wait()
         with contextlib.suppress(OSError):
-            process.stdin.close()
+            stdin.close()
 
 
 def _read(stream: IO[str], lines: "queue.SimpleQueue[str | None]") -> None:

@@ -1,6 +1,7 @@
 """Jobs: accepted, listed, read, cancelled, retried, deleted."""
 
 import uuid
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ from engine.errors import ConfigError
 from service.auth import Principal, Reader, Writer
 from service.etags import check_precondition, matches
 from service.idempotency import IdempotencyKey, fingerprint, once
+from service.limits import check_ceilings, check_priority, estimate_job, limit_notes
 from service.paging import Cursor, Limit, link_next, read_id_cursor, write_cursor
 from service.problems import Problem, not_found, refused_options
 from service.queue_facts import check_writable, waiting_notes, workers_of
@@ -20,7 +22,7 @@ from service.state import Service, ServiceDep
 from service.webhook_addresses import check_address
 from workers.queue import jobs as rows
 from workers.records.database import Connection
-from workers.records.datasets import get_dataset
+from workers.records.datasets import get_dataset, photograph_sizes
 from workers.records.quotas import check_new_job
 from workers.records.rows import Job, JobState
 from workers.upkeep.webhooks.rows import add_endpoint
@@ -40,7 +42,9 @@ async def create_job(
     """Accept a job; poll the address in `Location`, or listen to its `/events`."""
     if service.draining:
         raise Problem(503, "draining", "The service is about to stop.", headers={"Retry-After": "10"})
-    kind = _accepted(new)
+    kind = accepted_kind(new.kind)
+    resolved(kind, new.options)
+    check_priority(who, new.priority, service.settings)
     if new.webhook is not None:
         check_address(service, new.webhook.url, "#/webhook/url")
     async with service.pool.connection() as connection, connection.transaction():
@@ -50,6 +54,9 @@ async def create_job(
             dataset_id, source_id, options = await _inputs(connection, who, kind, new)
             workers = await workers_of(connection, new.queue, service.settings.stale_seconds)
             check_writable(kind, options, new.queue, workers)
+            sizes = await photograph_sizes(connection, dataset_id) if dataset_id is not None else []
+            check_ceilings(kind, options, sizes, service.settings)
+            estimate = estimate_job(kind, options, sizes, workers)
             made = rows.NewJob(
                 owner=who.owner,
                 kind=kind.name,
@@ -59,6 +66,7 @@ async def create_job(
                 dataset_id=dataset_id,
                 source_id=source_id,
                 label=new.label,
+                estimate=None if estimate is None else estimate.model_dump(mode="json"),
                 traceparent=request.headers.get("traceparent", "")[:100] or None,
             )
             job_id = (await rows.create_job(connection, service.slips, made)).id
@@ -175,12 +183,14 @@ async def retry_job(
         async def make() -> uuid.UUID:
             await check_new_job(connection, owner, service.settings.quota)
             job = await owned_job(connection, who, job_id, lock=True)
+            options, estimate = await _revised(connection, service, job, asked)
             await rows.retry_job(
                 connection,
                 service.slips,
                 job_id,
                 fresh=asked.start == "start",
-                options=await _revised(connection, service, job, asked),
+                options=options,
+                estimate=estimate,
             )
             return job_id
 
@@ -237,24 +247,35 @@ def stages_of(job: Job) -> list[str]:
         return []
 
 
-def _accepted(new: NewJob) -> JobKind:
-    """The kind, which takes the options."""
+def accepted_kind(name: str) -> JobKind:
+    """The kind of that name.
+
+    Raises:
+        Problem: 422.
+    """
     try:
-        kind = kind_named(new.kind)
+        return kind_named(name)
     except ConfigError as error:
         raise Problem(422, "kind", str(error), errors=[{"pointer": "#/kind", "detail": str(error)}]) from None
+
+
+def resolved(kind: JobKind, asked: Mapping[str, Any]) -> BaseModel:
+    """Complete options.
+
+    Raises:
+        Problem: 422.
+    """
     try:
-        kind.resolve(new.options)
+        return kind.options.model_validate(kind.resolve(asked).model_dump(mode="json"))
     except ValidationError as error:
         raise refused_options(error) from None
-    return kind
 
 
 async def _inputs(
     connection: Connection, who: Principal, kind: JobKind, new: NewJob
 ) -> tuple[uuid.UUID | None, uuid.UUID | None, BaseModel]:
     """What the job works on, checked: dataset, source, and the complete options that fit these."""
-    options = kind.options.model_validate(kind.resolve(new.options).model_dump(mode="json"))
+    options = resolved(kind, new.options)
     if kind.needs == "result":
         if new.source_id is None or new.dataset_id is not None:
             raise _input_problem("source_id", f"The kind {kind.name} works on source_id, a finished job.")
@@ -286,15 +307,15 @@ def _input_problem(name: str, detail: str) -> Problem:
 
 async def _revised(
     connection: Connection, service: Service, job: Job, asked: RetryRequest
-) -> dict[str, Any] | None:
-    """The options of a job that is tried again, checked; None leaves them as they are."""
+) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+    """The options of a job that is tried again, checked, and their estimate; None leaves them as they are."""
     workers = await workers_of(connection, job.queue, service.settings.stale_seconds)
     try:
         kind = kind_named(job.kind)
         before = kind.options.model_validate(job.options)
     except (ConfigError, ValidationError):
         if not asked.options:
-            return None
+            return None, None
         detail = "The job is of another version, so its options cannot be changed; make a new one."
         raise Problem(409, "version", detail) from None
     try:
@@ -302,15 +323,18 @@ async def _revised(
     except ValidationError as error:
         raise refused_options(error) from None
     check_writable(kind, options, job.queue, workers)
+    sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []
+    check_ceilings(kind, options, sizes, service.settings)
     if not asked.options:
-        return None
+        return None, None
     if kind.needs == "dataset" and job.dataset_id is not None:
         dataset = await get_dataset(connection, job.dataset_id)
         options = kind.settle(options, dataset is not None and dataset.has_poses)
     if asked.start == "checkpoint" and job.checkpoint is not None and not kind.goes_on(before, options):
         detail = "With these options the work begins anew; ask for that with from: start."
         raise Problem(422, "other-work", detail, errors=[{"pointer": "#/options", "detail": detail}])
-    return options.model_dump(mode="json")
+    estimate = estimate_job(kind, options, sizes, workers)
+    return options.model_dump(mode="json"), None if estimate is None else estimate.model_dump(mode="json")
 
 
 async def job_view(connection: Connection, service: Service, job: Job) -> JobView:
@@ -321,6 +345,7 @@ async def job_view(connection: Connection, service: Service, job: Job) -> JobVie
             kind = kind_named(job.kind)
             workers = await workers_of(connection, job.queue, service.settings.stale_seconds)
             notes = waiting_notes(kind, kind.options.model_validate(job.options), job.queue, workers)
+            notes += limit_notes(job.estimate, workers, service.settings)
     return JobView.of(job, stages_of(job), await rows.queue_position(connection, job), notes)
 
 

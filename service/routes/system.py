@@ -9,6 +9,7 @@ import engine
 from engine.errors import ConfigError
 from engine.files import exporters
 from service.auth import Admin, Reader
+from service.limits import ceilings_by_path
 from service.problems import not_found
 from service.routes import problems
 from service.schemas import (
@@ -38,16 +39,16 @@ health_router = APIRouter(tags=["health"])
 
 
 @router.get("/options", responses=problems())
-async def list_options(_who: Reader) -> KindList:
+async def list_options(_who: Reader, service: ServiceDep) -> KindList:
     """The kinds of jobs with their options as JSON Schema."""
-    return KindList(kinds=[_kind_view(kind) for kind in job_kinds()])
+    return KindList(kinds=[_kind_view(kind, service) for kind in job_kinds()])
 
 
 @router.get("/options/{kind}", responses=problems(404))
-async def get_options(kind: str, _who: Reader) -> KindView:
+async def get_options(kind: str, _who: Reader, service: ServiceDep) -> KindView:
     """One kind of job with its options as JSON Schema."""
     try:
-        return _kind_view(kind_named(kind))
+        return _kind_view(kind_named(kind), service)
     except ConfigError:
         raise not_found("kind of job") from None
 
@@ -162,6 +163,7 @@ def _check_storage(service: Service) -> str:
     return "ok" if free is None or free > 0 else "full"
 
 
-def _kind_view(kind: JobKind) -> KindView:
+def _kind_view(kind: JobKind, service: Service) -> KindView:
     schema = kind.options.model_json_schema()
-    return KindView(name=kind.name, title=kind.title, needs=kind.needs, options=schema)
+    ceilings = ceilings_by_path(kind, service.settings)
+    return KindView(name=kind.name, title=kind.title, needs=kind.needs, options=schema, ceilings=ceilings)

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, Literal
 
 from engine.files import exporters
@@ -121,14 +122,22 @@ class OptionsForm:
     more: list[Section]
 
 
-def options_form(kind: JobKind, unwritable: Collection[str] = ()) -> OptionsForm:
-    """The form of a kind of job; files of the formats ``unwritable`` are marked and cannot be chosen."""
+def options_form(
+    kind: JobKind, unwritable: Collection[str] = (), ceilings: Mapping[str, int] = MappingProxyType({})
+) -> OptionsForm:
+    """The form of a kind of job.
+
+    Args:
+        kind: which.
+        unwritable: formats whose files are marked and cannot be chosen.
+        ceilings: of numbers, by their paths.
+    """
     schema = kind.options.model_json_schema()
     presets = _preset_values(schema)
     # The schema has the docstring of the class alone, not those that it inherits from.
     docstring = "\n".join(cls.__doc__ or "" for cls in reversed(kind.options.__mro__[:-1]))
     walked = _walk(schema, {**schema, "description": docstring}, "", presets)
-    fields = [_marked(item, unwritable) for item in walked]
+    fields = [_capped(_marked(item, unwritable), ceilings) for item in walked]
     names = [*_FIRST, *_FIRST_OF_TRAINING] if presets else [f.path for f in fields]
     by_path = {f.path: f for f in fields}
     first = [by_path[name] for name in names if name in by_path]
@@ -150,6 +159,13 @@ def _marked(item: Field, unwritable: Collection[str]) -> Field:
     return replace(
         item, choices=tuple(replace(choice, lacking=choice.value in lacking) for choice in item.choices)
     )
+
+
+def _capped(item: Field, ceilings: Mapping[str, int]) -> Field:
+    ceiling = ceilings.get(item.path)
+    if ceiling is None:
+        return item
+    return replace(item, high=ceiling if item.high is None else min(item.high, ceiling))
 
 
 def _label(name: str) -> str:

@@ -11,6 +11,7 @@ from fastapi.responses import HTMLResponse, JSONResponse
 
 from service.auth import Principal, Reader, Writer
 from service.downloads import send_blob
+from service.limits import ceilings_by_path
 from service.paging import read_id_cursor, write_cursor
 from service.problems import not_found
 from service.queue_facts import unwritable_formats
@@ -146,6 +147,7 @@ async def show_new(
     request: Request, who: Writer, service: ServiceDep, dataset: uuid.UUID | None = None
 ) -> Response:
     """Send photographs and queue their reconstruction."""
+    kind = kind_named("reconstruct")
     async with service.pool.connection() as connection:
         datasets = await list_datasets(connection, owner=who.sees, limit=MAX_DATASETS)
         workers = await live_workers(connection, service.settings.stale_seconds)
@@ -153,7 +155,7 @@ async def show_new(
         request,
         "new.html",
         who,
-        form=options_form(kind_named("reconstruct"), unwritable_formats(workers)),
+        form=options_form(kind, unwritable_formats(workers), ceilings_by_path(kind, service.settings)),
         datasets=[row for row in datasets if row.state == "committed"],
         chosen=dataset,
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),

@@ -88,7 +88,12 @@ const steps = {
         found.iterationsHint = await page.getAttribute("[data-path='train.iterations']", "placeholder");
         await page.fill("#label", "a still life");
         await page.click("details.all summary");
+        const estimate = (words) => page.waitForFunction((words) => document.getElementById("estimate").textContent.includes(words), words).then((shown) => page.textContent("#estimate"));
+        found.estimate = await estimate("of memory");
+        await page.fill("[data-path='train.iterations']", "1000000000");
+        found.tooMuch = await estimate("at most");
         for (const [path, value] of Object.entries(job.options)) await page.fill(`[data-path='${path}']`, String(value));
+        found.estimateAnew = await estimate("of memory");
         await shot(page, "new_settings");
         found.namelessOnNew = await nameless(page);
         await page.click("#start");

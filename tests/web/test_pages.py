@@ -113,6 +113,16 @@ def test_the_form_asks_for_what_was_filled_in(flow: Flow) -> None:
     assert flow.facts["namelessOnNew"] == []
 
 
+def test_the_form_says_what_the_job_will_take(flow: Flow) -> None:
+    facts = flow.facts
+    for shown in (facts["estimate"], facts["estimateAnew"]):
+        assert shown.startswith("This takes about ") and shown.endswith(", within a factor of two.")
+    assert facts["estimate"] != facts["estimateAnew"]  # other options, another time
+    assert "train.iterations asks for 1,000,000,000 iterations; at most 100,000" in facts["tooMuch"]
+    job = flow.service.ask("GET", f"/v1/jobs/{flow.job}")
+    assert facts["estimateAnew"] == f"This takes {job['estimate']['text']}, within a factor of two."
+
+
 def test_a_job_is_followed_to_its_end(watched: dict[str, Any]) -> None:
     states = watched["states"]
     assert states[-1] == "succeeded" and "running" in states, states

@@ -19,6 +19,8 @@ def submit(api: Api, what: Submission, *, quiet: bool = False) -> dict[str, Any]
     """Upload what is missing and queue the job; returns the job."""
     with show_progress(quiet=quiet) as listener:
         job = submission.submit(api, what, listener)
+    if not quiet and job.get("estimate"):
+        click.echo(f"Estimate: {job['estimate']['text']}, within a factor of two.", err=True)
     for note in job.get("notes", ()):
         click.echo(f"Note: {note}", err=True)
     return job

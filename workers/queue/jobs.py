@@ -35,6 +35,7 @@ class NewJob:
     source_id: uuid.UUID | None = None
     label: str | None = None
     traceparent: str | None = None
+    estimate: Mapping[str, Any] | None = None
 
 
 async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
@@ -45,12 +46,13 @@ async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
-                              traceparent)
-            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
+                              traceparent, estimate)
+            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
             """,
             [
                 job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
                 Jsonb(dict(new.options)), new.queue, new.priority, slip, new.traceparent,
+                None if new.estimate is None else Jsonb(dict(new.estimate)),
             ],
         )  # fmt: skip
         if new.dataset_id is not None:
@@ -166,6 +168,7 @@ async def retry_job(
     *,
     fresh: bool,
     options: Mapping[str, Any] | None = None,
+    estimate: Mapping[str, Any] | None = None,
 ) -> Job:
     """Queue a failed or cancelled job again.
 
@@ -175,6 +178,7 @@ async def retry_job(
         job_id: which.
         fresh: begin from the start, not from the newest checkpoint.
         options: complete options in the place of the job's own.
+        estimate: with them, what the job will take.
 
     Raises:
         Conflict: it is neither failed nor cancelled.
@@ -190,13 +194,15 @@ async def retry_job(
                 seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL,
                 checkpoint = CASE WHEN %(fresh)s THEN NULL ELSE checkpoint END,
                 fresh_after = CASE WHEN %(forget)s THEN attempt ELSE fresh_after END,
-                options = coalesce(%(options)s, options)
+                options = coalesce(%(options)s, options),
+                estimate = CASE WHEN %(options)s::jsonb IS NULL THEN estimate ELSE %(estimate)s END
             WHERE id = %(id)s
             """,
             {
                 "fresh": fresh,
                 "forget": fresh or options is not None,
                 "options": Jsonb(dict(options)) if options is not None else None,
+                "estimate": Jsonb(dict(estimate)) if estimate is not None else None,
                 "id": job_id,
             },
         )

@@ -11,6 +11,7 @@ from workers.records.database import Connection
 from workers.records.errors import Conflict
 from workers.records.ids import new_id
 from workers.records.rows import Dataset, DatasetFile
+from workers.work.kinds.estimates import Sizes
 
 
 async def create_dataset(connection: Connection, owner: str, name: str) -> Dataset:
@@ -117,6 +118,21 @@ async def files_of(
             [dataset_id, after, limit],
         )
         return await cursor.fetchall()
+
+
+async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> list[Sizes]:
+    """How many photographs of which size a dataset has, of those whose size is known."""
+    cursor = await connection.execute(
+        """
+        SELECT (facts->>'width_px')::int AS width, (facts->>'height_px')::int AS height, count(*) AS n
+        FROM dataset_files
+        WHERE dataset_id = %s AND path LIKE 'images/%%' AND facts->>'width_px' IS NOT NULL
+            AND facts->>'height_px' IS NOT NULL
+        GROUP BY 1, 2 ORDER BY 3 DESC, 1, 2
+        """,
+        [dataset_id],
+    )
+    return [Sizes(row["width"], row["height"], row["n"]) for row in await cursor.fetchall()]
 
 
 async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Dataset:

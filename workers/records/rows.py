@@ -87,6 +87,8 @@ class Job:
         error: why it failed: ``type``, ``message``.
         checkpoint: manifest of the newest one that is stored.
         preview: newest preview picture: ``sha256``, ``step`` and ``view``, the photograph it answers to.
+        estimate: what it was reckoned to take when it was accepted, see
+            :class:`workers.work.kinds.estimates.Estimate`.
         traceparent: W3C trace context of the request.
         pinned: never removed by retention.
         created_at: when it was accepted.
@@ -130,6 +132,7 @@ class Job:
     finished_at: datetime | None
     expires_at: datetime | None
     version: int
+    estimate: dict[str, Any] | None = None
 
     @property
     def is_over(self) -> bool:

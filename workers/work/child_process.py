@@ -116,13 +116,18 @@ class ChildProcess:
             os.killpg(self._process.pid, signal.SIGKILL)
 
     def memory_bytes(self) -> int:
-        """Resident memory of the child and what it started."""
+        """Private memory of the child and what it started.
+
+        Pages of files that are mapped, as those of photographs, belong to the system, which takes them back
+        when it needs them.
+        """
         total = 0
         with contextlib.suppress(psutil.Error):
             child = psutil.Process(self._process.pid)
             for process in (child, *child.children(recursive=True)):
                 with contextlib.suppress(psutil.Error):
-                    total += process.memory_info().rss
+                    memory = process.memory_info()
+                    total += memory.rss - getattr(memory, "shared", 0)
         return total
 
     def _send(self, line: str) -> None:

@@ -18,9 +18,11 @@ from procrastinate.exceptions import ConnectorException
 
 import engine
 from engine.files import writable_formats
+from workers.cli.options import available_threads
 from workers.parent import die_with_server
 from workers.queue.attempts import claim
 from workers.queue.jobs import get_job, queue_again
+from workers.queue.limits import end_abandoned
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.queue.rescue import rescue_lost_jobs
 from workers.records.database import Pool, open_pool
@@ -36,6 +38,7 @@ from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiri
 from workers.upkeep.webhooks.outbox import forget_old
 from workers.upkeep.webhooks.sending import send_due
 from workers.work.contact import DATABASE_ERRORS
+from workers.work.memory import memory_limit_bytes
 from workers.work.supervisor import LostDatabase, Supervisor, Surroundings
 from workers.work.workspace import sweep_workspaces
 
@@ -94,7 +97,14 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         worker = _Worker(
             settings,
             pool,
-            Surroundings(settings, make_slips(settings, pool), storage, room, asyncio.Event()),
+            Surroundings(
+                settings,
+                make_slips(settings, pool),
+                storage,
+                room,
+                asyncio.Event(),
+                memory_limit_bytes(settings.memory_limit_bytes, slots),
+            ),
             name or f"{socket.gethostname()}-{os.getpid()}",
             queues,
         )
@@ -251,8 +261,23 @@ class _Worker:
                 name=self._name,
                 queues=list(self._queues),
                 slots=sum(self._queues.values()),
-                facts=_facts(),
+                facts=self._facts(),
             )
+
+    def _facts(self) -> dict[str, Any]:
+        memory = psutil.virtual_memory()
+        return {
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "version": engine.__version__,
+            "python": platform.python_version(),
+            "cores": os.cpu_count(),
+            "threads": self._settings.threads or available_threads(),
+            "formats": list(writable_formats()),
+            "memory_bytes": memory.total,
+            "memory_free_bytes": memory.available,
+            "memory_limit_bytes": self._around.memory_limit_bytes,
+        }
 
     async def _rescue(self) -> None:
         await rescue_lost_jobs(self._pool, self._around.slips, self._settings.stale_seconds)
@@ -269,6 +294,13 @@ class _Worker:
             await forget_expired(connection)
             await forget_old(connection)
             await forget_old_keys(connection)
+        for job_id in await end_abandoned(
+            self._pool,
+            self._around.slips,
+            stale_seconds=self._settings.stale_seconds,
+            hours=self._settings.absent_queue_hours,
+        ):
+            logger.warning("job %s waited too long in a queue that no worker takes", job_id)
 
     async def _collect(self) -> None:
         try:
@@ -299,17 +331,3 @@ def _on_stray_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]
         logger.info("a slip of another attempt was left alone: %s", error.__cause__ or error)
     else:
         loop.default_exception_handler(context)
-
-
-def _facts() -> dict[str, Any]:
-    memory = psutil.virtual_memory()
-    return {
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "version": engine.__version__,
-        "python": platform.python_version(),
-        "cores": os.cpu_count(),
-        "formats": list(writable_formats()),
-        "memory_bytes": memory.total,
-        "memory_free_bytes": memory.available,
-    }

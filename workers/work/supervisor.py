@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from engine.errors import OctasplatError
 from workers.queue.attempts import MAX_RESCUES, Attempt, Fenced, Result
 from workers.queue.jobs import artifacts_of
+from workers.queue.limits import seconds_spent
 from workers.queue.port import Slips
 from workers.queue.storing import Note, storing
 from workers.records.datasets import files_of, get_dataset
@@ -51,6 +52,7 @@ class End(Enum):
     CANCELED = "its owner cancelled it"
     LEAVING = "its worker is stopping"
     SILENT = "its program said nothing for too long"
+    TIME = "it ran for longer than allowed"
     MEMORY = "its program needed more memory than allowed"
 
 
@@ -63,6 +65,7 @@ class Surroundings:
     storage: Storage
     room: Room
     leaving: asyncio.Event
+    memory_limit_bytes: int | None = None
 
     async def lacking_room(self) -> str | None:
         """What lacks room for jobs, in a sentence, or None."""
@@ -106,6 +109,7 @@ class Supervisor:
         self._kill_at = math.inf
         self._news = asyncio.Event()
         self._contact = Contact(attempt, around.settings, since)
+        self._time_up = math.inf
 
     async def run(self) -> None:
         """Work until the job is over, handed back or lost.
@@ -168,6 +172,8 @@ class Supervisor:
             dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
             files = await files_of(connection, job.dataset_id) if job.dataset_id else []
             artifacts = await artifacts_of(connection, job.source_id) if job.source_id else []
+            left = 3600 * settings.max_job_hours - await seconds_spent(connection, job)
+        self._time_up = time.monotonic() + left
         if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
             title = dataset.name
             scene = await asyncio.to_thread(self._workspace.fetch_dataset, dataset.id, files, dataset.name)
@@ -282,8 +288,14 @@ class Supervisor:
             seconds = self._settings.silent_seconds
             message = f"The job's program said nothing for {seconds:g} s and was stopped."
             await self._lose({"type": "silent", "message": message})
+        elif end is End.TIME:
+            message = (
+                f"The job ran for {self._settings.max_job_hours:g} hours, as long as it may; ask for fewer "
+                "iterations or rays, or retry it, which goes on from its checkpoint."
+            )
+            await self._fail({"type": "time_limit", "message": message})
         else:
-            limit = (self._settings.memory_limit_bytes or 0) / 2**30
+            limit = (self._around.memory_limit_bytes or 0) / 2**30
             message = (
                 f"The job needed more than the {limit:.1f} GB of memory that it may use; "
                 "use fewer Gaussians, smaller photographs, or a machine with more."
@@ -346,13 +358,15 @@ class Supervisor:
         self._stop(End.LEAVING)
 
     async def _watch_limits(self, child: ChildProcess) -> None:
-        """Stop a child that is silent or too big, also one that was asked to stop already."""
+        """Stop a child that is silent, late or too big, also one that was asked to stop already."""
         settings, loop = self._settings, asyncio.get_running_loop()
         while True:
             await asyncio.sleep(min(1.0, settings.silent_seconds / 4))
             if time.monotonic() - child.last_heard > settings.silent_seconds:
                 self._stop(End.SILENT)
-            limit = settings.memory_limit_bytes
+            if settings.max_job_hours and time.monotonic() > self._time_up:
+                self._stop(End.TIME)
+            limit = self._around.memory_limit_bytes
             if limit is not None and await loop.run_in_executor(_EYE, child.memory_bytes) > limit:
                 self._stop(End.MEMORY)
 
@@ -370,7 +384,7 @@ class Supervisor:
             return self._contact.late_at
         if end is End.CANCELED:
             return now + min(CANCEL_SECONDS, grace)
-        return now + grace if end is End.LEAVING else now
+        return now + grace if end in (End.LEAVING, End.TIME) else now
 
     async def _said(self, say: Callable[[], Awaitable[T]]) -> T:
         """Write the verdict, trying again for as long as the job is surely ours.

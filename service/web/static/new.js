@@ -1,5 +1,6 @@
 // The page of a new job: photographs are chosen or dropped, sent, and their reconstruction is queued.
 
+import { showEstimates } from "./estimate.js";
 import { followPreset, queueJob, readOptions } from "./options.js";
 import { chosenFiles, droppedFiles, sceneOf } from "./scene_files.js";
 import { Upload } from "./upload.js";
@@ -11,6 +12,7 @@ const drop = find("drop"), known = find("dataset"), start = find("start"), pause
 let scene = null, upload = null;
 
 followPreset(form);
+const estimateAnew = showEstimates(form, find("estimate"), () => ({ scene, dataset: known?.value, queue: find("queue")?.value ?? "cpu" }));
 
 function size(bytes) {
     const units = ["B", "kB", "MB", "GB", "TB"];
@@ -64,6 +66,7 @@ function show() {
         find("label").placeholder = scene.title || "as the folder";
     }
     start.textContent = known?.value && !scene ? "Start" : "Upload and start";
+    estimateAnew();
 }
 
 for (const id of ["pick-folder", "pick-files"]) {

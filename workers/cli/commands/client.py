@@ -124,6 +124,8 @@ def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bo
         click.echo(json.dumps(job, indent=2))
         return
     click.echo(f"{job['kind']} {job['id']}: {job['state']} {_where(job)}".rstrip())
+    if job.get("estimate") and job["state"] in ("queued", "running"):
+        click.echo(f"Estimated when it was asked for: {job['estimate']['text']}, within a factor of two.")
     for note in job.get("notes", ()):
         click.echo(note)
     if job["error"]:

@@ -1,9 +1,19 @@
 """The kinds that octasplat brings."""
 
+from collections.abc import Sequence
 from typing import cast
 
 from pydantic import BaseModel
 
+from engine.train.config import iteration_count, most_gaussians
+from workers.work.kinds.demands import Demand
+from workers.work.kinds.estimates import (
+    Sizes,
+    estimate_reconstruction,
+    estimate_render,
+    rendered_pixels,
+    training_pixels,
+)
 from workers.work.kinds.options import (
     EvaluateOptions,
     ExportJobOptions,
@@ -34,6 +44,10 @@ def register_all() -> None:
             goes_on=_same_training,
             writes=lambda options: cast(ReconstructOptions, options).exports,
             writes_at="exports",
+            demands=_reconstruction_demands,
+            estimate=lambda options, sizes, cores: estimate_reconstruction(
+                cast(ReconstructOptions, options), sizes, cores
+            ),
         )
     )
     register(
@@ -60,6 +74,9 @@ def register_all() -> None:
             resolve=validated(ExportJobOptions),
             writes=lambda options: cast(ExportJobOptions, options).files,
             writes_at="files",
+            demands=lambda options, _sizes: (
+                Demand("files", "exports", len(cast(ExportJobOptions, options).files)),
+            ),
             source_files=("scene.ply", "config.json"),
         )
     )
@@ -72,6 +89,10 @@ def register_all() -> None:
             program="workers.work.programs:render",
             stages=lambda _options: ("render",),
             resolve=validated(RenderJobOptions),
+            demands=_render_demands,
+            estimate=lambda options, sizes, cores: estimate_render(
+                cast(RenderJobOptions, options), sizes, cores
+            ),
             source_files=("scene.ply", "config.json"),
             needs_photographs=lambda _options: True,
         )
@@ -89,6 +110,29 @@ def _settled_poses(options: BaseModel, has_poses: bool) -> BaseModel:
     if cast(ReconstructOptions, options).poses != "missing":
         return options
     return options.model_copy(update={"poses": "given" if has_poses else "auto"})
+
+
+def _reconstruction_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+    asked = cast(ReconstructOptions, options)
+    train = asked.train
+    pixels = training_pixels(asked, sizes)
+    gaussians = most_gaussians(train, pixels)
+    return (
+        Demand("train.iterations", "iterations", iteration_count(train, pixels)),
+        Demand("train.max_gaussians", "gaussians", gaussians),
+        Demand("train.rays", "rays", train.rays),
+        Demand("train.probe_rays", "rays", train.probe_rays),
+        Demand("train.window_rays", "rays", train.window_rays),
+        Demand("train.patch_side", "rays", train.patch_side**2),
+        Demand("max_side", "side_px", asked.max_side or 0),
+        Demand("exports", "exports", len(asked.exports)),
+    )
+
+
+def _render_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+    asked = cast(RenderJobOptions, options)
+    path = "frames" if asked.mode == "turntable" else "max_side"
+    return (Demand(path, "render_pixels", rendered_pixels(asked, sizes)),)
 
 
 def _same_training(before: BaseModel, after: BaseModel) -> bool:

@@ -43,7 +43,7 @@ class ReconstructOptions(ReconstructionConfig):
             features, matching and mapping; ``missing`` does so only where the dataset holds no model.
     """
 
-    exports: tuple[ExportName, ...] = Field(("mesh.ply", "mesh.obj", "mesh.glb"), max_length=20)
+    exports: tuple[ExportName, ...] = Field(("mesh.ply", "mesh.obj", "mesh.glb"), max_length=100)
     poses: Literal["given", "auto", "missing"] = "given"
 
     def config(self) -> ReconstructionConfig:
@@ -69,7 +69,7 @@ class ExportJobOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    files: tuple[ExportName, ...] = Field(min_length=1, max_length=20)
+    files: tuple[ExportName, ...] = Field(min_length=1, max_length=100)
     min_opacity: float = Field(0.0, ge=0, lt=1)
     q: float | None = Field(None, gt=0, le=100)
     sh_pad_degree: int | None = Field(None, ge=0, le=3)

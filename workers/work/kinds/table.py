@@ -1,12 +1,14 @@
 """The table of job kinds."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
 from engine.errors import ConfigError
+from workers.work.kinds.demands import Demand
+from workers.work.kinds.estimates import Estimate, Sizes
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,9 @@ class JobKind:
         goes_on: whether the work that was done with the first options can be gone on with under the second.
         writes: names of the files that it writes in formats of their own, given the options.
         writes_at: where the options name those files.
+        demands: what the options ask for that a service may set a ceiling to, given the photographs' sizes.
+        estimate: time and memory that it takes, given the options, the photographs' sizes and the number of
+            cores; None where nobody knows.
     """
 
     name: str
@@ -48,6 +53,8 @@ class JobKind:
     goes_on: Callable[[BaseModel, BaseModel], bool] = lambda before, after: before == after
     writes: Callable[[BaseModel], tuple[str, ...]] = lambda _options: ()
     writes_at: str = ""
+    demands: Callable[[BaseModel, Sequence[Sizes]], Iterable[Demand]] = lambda _options, _sizes: ()
+    estimate: Callable[[BaseModel, Sequence[Sizes], int], Estimate | None] = lambda _options, _sizes, _n: None
 
     def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> BaseModel:
         """Complete options of a job that is tried again with changes; raises pydantic's ValidationError."""

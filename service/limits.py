@@ -1,0 +1,109 @@
+"""What a job asks for, against the ceilings of the service; and what it will take."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel
+
+from service.auth import Principal
+from service.problems import Problem
+from service.settings import ServiceSettings
+from workers.records.rows import WorkerRow
+from workers.settings import PREFIX
+from workers.work.kinds import JobKind
+from workers.work.kinds.demands import excesses
+from workers.work.kinds.estimates import Estimate, Sizes
+
+
+def check_ceilings(
+    kind: JobKind, options: BaseModel, sizes: Sequence[Sizes], settings: ServiceSettings
+) -> None:
+    """Refuse options that ask for too much.
+
+    Raises:
+        Problem: 422, with each such option and its ceiling.
+    """
+    faults = [
+        {
+            "pointer": f"#/options/{excess.demand.path.replace('.', '/')}",
+            "detail": excess.sentence,
+            "ceiling": excess.ceiling,
+            "setting": f"{PREFIX}MAX_{excess.demand.of.upper()}",
+        }
+        for excess in excesses(kind.demands(options, sizes), settings.ceilings)
+    ]
+    if faults:
+        raise Problem(422, "ceiling", str(faults[0]["detail"]), errors=faults)
+
+
+def check_priority(who: Principal, priority: int, settings: ServiceSettings) -> None:
+    """Keep high priorities for administrators.
+
+    Raises:
+        Problem: 422.
+    """
+    if priority <= settings.max_priority or who.may("admin"):
+        return
+    detail = f"The priority is {priority}; you may give at most {settings.max_priority}, administrators more."
+    setting = f"{PREFIX}MAX_PRIORITY"
+    fault = {
+        "pointer": "#/priority", "detail": detail, "ceiling": settings.max_priority, "setting": setting,
+    }  # fmt: skip
+    raise Problem(422, "ceiling", detail, errors=[fault])
+
+
+def ceilings_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]:
+    """What each option may ask for, of those that say it themselves."""
+    try:
+        options = kind.resolve({})
+    except ValueError:  # something has to be given
+        return {}
+    numbers = [
+        demand for demand in kind.demands(options, ()) if demand.of not in ("exports", "render_pixels")
+    ]
+    return {
+        demand.path: settings.ceilings[demand.of] for demand in numbers if demand.path != "train.patch_side"
+    }
+
+
+def estimate_job(
+    kind: JobKind, options: BaseModel, sizes: Sequence[Sizes], workers: Sequence[WorkerRow]
+) -> Estimate | None:
+    """What a job will take on the best of ``workers``, or where there are none on a machine as this one.
+
+    None where nobody knows, as without any photographs whose sizes are known.
+    """
+    if not sizes:
+        return None
+    return kind.estimate(options, sizes, max(map(_cores, workers), default=os.cpu_count() or 1))
+
+
+def limit_notes(
+    estimate: Mapping[str, Any] | None, workers: Sequence[WorkerRow], settings: ServiceSettings
+) -> list[str]:
+    """What the owner of a job should know that is likely to meet a limit, in sentences."""
+    if estimate is None:
+        return []
+    known = Estimate.model_validate(dict(estimate))
+    notes = []
+    limits = [row.facts.get("memory_limit_bytes") for row in workers]
+    allowed = [int(limit) for limit in limits if isinstance(limit, int)]
+    if allowed and len(allowed) == len(limits) and known.memory_bytes > max(allowed):
+        notes.append(
+            f"It may need {known.memory_bytes / 1e9:.1f} GB of memory, and its workers allow "
+            f"{max(allowed) / 1e9:.1f} GB; ask for fewer Gaussians, rays or pixels."
+        )
+    hours = settings.max_job_hours
+    if hours and known.seconds > 3600 * hours:
+        notes.append(
+            f"It may take {known.seconds / 3600:.0f} hours, and is ended after {hours:g}; ask for less."
+        )
+    return notes
+
+
+def _cores(worker: WorkerRow) -> int:
+    """Cores that one job of a worker has, where it says so."""
+    found = worker.facts.get("threads", worker.facts.get("cores"))
+    cores = found if isinstance(found, int) and found > 0 else 1
+    return max(1, cores // max(1, worker.slots))

@@ -1,0 +1,54 @@
+// What a job would take, asked of the service anew whenever its options change.
+
+import { readOptions } from "./options.js";
+
+const PAUSE_MS = 350;
+
+/**
+ * Shows the estimate of the job that `form` describes in `place`; returns what asks anew.
+ * `chosen` says what the job would work on: {scene, dataset, queue}.
+ */
+export function showEstimates(form, place, chosen) {
+    let timer = 0, latest = 0;
+    const ask = async () => {
+        const number = ++latest;
+        const { scene, dataset, queue } = chosen();
+        const body = { kind: form.dataset.kind, options: readOptions(form), queue };
+        if (scene) body.photographs = await sizesOf(scene);
+        else if (dataset) body.dataset_id = dataset;
+        if (!body.dataset_id && !body.photographs?.length) return show(number, "");
+        const response = await fetch("/v1/estimates", {
+            method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
+        }).catch(() => null);
+        const answer = await response?.json().catch(() => null);
+        if (response?.ok && answer?.estimate) show(number, `This takes ${answer.estimate.text}, within a factor of two.`);
+        else if (response?.status === 422) show(number, [...new Set((answer?.errors ?? []).map((fault) => fault.detail))].join(" ") || answer?.detail);
+        else show(number, "");
+    };
+    const show = (number, text) => {
+        if (number !== latest) return; // another question has been asked since
+        place.textContent = text;
+        place.hidden = !text;
+    };
+    const soon = () => {
+        clearTimeout(timer);
+        timer = setTimeout(ask, PAUSE_MS);
+    };
+    form.addEventListener("input", soon);
+    form.addEventListener("change", soon);
+    return soon;
+}
+
+/** The size of one photograph, taken for that of all; nothing where the browser cannot read it. */
+async function sizesOf(scene) {
+    if (scene.sizes === undefined) {
+        scene.sizes = [];
+        const first = scene.files?.find(({ name }) => /^images\/.*\.(jpe?g|png|webp|bmp)$/i.test(name));
+        const picture = first && await createImageBitmap(first.file).catch(() => null);
+        if (picture) {
+            scene.sizes = [{ width_px: picture.width, height_px: picture.height, count: scene.photographs }];
+            picture.close();
+        }
+    }
+    return scene.sizes;
+}

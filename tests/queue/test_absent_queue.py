@@ -1,0 +1,54 @@
+"""A job in a queue that no worker takes does not wait for ever."""
+
+import asyncio
+
+from workers.queue.attempts import claim
+from workers.queue.jobs import NewJob, create_job, get_job
+from workers.queue.limits import end_abandoned
+from workers.queue.procrastinate_slips import ProcrastinateSlips
+from workers.records.database import open_pool
+from workers.records.ids import new_id
+from workers.records.workers import see_worker
+
+SLIPS = ProcrastinateSlips(stale_seconds=5)
+
+
+def test_only_what_nobody_takes_is_given_up(conninfo: str) -> None:
+    async def what() -> None:
+        async with open_pool(conninfo, max_size=4) as pool:
+
+            async def give_up(hours: float = 1) -> list[str]:
+                ended = await end_abandoned(pool, SLIPS, stale_seconds=20, hours=hours)
+                return [name for name, job in jobs.items() if job.id in ended]
+
+            async with pool.connection() as connection:
+                jobs = {
+                    name: await create_job(connection, SLIPS, NewJob("me", "toy", {}, queue))
+                    for name, queue in (
+                        ("absent", "gpuu"), ("busy", "cpu"), ("runs", "cpu"), ("served", "gpu"),
+                        ("new", "gpuu"),
+                    )
+                }  # fmt: skip
+                await connection.execute(
+                    "UPDATE jobs SET queued_at = now() - interval '2 hours' WHERE id <> %s", [jobs["new"].id]
+                )
+                await see_worker(connection, new_id(), name="w", queues=["gpu"], slots=1, facts={})
+                slip = jobs["runs"].slip
+            assert slip is not None
+            running = await claim(pool, jobs["runs"].id, slip, "w")
+            assert running is not None
+            assert await give_up(hours=0) == []
+            assert await give_up() == ["absent"]
+            async with pool.connection() as connection:
+                job = await get_job(connection, jobs["absent"].id)
+            assert job is not None and job.state == "failed" and job.error is not None and job.slip is None
+            assert job.error["type"] == "no_worker" and "--queues gpuu" in job.error["message"]
+            # A worker that restarts, or is gone for less than the time, gives nothing up.
+            async with pool.connection() as connection:
+                await connection.execute("UPDATE workers SET seen_at = now() - interval '1 minute'")
+                await connection.execute(
+                    "UPDATE jobs SET heartbeat_at = now() - interval '30 minutes' WHERE state = 'running'"
+                )
+            assert await give_up() == ["served"]
+
+    asyncio.run(what())

@@ -1,0 +1,72 @@
+"""Ends of jobs that no worker brings about: how long they have run, and queues that nobody takes."""
+
+import uuid
+
+from psycopg.rows import class_row
+
+from workers.queue.attempts import end_job
+from workers.queue.jobs import get_job
+from workers.queue.port import Slips
+from workers.records.database import Connection, Pool
+from workers.records.rows import TERMINAL, Job
+
+
+async def seconds_spent(connection: Connection, job: Job) -> float:
+    """For how long workers had a job in earlier attempts, since it was accepted or retried by its owner."""
+    cursor = await connection.execute(
+        """
+        SELECT coalesce(sum(extract(epoch FROM ended.at - began.at)), 0)::float8 AS seconds
+        FROM job_events began CROSS JOIN LATERAL (
+            SELECT min(at) AS at FROM job_events
+            WHERE job_id = began.job_id AND id > began.id AND kind = 'state'
+              AND data->>'state' NOT IN ('running', 'canceling')
+        ) ended
+        WHERE began.job_id = %s AND began.kind = 'state' AND began.data->>'state' = 'running'
+          AND began.attempt < %s AND began.id > coalesce((
+            SELECT max(id) FROM job_events
+            WHERE job_id = began.job_id AND kind = 'state' AND data->>'state' = ANY(%s)), 0)
+        """,
+        [job.id, job.attempt, list(TERMINAL)],
+    )
+    row = await cursor.fetchone()
+    return float(row["seconds"]) if row else 0.0
+
+
+async def end_abandoned(pool: Pool, slips: Slips, *, stale_seconds: float, hours: float) -> list[uuid.UUID]:
+    """Fail jobs that have waited for ``hours`` in a queue that no worker has taken for as long.
+
+    Returns:
+        The jobs.
+    """
+    if hours <= 0:
+        return []
+    async with pool.connection() as connection, connection.cursor(row_factory=class_row(Job)) as cursor:
+        await cursor.execute(
+            """
+            SELECT * FROM jobs WHERE state = 'queued' AND queued_at < now() - make_interval(secs => %(limit)s)
+              AND NOT EXISTS (
+                SELECT 1 FROM workers WHERE jobs.queue = ANY(workers.queues)
+                  AND seen_at > now() - make_interval(secs => %(stale)s))
+              AND NOT EXISTS (
+                SELECT 1 FROM jobs others WHERE others.queue = jobs.queue
+                  AND others.heartbeat_at > now() - make_interval(secs => %(limit)s))
+            ORDER BY id LIMIT 1000
+            """,
+            {"limit": 3600 * hours, "stale": stale_seconds},
+        )
+        found = await cursor.fetchall()
+    ended = []
+    for job in found:
+        async with pool.connection() as connection, connection.transaction():
+            now = await get_job(connection, job.id, lock=True)
+            if now is None or now.state != "queued" or now.slip != job.slip:
+                continue
+            if now.slip is not None:
+                await slips.remove(connection, now.slip)
+            message = (
+                f"The job waited for {hours:g} hours in the queue {job.queue}, which no worker takes; start "
+                f"one with octasplat worker --queues {job.queue}, or ask for another queue."
+            )
+            await end_job(connection, now, "failed", {"type": "no_worker", "message": message})
+            ended.append(job.id)
+    return ended

@@ -1,0 +1,3 @@
+-- What a job was reckoned to take when it was accepted.
+
+ALTER TABLE jobs ADD COLUMN estimate jsonb;

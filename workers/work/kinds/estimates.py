@@ -1,0 +1,173 @@
+"""How long a job will take and how much memory, before it is begun; for people, and for ceilings.
+
+The figures come from runs on photographed scenes (``docs/experiments.md``); ``benchmarks/estimates.py``
+compares anew. What the photographs show decides as much as how many they are, so that an estimate is right
+within a factor of two, not better. Imports neither torch nor numba.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pydantic import BaseModel, computed_field
+
+from engine.train.config import TrainConfig, iteration_count, most_gaussians
+from workers.cli.wording import duration
+from workers.work.kinds.options import ReconstructOptions, RenderJobOptions
+
+_START_CPU_SECONDS = 16.0
+_LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
+_LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
+_EVALUATE_CPU_SECONDS_PER_PIXEL = 2.7e-6
+_RENDER_CPU_SECONDS_PER_PIXEL = 1.5e-6
+_RAY_CPU_SECONDS = 5.9e-6
+"""For a ray, forward and backward, of a training that ends with 100,000 Gaussians."""
+_LEAST_RAY_CPU_SECONDS = 1.0e-6
+_RAY_POWER = 0.8
+_FAR_RAY_POWER = 0.45
+"""Powers of the number of Gaussians by which it grows: up to the 200,000 of the runs that it was fitted to,
+and beyond, where an iteration was measured with 100,000 and 1,000,000 (``benchmarks/growth.py``)."""
+_FITTED_GAUSSIANS = 200_000
+_SINGLE_RAY_CPU_SECONDS = 10.8e-6
+"""For a ray that comes alone, as the preset paper has them."""
+_PAPER_GAUSSIANS = 60_000
+"""What clone and split comes to, whatever its cap."""
+_START_BYTES = 300 << 20
+_RAY_BYTES = 21_000
+_PIXEL_BYTES = 250
+"""For a pixel of the largest photograph, when a view is measured."""
+_CORE_POWER = 0.79
+"""Two cores train 1.73 times as fast as one."""
+_TYPICAL_RENDER_GAUSSIANS = 100_000
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Photographs of one size: width and height in px, and how many there are."""
+
+    width_px: int
+    height_px: int
+    count: int
+
+
+class Estimate(BaseModel):
+    """What a job will take, within a factor of two.
+
+    Attributes:
+        cpu_seconds: of all cores together, without finding poses.
+        seconds: by the clock, on so many cores with nothing else to do.
+        cores: of the machine that is reckoned with.
+        memory_bytes: largest private memory of the job's process.
+        finds_poses: whether poses are found first, which takes time that is not in it.
+    """
+
+    cpu_seconds: float
+    seconds: float
+    cores: int
+    memory_bytes: int
+    finds_poses: bool = False
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def text(self) -> str:
+        """The same in words."""
+        cores = f"{self.cores} core{'s' if self.cores > 1 else ''}"
+        poses = ", besides the time to find the poses" if self.finds_poses else ""
+        return (
+            f"about {duration(self.seconds)} on {cores} and {self.memory_bytes / 1e9:.1f} GB of memory{poses}"
+        )
+
+
+def estimate_reconstruction(
+    options: ReconstructOptions, photographs: Sequence[Sizes], cores: int
+) -> Estimate:
+    """The estimate of a reconstruction of these photographs, on a machine of so many cores."""
+    train = options.train
+    shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
+    count = sum(sizes.count for sizes in shrunk)
+    pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+    largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
+    held_out = _held_out(options, count) / max(count, 1)
+    trained_on = training_pixels(options, photographs)
+    iterations = iteration_count(train, trained_on)
+    gaussians = _gaussians(train, trained_on)
+    full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
+    cpu_seconds = (
+        _START_CPU_SECONDS
+        + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels
+        + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.lift_pixels
+        + _EVALUATE_CPU_SECONDS_PER_PIXEL * pixels * held_out
+        + iterations * train.rays * _ray_cpu_seconds(train, gaussians)
+    )
+    memory = (
+        _START_BYTES
+        + _gaussian_bytes(train.sh_degree) * gaussians
+        + _RAY_BYTES * max(train.rays, train.probe_rays)
+        + _PIXEL_BYTES * largest
+    )
+    return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto")
+
+
+def training_pixels(options: ReconstructOptions, photographs: Sequence[Sizes]) -> int:
+    """Pixels of the views that a reconstruction trains on, all of the photographs having poses."""
+    shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
+    count = sum(sizes.count for sizes in shrunk)
+    pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+    return round(pixels * (1 - _held_out(options, count) / max(count, 1)))
+
+
+def estimate_render(options: RenderJobOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
+    """The estimate of new views; of views, all photographs are reckoned with."""
+    pixels = rendered_pixels(options, photographs)
+    cpu_seconds = _START_CPU_SECONDS + _RENDER_CPU_SECONDS_PER_PIXEL * pixels
+    memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
+    return _estimate(cpu_seconds, memory, cores)
+
+
+def rendered_pixels(options: RenderJobOptions, photographs: Sequence[Sizes]) -> int:
+    """Pixels of all images together that a render makes at most."""
+    if options.mode == "turntable":
+        return options.frames * options.width_px * options.height_px
+    shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
+    return sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+
+
+def _estimate(cpu_seconds: float, memory_bytes: float, cores: int, *, finds_poses: bool = False) -> Estimate:
+    return Estimate(
+        cpu_seconds=round(cpu_seconds, 1),
+        seconds=round(cpu_seconds / max(1, cores) ** _CORE_POWER, 1),
+        cores=max(1, cores),
+        memory_bytes=round(memory_bytes),
+        finds_poses=finds_poses,
+    )
+
+
+def _shrunk(sizes: Sizes, max_side: int | None) -> Sizes:
+    longest = max(sizes.width_px, sizes.height_px)
+    if max_side is None or longest <= max_side:
+        return sizes
+    scale = max_side / longest
+    return Sizes(max(1, round(sizes.width_px * scale)), max(1, round(sizes.height_px * scale)), sizes.count)
+
+
+def _held_out(options: ReconstructOptions, count: int) -> int:
+    if options.held_out is not None:
+        return min(len(options.held_out), count)
+    return -(-count // options.test_every) if options.test_every else 0
+
+
+def _gaussians(train: TrainConfig, trained_on: int) -> int:
+    most = most_gaussians(train, trained_on)
+    return min(most, _PAPER_GAUSSIANS) if train.densify.kind == "paper" else most
+
+
+def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
+    if train.window_rays == 1:
+        return _SINGLE_RAY_CPU_SECONDS
+    near, far = min(gaussians, _FITTED_GAUSSIANS) / 1e5, max(gaussians / _FITTED_GAUSSIANS, 1.0)
+    seconds = _RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER
+    return float(max(seconds, _LEAST_RAY_CPU_SECONDS))
+
+
+def _gaussian_bytes(sh_degree: int) -> int:
+    """Parameters, gradients and two moments as float32, and the hierarchy: 789 for degree 2, as measured."""
+    return 197 + 16 * (10 + 3 * (sh_degree + 1) ** 2)
