@@ -156,13 +156,6 @@ def run_scene(output: Path) -> Path:
         raise ConfigError(f"{output / CONFIG} cannot be read ({error}); name the folder of a run.") from None
 
 
-def open_run_dataset(output: Path, *, scene: Path | None = None, threads: int = 0) -> Dataset:
-    """The photographs of a run, as it used them."""
-    return _open_dataset(
-        scene or run_scene(output), output, read_config(output / CONFIG), threads, lambda _event: None
-    )
-
-
 @contextmanager
 def _stage(name: str, tell: Listener, steps: int = 0) -> Iterator[None]:
     tell(StageStarted(name, steps))
