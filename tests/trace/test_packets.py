@@ -20,7 +20,7 @@ from trace_scenes import (
 
 from engine.gaussians.model import concatenate
 from engine.trace.cpu import CpuTracer
-from engine.trace.packets import MAX_RAYS, PacketHits, find_packets
+from engine.trace.cpu.packets import MAX_RAYS, PacketHits, find_packets
 from engine.trace.protocol import HitLists
 
 

@@ -21,7 +21,7 @@ from trace_scenes import (
 )
 
 from engine.gaussians.model import FlatGaussians, concatenate
-from engine.trace.kernels_hit import K
+from engine.trace.cpu.kernels_hit import K
 from engine.trace.protocol import TraceGradients
 
 pytestmark = pytest.mark.usefixtures("both_ways")

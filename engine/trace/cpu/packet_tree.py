@@ -1,9 +1,9 @@
-"""The packets' hierarchy as arrays; :mod:`engine.trace.kernels_tree` says how they are laid out."""
+"""The packets' hierarchy as arrays; :mod:`engine.trace.cpu.kernels_tree` says how they are laid out."""
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from engine.trace.kernels_tree import (
+from engine.trace.cpu.kernels_tree import (
     BOX_ROWS,
     LEAF_ROWS,
     LEFT_OUT,

@@ -8,12 +8,12 @@ from jaxtyping import Float32, Int32
 
 from engine.gaussians.model import FlatGaussians
 from engine.threads import use_threads
-from engine.trace.arrays import aligned_empty, contiguous
-from engine.trace.kernels_hit import RECORD_WORDS
-from engine.trace.kernels_records import refresh_records, write_boxes, write_records
-from engine.trace.packets import PacketHits, PacketTracer, find_packets
+from engine.trace.cpu.kernels_hit import RECORD_WORDS
+from engine.trace.cpu.kernels_records import refresh_records, write_boxes, write_records
+from engine.trace.cpu.memory import aligned_empty, contiguous
+from engine.trace.cpu.packets import PacketHits, PacketTracer, find_packets
+from engine.trace.cpu.single_rays import SingleRayTracer
 from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, TraceResult, TraceSettings
-from engine.trace.single_rays import SingleRayTracer
 
 MAX_RAYS_PER_TRACE = 1 << 28
 WORTH_A_PACKET = 3.0

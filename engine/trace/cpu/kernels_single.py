@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_hit import (
+from engine.trace.cpu.kernels_hit import (
     ALPHA_MAX,
     BUFFER_FULL,
     COUNT,
@@ -20,8 +20,8 @@ from engine.trace.kernels_hit import (
     RECORDS,
     TRANSMITTANCE,
 )
+from engine.trace.cpu.kernels_sh import colour, write_basis
 from engine.trace.kernels_native import call_with_three_pointers, next_from_counter
-from engine.trace.kernels_sh import colour, write_basis
 
 INT32_MAX = 2**31 - 1
 

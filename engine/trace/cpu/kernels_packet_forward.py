@@ -3,9 +3,8 @@
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_footprint import BINS, FRAME_WORDS
-from engine.trace.kernels_native import next_from_counter
-from engine.trace.kernels_packet import (
+from engine.trace.cpu.kernels_footprint import BINS, FRAME_WORDS
+from engine.trace.cpu.kernels_packet import (
     ALPHA_0,
     CHUNK,
     ROWS,
@@ -21,9 +20,10 @@ from engine.trace.kernels_packet import (
     sort_candidates,
     write_rows,
 )
-from engine.trace.kernels_sh import write_basis
-from engine.trace.kernels_simd import float32_bits, float32_from_bits, write_ranks
-from engine.trace.kernels_tree import WIDTH
+from engine.trace.cpu.kernels_sh import write_basis
+from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, write_ranks
+from engine.trace.cpu.kernels_tree import WIDTH
+from engine.trace.kernels_native import next_from_counter
 
 RANKED = 96
 STRIDE = CHUNK // WIDTH

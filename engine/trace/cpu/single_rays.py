@@ -4,12 +4,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from engine.gaussians.model import FlatGaussians
-from engine.trace.arrays import aligned_empty, contiguous, empty_gradients, empty_result, or_zeros
+from engine.trace.cpu.kernels_hit import RAY_WORDS, SCRATCH_WORDS, intersect_octagon, octagon_bounds
+from engine.trace.cpu.kernels_single import trace_rays
+from engine.trace.cpu.kernels_single_backward import gather_gaussians, replay_rays
+from engine.trace.cpu.kernels_sort import sort_by_gaussian
+from engine.trace.cpu.memory import aligned_empty, contiguous, empty_gradients, empty_result, or_zeros
 from engine.trace.embree_library import BoxScene, Device, intersect1_address
-from engine.trace.kernels_backward import gather_gaussians, replay_rays
-from engine.trace.kernels_forward import trace_rays
-from engine.trace.kernels_hit import RAY_WORDS, SCRATCH_WORDS, intersect_octagon, octagon_bounds
-from engine.trace.kernels_sort import sort_by_gaussian
 from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, TraceResult, TraceSettings
 
 MAX_CHUNKS = 1024

@@ -10,10 +10,10 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_hit import NORMAL, OPACITY
+from engine.trace.cpu.kernels_hit import NORMAL, OPACITY
+from engine.trace.cpu.kernels_records import rotation_columns
+from engine.trace.cpu.kernels_sh import write_basis
 from engine.trace.kernels_native import next_from_counter
-from engine.trace.kernels_records import rotation_columns
-from engine.trace.kernels_sh import write_basis
 
 RED_OFF, GREEN_OFF, BLUE_OFF = 1 << 28, 1 << 29, 1 << 30
 """Bits of a hit's ray number: this channel's colour was clamped at zero and gets no gradient."""

@@ -10,9 +10,9 @@ import math
 import numpy as np
 from numba import njit
 
-from engine.trace.kernels_footprint import CELLS, footprints, rays_between, write_bins
-from engine.trace.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
-from engine.trace.kernels_simd import (
+from engine.trace.cpu.kernels_footprint import CELLS, footprints, rays_between, write_bins
+from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
+from engine.trace.cpu.kernels_simd import (
     boxes_in_pyramid,
     ellipses_in_pyramid,
     float32_bits,
@@ -21,7 +21,7 @@ from engine.trace.kernels_simd import (
     meet_block,
     prefetch,
 )
-from engine.trace.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
+from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
 
 STACK = 1024
 # --- rows of a block of eight candidates, float64; u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0 ---
@@ -71,7 +71,7 @@ def make_pyramid(directions, first, last, planes, frame, below):
     """The pyramid around rays ``first`` to ``last``.
 
     Writes its inward normals and its axis to the rows of ``planes``, its ``frame``, and the tables ``below``
-    of its rays (:mod:`engine.trace.kernels_footprint`).
+    of its rays (:mod:`engine.trace.cpu.kernels_footprint`).
     """
     x = y = z = 0.0
     for r in range(first, last):

@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from engine.gaussians.model import FlatGaussians
-from engine.trace.arrays import Scratch, contiguous, empty_gradients, empty_result, or_zeros
-from engine.trace.kernels_packet import packet_starts
-from engine.trace.kernels_packet_backward import ROW_WORDS, replay_packets, sum_packets
-from engine.trace.kernels_packet_forward import trace_packets
-from engine.trace.kernels_sort import sort_by_gaussian
-from engine.trace.packet_tree import PacketTree
+from engine.trace.cpu.kernels_packet import packet_starts
+from engine.trace.cpu.kernels_packet_backward import ROW_WORDS, replay_packets, sum_packets
+from engine.trace.cpu.kernels_packet_forward import trace_packets
+from engine.trace.cpu.kernels_sort import sort_by_gaussian
+from engine.trace.cpu.memory import Scratch, contiguous, empty_gradients, empty_result, or_zeros
+from engine.trace.cpu.packet_tree import PacketTree
 from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, TraceResult, TraceSettings
 
 MAX_RAYS = 64

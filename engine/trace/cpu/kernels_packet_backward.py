@@ -13,12 +13,12 @@ degree 3.
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_backward import write_gradients
+from engine.trace.cpu.kernels_packet import AHEAD, exponential
+from engine.trace.cpu.kernels_records import rotation_columns
+from engine.trace.cpu.kernels_sh import write_basis
+from engine.trace.cpu.kernels_simd import prefetch
+from engine.trace.cpu.kernels_single_backward import write_gradients
 from engine.trace.kernels_native import next_from_counter
-from engine.trace.kernels_packet import AHEAD, exponential
-from engine.trace.kernels_records import rotation_columns
-from engine.trace.kernels_sh import write_basis
-from engine.trace.kernels_simd import prefetch
 
 # --- sums of a packet's rays for one of its Gaussians, float64 scratch ---
 H, HU, HV, HUU, HUV, HVV = range(6)
