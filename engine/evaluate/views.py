@@ -1,7 +1,7 @@
 """Measured views and their summary, as ``metrics.json`` holds them."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
@@ -145,12 +145,6 @@ def measure_view(view: RenderedView) -> MeasuredView:
         psnr_foreground=_psnr_foreground(render, reference, view.weight, view.alpha),
     )
     return MeasuredView(metrics, flip_map)
-
-
-def measure_views(views: Iterable[RenderedView]) -> Iterator[MeasuredView]:
-    """Measure views one by one, so that only one needs to be in memory."""
-    for view in views:
-        yield measure_view(view)
 
 
 def summarise(views: Iterable[ViewMetrics]) -> Metrics:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from scipy.spatial import cKDTree
 
 from engine.surface.mesh import TriangleMesh
@@ -113,17 +113,6 @@ def point_triangle_distances(
         [_to_segment(points, a, b), _to_segment(points, b, c), _to_segment(points, c, a)]
     )
     return np.where(inside, to_plane, to_rim)
-
-
-def seen_from(
-    points_world: Float64[np.ndarray, "n 3"],
-    mesh: TriangleMesh,
-    centre_world: Float64[np.ndarray, "3"],
-) -> Bool[np.ndarray, " n"]:
-    """Whether nothing of the mesh lies between each point and a viewer; lens and image size do not count."""
-    from engine.surface.occlusion import Occluder
-
-    return Occluder(mesh).sees(points_world, np.broadcast_to(centre_world, points_world.shape))
 
 
 def _to_segment(

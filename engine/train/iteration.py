@@ -15,7 +15,7 @@ from engine.trace.sums import add_gradients
 from engine.train.batches import Batch
 from engine.train.config import LossWeights, TrainConfig
 from engine.train.densify import Densifier
-from engine.train.losses import BatchLoss, batch_loss
+from engine.train.losses import BatchLoss, batch_loss, ray_errors
 from engine.train.state import TrainState
 
 RUNNING = 0.98
@@ -49,7 +49,13 @@ class Differentiated:
 
 
 def differentiate(
-    batch: Batch, tracer: Tracer, shading: ShadingModel, weights: LossWeights, *, progress: float
+    batch: Batch,
+    tracer: Tracer,
+    shading: ShadingModel,
+    weights: LossWeights,
+    *,
+    progress: float,
+    with_errors: bool = False,
 ) -> Differentiated:
     """The loss of the Gaussians that ``tracer`` holds, and its gradients; changes nothing.
 
@@ -59,14 +65,18 @@ def differentiate(
         shading: makes photographs of what is traced.
         weights: of the loss terms.
         progress: share of the training that is done.
+        with_errors: share the rays' errors out to their Gaussians.
     """
     seen = tracer.trace(batch.origins_world, batch.directions_world, record=True)
     assert seen.hits is not None
     sight = Sight(batch.origins_world, batch.directions_world, seen, tracer, batch.view, progress)
     developed = shading.develop(sight)
-    loss = batch_loss(developed.over(batch.background_srgb), batch, weights)
+    render = developed.over(batch.background_srgb)
+    loss = batch_loss(render, batch, weights)
     back = shading.reverse(sight, developed, loss.gradient, loss.gradient @ batch.background_srgb)
-    by_seen = replace(back.seen, ray_errors=loss.ray_errors)
+    by_seen = back.seen
+    if with_errors:
+        by_seen = replace(by_seen, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
     recorded = [(seen.hits, by_seen), *back.further]
     return Differentiated(
         loss=loss,
@@ -102,7 +112,10 @@ def iterate(
         TrainingFailure: the loss is no number.
     """
     tracer, shading = machinery.tracer, machinery.shading
-    found = differentiate(batch, tracer, shading, config.loss, progress=progress)
+    densifier = machinery.densifier
+    found = differentiate(
+        batch, tracer, shading, config.loss, progress=progress, with_errors=densifier.wants_errors
+    )
     if not np.isfinite(found.loss.value):
         raise TrainingFailure(
             f"The loss became {found.loss.value} at iteration {state.iteration + 1}; lower the learning "
@@ -114,7 +127,7 @@ def iterate(
     )
     shading.step(state.gaussians, gradients, found.shading, progress=progress)
     tracer.refresh(gradients.ids)
-    machinery.densifier.observe(len(state.gaussians), gradients, moved)
+    densifier.observe(len(state.gaussians), gradients, moved)
     state.iteration += 1
     keep = min(RUNNING, 1 - 1 / state.iteration)
     state.running_mse = keep * state.running_mse + (1 - keep) * found.loss.squared_error

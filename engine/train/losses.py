@@ -65,13 +65,11 @@ class BatchLoss:
         value: the loss.
         gradient: by the colours.
         squared_error: mean over the rays of non-zero weight and the channels.
-        ray_errors: each ray's mean absolute error, for densification.
     """
 
     value: float
     gradient: Float32[np.ndarray, "r 3"]
     squared_error: float
-    ray_errors: Float32[np.ndarray, " r"]
 
 
 def batch_loss(render: Float32[np.ndarray, "r 3"], batch: Batch, weights: LossWeights) -> BatchLoss:
@@ -83,7 +81,16 @@ def batch_loss(render: Float32[np.ndarray, "r 3"], batch: Batch, weights: LossWe
     structure, by_patches = _patch_term(render, target, batch)
     gradient = pixel.gradient.copy()
     gradient[-len(by_patches) :] += np.float32(weights.ssim) * by_patches
-    return BatchLoss(pixel.value + weights.ssim * structure, gradient, pixel.squared_error, pixel.ray_errors)
+    return BatchLoss(pixel.value + weights.ssim * structure, gradient, pixel.squared_error)
+
+
+def ray_errors(
+    render: Float32[np.ndarray, "r 3"],
+    target: Float32[np.ndarray, "r 3"],
+    weight: Float32[np.ndarray, " r"],
+) -> Float32[np.ndarray, " r"]:
+    """Each ray's mean absolute error, 0 without weight, for densification."""
+    return np.asarray((np.abs(render - target) * weight[:, None]).mean(axis=1, dtype=np.float32))
 
 
 def _patch_term(
@@ -117,4 +124,4 @@ def pixel_loss(
     value = l1 * float(absolute.sum(dtype=np.float64)) / (3 * valid) + l2 * mse
     gradient = (np.float32(l1) * np.sign(difference) + np.float32(2 * l2) * difference) * per_ray
     gradient /= np.float32(3 * valid)
-    return BatchLoss(value, gradient.astype(np.float32), mse, absolute.mean(axis=1, dtype=np.float32))
+    return BatchLoss(value, gradient.astype(np.float32), mse)

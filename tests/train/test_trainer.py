@@ -12,7 +12,7 @@ from engine.errors import Cancelled, TrainingFailure
 from engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint, save_best
-from engine.train.config import PaperConfig, TrainConfig
+from engine.train.config import McmcConfig, PaperConfig, TrainConfig
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 
@@ -88,13 +88,17 @@ def test_another_seed_gives_another_scene(
     assert content(train(tmp_path, small_config(seed=1))[0]) != content(whole_run[0])
 
 
-@pytest.mark.parametrize("paper", [False, True])
-def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, paper: bool) -> None:
-    changes = {}
-    if paper:
-        strategy = PaperConfig(start=20, interval=20, stop_fraction=0.9, step_threshold=1e-5)
-        changes = {"densify": strategy.model_dump()}
-    config = small_config(**changes)
+@pytest.mark.parametrize(
+    "strategy",
+    [
+        McmcConfig(start=20, interval=20, growth=0.1),
+        McmcConfig(start=20, interval=20, growth=0.1, error_power=1.0),
+        PaperConfig(start=20, interval=20, stop_fraction=0.9, step_threshold=1e-5),
+    ],
+    ids=["mcmc", "mcmc by error", "paper"],
+)
+def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, strategy: McmcConfig | PaperConfig) -> None:
+    config = small_config(densify=strategy.model_dump())
     expected, _ = train(tmp_path / "whole", config)
     assert len(expected) != 300
     asked = 0

@@ -54,6 +54,7 @@ class Mcmc:
 
     def __init__(self, config: McmcConfig, *, iterations: int, max_gaussians: int) -> None:
         self._config = config
+        self.wants_errors = config.error_power > 0
         self._stop = int(config.stop_fraction * iterations)
         self._cap = max_gaussians
         self._errors: Float32[np.ndarray, " n"] = np.zeros(0, np.float32)
@@ -61,7 +62,9 @@ class Mcmc:
     def observe(
         self, count: int, gradients: GaussianGradients, mean_steps_world: Float32[np.ndarray, "u 3"]
     ) -> None:
-        """Add up the error that is seen through each Gaussian."""
+        """Add up the error that is seen through each Gaussian, where it matters."""
+        if not self.wants_errors:
+            return
         if len(self._errors) != count:
             self._errors = np.zeros(count, np.float32)
         self._errors[gradients.ids] += gradients.error_sums

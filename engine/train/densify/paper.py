@@ -21,6 +21,8 @@ class Paper:
     the opacity after the last densification.
     """
 
+    wants_errors = False
+
     def __init__(self, config: PaperConfig, *, iterations: int, max_gaussians: int) -> None:
         self._config = config
         self._stop = int(config.stop_fraction * iterations)

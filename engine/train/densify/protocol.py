@@ -12,7 +12,13 @@ from engine.train.optimiser import Adam
 
 @runtime_checkable
 class Densifier(Protocol):
-    """Watches the training and changes the set of Gaussians at some iterations."""
+    """Watches the training and changes the set of Gaussians at some iterations.
+
+    Attributes:
+        wants_errors: whether :meth:`observe` looks at the errors seen through each Gaussian.
+    """
+
+    wants_errors: bool
 
     def observe(
         self, count: int, gradients: GaussianGradients, mean_steps_world: Float32[np.ndarray, "u 3"]
