@@ -37,6 +37,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
 from engine.scene import Dataset, write_held_out
 from engine.threads import use_threads
+from engine.trace.protocol import Tracer
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count, most_gaussians
 from engine.train.dense_points import dense_points
@@ -47,6 +48,8 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json",
 )  # fmt: skip
 CHECKPOINTS, CACHE = "checkpoints", "cache"
+Watcher = Callable[[int, Dataset, Tracer], None]
+"""Shown a training between two iterations: iterations done, photographs, and the tracer as it is then."""
 MIN_POINTS = 50
 """Fewer sparse points than this are no use to begin from; random ones are taken."""
 
@@ -60,6 +63,7 @@ def reconstruct(
     threads: int = 0,
     listener: Listener = lambda _event: None,
     should_stop: Callable[[], bool] = lambda: False,
+    watch: Watcher | None = None,
 ) -> Path:
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
@@ -74,6 +78,7 @@ def reconstruct(
         threads: for everything; 0 means all cores.
         listener: hears the events that also go to ``events.jsonl``.
         should_stop: asked now and then; True stops the run after a checkpoint.
+        watch: shown the training after each iteration; it must change nothing.
 
     Raises:
         DatasetError: the photographs or the model cannot be used.
@@ -99,7 +104,7 @@ def reconstruct(
             write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
         if not (output / SCENE).exists():
             with _stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)):
-                gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
+                gaussians = _train(dataset, output, config.train, threads, tell, should_stop, watch)
                 write_gaussian_ply(gaussians, output / SCENE)
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
             with _stage("evaluate", tell, len(dataset.test_indices)):
@@ -251,6 +256,7 @@ def _train(
     threads: int,
     tell: Listener,
     should_stop: Callable[[], bool],
+    watch: Watcher | None,
 ) -> FlatGaussians:
     folder = output / CHECKPOINTS
     fingerprint = _fingerprint(dataset, config)
@@ -267,6 +273,7 @@ def _train(
         listener=tell,
         threads=threads,
         should_stop=should_stop,
+        watch=None if watch is None else lambda iteration, tracer: watch(iteration, dataset, tracer),
     )
     gaussians = trainer.run()
     write_json(output / TRAINING, {"seconds": trainer.state.seconds, "iterations": trainer.state.iteration})

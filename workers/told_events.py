@@ -18,7 +18,6 @@ _KINDS: dict[str, type[Event]] = {
     kind.kind: kind
     for kind in (StageStarted, StageProgress, StageFinished, TrainingProgress, HeldOutMeasured, Warned)
 }
-
 TOLD_KINDS = frozenset({"progress", *_KINDS})
 
 
@@ -31,8 +30,16 @@ def told_event(kind: str, data: Mapping[str, Any]) -> Event | None:
     """
     if kind == "progress":
         kind = TrainingProgress.kind if "iteration" in data else StageProgress.kind
+        if "training_psnr" in data:
+            data = {**data, "psnr": data["training_psnr"]}
     model = _KINDS.get(kind)
     if model is None:
         return None
     names = {field.name for field in fields(model)}
     return model(**{name: data[name] for name in names}) if names <= data.keys() else None
+
+
+def journal_progress(event: Mapping[str, Any]) -> dict[str, Any]:
+    """A training's progress as the journal keeps it: the PSNR of its own rays is called so."""
+    data = {key: value for key, value in event.items() if key != "kind"}
+    return {**data, "training_psnr": data["psnr"]}

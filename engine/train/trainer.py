@@ -78,6 +78,7 @@ class Trainer:
         threads: for everything; 0 means all cores.
         should_stop: asked after each iteration; True ends the run at the next safe iteration.
         tracer: anything that follows the protocol; by default Embree.
+        watch: shown every iteration done and the tracer as it is then, to trace without recording.
 
     Attributes:
         state: where the training stands.
@@ -96,8 +97,10 @@ class Trainer:
         threads: int = 0,
         should_stop: Callable[[], bool] = lambda: False,
         tracer: Tracer | None = None,
+        watch: Callable[[int, Tracer], None] | None = None,
     ) -> None:
         self.state = state
+        self._watch = watch
         self._dataset = dataset
         self._config = config
         self._folder = folder
@@ -193,7 +196,17 @@ class Trainer:
                         seconds_left=pace * (total - state.iteration),
                     )
                 )
+            if not rebuild:
+                began += self._let_watch()
         return self._choose_result()
+
+    def _let_watch(self) -> float:
+        """Let somebody look; returns the seconds that took, which are no training."""
+        if self._watch is None:
+            return 0.0
+        paused = time.perf_counter()
+        self._watch(self.state.iteration, self._tracer)
+        return time.perf_counter() - paused
 
     def _iterate(self) -> float:
         """One iteration; returns the loss."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from engine.config import read_config
-from engine.events import StageProgress, broadcast
+from engine.events import StageProgress
 from engine.export.options import ExportOptions
 from engine.export.registry import export_scene
 from engine.files import write_json
@@ -30,15 +30,15 @@ def reconstruct(task: Task) -> None:
     options = ReconstructOptions.model_validate(task.options)
     config = options.config()
     scene = _scene(task, options.poses)
-    previews = Previews(scene, task.run, config, task.listener)
     reconstruct_scene(
         scene,
         task.run,
         config,
         resume=True,
         threads=task.threads,
-        listener=stopping(broadcast([task.listener, previews]), task.should_stop),
+        listener=stopping(task.listener, task.should_stop),
         should_stop=task.should_stop,
+        watch=Previews(task.run, config.evaluate_background, task.listener),
     )
     for path in sorted(task.run.rglob("*")):
         name = path.relative_to(task.run)
