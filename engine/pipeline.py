@@ -51,6 +51,7 @@ from engine.scene import Dataset, write_held_out
 from engine.scene.views_file import ViewsRecord, read_views, write_views
 from engine.stages import StageClock, stage
 from engine.threads import use_threads
+from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count, trace_settings
@@ -62,6 +63,9 @@ from engine.train.trainer import Trainer
 from engine.versions import versions
 from engine.writing import write_json
 
+Watcher = Callable[[int, Dataset, Tracer], None]
+"""Shown a training between two iterations: iterations done, photographs, and the tracer as it is then."""
+
 
 def reconstruct(
     scene: Path,
@@ -72,6 +76,7 @@ def reconstruct(
     threads: int = 0,
     listener: Listener = lambda _event: None,
     should_stop: Callable[[], bool] = lambda: False,
+    watch: Watcher | None = None,
 ) -> Path:
     """Reconstruct ``scene`` into the folder ``output`` and return it.
 
@@ -86,6 +91,7 @@ def reconstruct(
         threads: for everything; 0 means all cores.
         listener: hears the events that also go to ``events.jsonl``.
         should_stop: asked now and then; True stops the run after a checkpoint.
+        watch: shown the training after each iteration; it must change nothing.
 
     Raises:
         DatasetError: the photographs or the model cannot be used.
@@ -134,7 +140,7 @@ def reconstruct(
                 _write_config(scene, output, config)  # the photographs have moved, or other files are wanted
         if not (output / SCENE).exists():
             with stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)) as clock:
-                gaussians = _train(dataset, output, config.train, threads, tell, should_stop, clock)
+                gaussians = _train(dataset, output, config.train, threads, tell, should_stop, clock, watch)
                 write_gaussian_ply(gaussians, output / SCENE)
         unmeasured: Exception | None = None
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
@@ -280,6 +286,7 @@ def _train(
     tell: Listener,
     should_stop: Callable[[], bool],
     clock: StageClock,
+    watch: Watcher | None,
 ) -> FlatGaussians:
     folder = output / CHECKPOINTS
     fingerprint = run_fingerprint(dataset, config)
@@ -299,6 +306,7 @@ def _train(
         listener=tell,
         threads=threads,
         should_stop=should_stop,
+        onlooker=None if watch is None else lambda iteration, tracer: watch(iteration, dataset, tracer),
     )
     gaussians = trainer.run()
     write_json(output / TRAINING, {"seconds": clock.stop(), "iterations": trainer.state.iteration})

@@ -263,7 +263,8 @@ class JobView(BaseModel):
                     "step": 400,
                     "total_steps": 1500,
                     "seconds_left": 41.2,
-                    "psnr": 25.1,
+                    "psnr": 24.6,
+                    "training_psnr": 25.1,
                     "worker": "host-4711",
                     "queue_position": None,
                     "estimate": {
@@ -305,7 +306,13 @@ class JobView(BaseModel):
     step: int | None
     total_steps: int | None
     seconds_left: float | None = Field(description="Of the stage.")
-    psnr: float | None = Field(description="Of the training so far, dB.")
+    psnr: float | None = Field(
+        description="Of the held-out views, dB: of some of their rays while it trains, the mean over all of "
+        "them once they are measured."
+    )
+    training_psnr: float | None = Field(
+        None, description="Running value over the rays that are trained on, dB; higher than `psnr` as a rule."
+    )
     worker: str | None
     queue_position: int | None = Field(description="Jobs that go before it.")
     estimate: Estimate | None = Field(description="What it was reckoned to take when it was accepted.")

@@ -17,4 +17,12 @@ def told_event(kind: str, data: Mapping[str, Any]) -> Event | None:
     """
     if kind == "progress":
         kind = TrainingProgress.kind if "iteration" in data else StageProgress.kind
+    if kind == TrainingProgress.kind and "training_psnr" in data:
+        data = {**data, "psnr": data["training_psnr"]}
     return event_from(kind, data)
+
+
+def journal_progress(event: Mapping[str, Any]) -> dict[str, Any]:
+    """A training's progress as the journal keeps it: the PSNR of its own rays is called so."""
+    data = {key: value for key, value in event.items() if key != "kind"}
+    return {**data, "training_psnr": data["psnr"]}

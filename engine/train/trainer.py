@@ -34,6 +34,8 @@ class Trainer:
         should_stop: asked wherever a run may stop, see :class:`engine.train.schedule.Schedule`.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: likewise.
+        onlooker: shown the iterations done and the tracer as it is then, after each; it may trace without
+            recording and must change nothing.
 
     Attributes:
         state: where the training stands.
@@ -57,8 +59,10 @@ class Trainer:
         should_stop: Callable[[], bool] = lambda: False,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
+        onlooker: Callable[[int, Tracer], None] | None = None,
     ) -> None:
         self.state = state
+        self._onlooker = onlooker
         self._config = config
         self._folder = folder
         self._fingerprint = fingerprint
@@ -108,6 +112,9 @@ class Trainer:
             stale = schedule.may_densify(state.iteration) and self._densify()
             if schedule.tells(state.iteration):
                 self._report(found, watch, state.iteration - began_at)
+            if self._onlooker is not None and not stale:
+                with watch.held():
+                    self._onlooker(state.iteration, machinery.tracer)
 
     def _build(self) -> None:
         gaussians = self.state.gaussians

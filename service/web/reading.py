@@ -36,7 +36,7 @@ class JobLine:
     Attributes:
         job: the job.
         name: what people call it.
-        psnr: of the held-out views once there is a result, of the training before, dB.
+        psnr: of the held-out views, dB.
         gaussians: how many there are.
         picture: address of a small picture.
     """

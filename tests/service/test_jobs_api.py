@@ -299,10 +299,10 @@ def test_log_timeline_and_stream(talk: Callable[..., None]) -> None:
         attempt = await claimed(service, job)
         await attempt.log([f"line {n}" for n in range(5)])
         page = (await http.get(f"/v1/jobs/{job['id']}/logs?limit=3")).json()
-        assert [line["text"] for line in page["lines"]] == ["line 0", "line 1", "line 2"]
+        assert [line["text"] for line in page["lines"]] == ["Attempt 1 on w", "line 0", "line 1"]
         rest = (await http.get(f"/v1/jobs/{job['id']}/logs", params={"after": page["next"]})).json()
-        assert [line["text"] for line in rest["lines"]] == ["line 3", "line 4"]
-        await attempt.progress(stage="train", step=3, total_steps=9, psnr=20.5, event={"step": 3})
+        assert [line["text"] for line in rest["lines"]] == ["line 2", "line 3", "line 4"]
+        await attempt.progress(stage="train", step=3, total_steps=9, training_psnr=20.5, event={"step": 3})
         await attempt.succeed([])
         timeline = (await http.get(f"/v1/jobs/{job['id']}/timeline")).json()
         kinds = [event["kind"] for event in timeline["events"]]
@@ -315,6 +315,34 @@ def test_log_timeline_and_stream(talk: Callable[..., None]) -> None:
         assert [kind async for kind, _, _ in events_of(later)] == kinds[2:]
         done = await http.get(f"/v1/jobs/{job['id']}/events", headers={"Last-Event-ID": heard[-1][1]})
         assert done.status_code == 204
+
+    talk(conversation)
+
+
+def test_the_psnr_is_that_of_held_out_views(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        job = await new_job(http, service)
+        address = f"/v1/jobs/{job['id']}"
+        attempt = await claimed(service, job)
+
+        async def figures() -> tuple[float | None, float | None]:
+            view = (await http.get(address)).json()
+            (listed,) = (await http.get("/v1/jobs")).json()["jobs"]
+            assert (view["psnr"], view["training_psnr"]) == (listed["psnr"], listed["training_psnr"])
+            return view["psnr"], view["training_psnr"]
+
+        assert await figures() == (None, None)
+        await attempt.progress(stage="train", step=10, total_steps=900, training_psnr=33.19)
+        assert await figures() == (None, 33.19)
+        await attempt.tell("held_out_measured", {"iteration": 20, "psnr": 27.5})
+        await attempt.progress(stage="train", step=20, total_steps=900, training_psnr=34.0)
+        assert await figures() == (27.5, 34.0)
+        await attempt.cancel()
+        answer = await http.post(f"{address}/retry", json={"from": "checkpoint"})
+        assert (answer.json()["psnr"], answer.json()["training_psnr"]) == (27.5, 34.0)
+        attempt = await claimed(service, answer.json())
+        await attempt.succeed([], 28.56)
+        assert await figures() == (28.56, 34.0)
 
     talk(conversation)
 

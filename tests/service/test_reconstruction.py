@@ -117,6 +117,34 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in (*names, *sorted(renders))}
 
 
+def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None:
+    """The log tells what was done, also by lost attempts, and nothing names a path of the machine."""
+    environment = {
+        **os.environ,
+        "OCTASPLAT_SERVER": json.loads((machine.data / "serve.json").read_text())["url"],
+    }
+
+    def command(*arguments: str) -> str:
+        run = [sys.executable, "-m", "workers", *arguments]
+        return subprocess.run(
+            run, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+        ).stdout
+
+    logs = command("logs", job["id"])
+    for line in ("Attempt 1 on", "Lost, and queued again", "Goes on from step", "Loaded 8 photographs in",
+                 "Trained 500 iterations in", "held out", "Exported", "Succeeded"):  # fmt: skip
+        assert line in logs, logs
+    assert f"PSNR {job['psnr']:.2f} dB over held-out views; {job['training_psnr']:.2f} dB" in command(
+        "status", job["id"]
+    )
+    assert f"{job['psnr']:.2f} dB" in command("jobs")
+    timeline = json.dumps(api.get(f"/v1/jobs/{job['id']}/timeline", limit=5000))
+    for text in (logs, timeline, json.dumps(api.get(f"/v1/jobs/{job['id']}/logs"))):
+        assert str(machine.data) not in text and str(ROOT) not in text and sys.prefix not in text
+    previews = [event for event in json.loads(timeline)["events"] if event["kind"] == "preview"]
+    assert previews and all(event["data"]["step"] > 0 for event in previews)
+
+
 def test_everything_is_killed_and_the_result_is_the_same(
     machine: Machine, scene: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -146,8 +174,13 @@ def test_everything_is_killed_and_the_result_is_the_same(
         events = api.get(f"/v1/jobs/{job['id']}/timeline", limit=5000)["events"]
         resumed = [event["data"]["step"] for event in events if event["kind"] == "resumed"]
         assert resumed and min(resumed) >= 25
+        check_what_is_shown(api, machine, done)
         download_results(api, job["id"], tmp_path / "result")
         again = download_results(api, job["id"], tmp_path / "result")
+    metrics = json.loads((tmp_path / "result" / "metrics.json").read_text())
+    assert done["psnr"] == metrics["mean"]["psnr"] and done["training_psnr"] > 0
+    texts = [path.read_text() for name in ("*.json*", "*.html") for path in (tmp_path / "result").glob(name)]
+    assert len(texts) >= 6 and not any(str(machine.data) in text or str(ROOT) in text for text in texts)
     assert contents(tmp_path / "result") == contents(undisturbed)
     assert json.loads((tmp_path / "result" / "config.json").read_text())["scene"] == "scene"
     assert (tmp_path / "result" / "report.html") in again

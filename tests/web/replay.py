@@ -11,6 +11,7 @@ from workers.queue.attempts import Attempt, Result, claim
 from workers.queue.jobs import get_job
 from workers.records.database import open_pool
 from workers.store.local import LocalStorage
+from workers.told_events import journal_progress
 from workers.work.media_types import media_type
 
 LEFT_OUT = ("checkpoints", "cache")
@@ -73,9 +74,16 @@ class Replay:
                         break
                     await attempt.progress(
                         stage=stage, step=event["iteration"], total_steps=event["total_iterations"],
-                        seconds_left=event["seconds_left"], psnr=event["psnr"], event=event,
+                        seconds_left=event["seconds_left"], training_psnr=event["psnr"],
+                        event=journal_progress(event),
                     )  # fmt: skip
-                elif kind in ("stage_started", "stage_finished", "warning", "run_finished"):
+                elif kind in (
+                    "stage_started",
+                    "stage_finished",
+                    "held_out_measured",
+                    "warning",
+                    "run_finished",
+                ):
                     await attempt.tell(kind, event)
             if preview is not None:
                 row = {**preview, "sha256": self.store(Path(preview["path"]))}

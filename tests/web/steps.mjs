@@ -140,11 +140,15 @@ const steps = {
         await page.waitForSelector("#viewer[data-ready=yes]");
         await page.waitForTimeout(700);
         await shot(page, "result");
+        await page.locator("#log-fold summary").click();
+        await page.waitForFunction(() => document.getElementById("log").textContent.includes("Succeeded"));
         const noted = (page) => page.evaluate(() => JSON.parse(sessionStorage.getItem("noted")));
         const { states, stages, curves: live, preview } = await noted(page);
         return {
             states, stages, preview, liveCurves: live, list: (await noted(list)).list,
             curves: await page.locator(".chart canvas").count(),
+            figures: await page.locator(".chart output").allInnerTexts(),
+            log: await page.locator("#log").innerText(),
             view: await brightness(page),
             nameless: [...await nameless(page), ...await nameless(list)],
             overflow: await overflow(page),

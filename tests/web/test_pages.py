@@ -129,6 +129,9 @@ def test_a_job_is_followed_to_its_end(watched: dict[str, Any]) -> None:
     assert watched["list"][-1] == "Done"
     assert watched["stages"], "no stage was shown by its name"
     assert watched["liveCurves"] == 3 and watched["curves"] == 3
+    assert "held-out views" in watched["figures"][0] and "training rays" in watched["figures"][0]
+    assert "Trained 600 iterations in" in watched["log"] and "Attempt 1 on w" in watched["log"]
+    assert watched["preview"]
     assert watched["view"]["deviation"] > 15  # there is a picture in the viewer
     assert watched["nameless"] == []
     assert watched["overflow"] <= 0

@@ -79,7 +79,7 @@ def test_the_log_says_now_and_then_how_far_the_job_is(monkeypatch: pytest.Monkey
         await child.finish()
         return [line for line in journal.lines if "noise" not in line and "(More" not in line]
 
-    state = "24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s"
+    state = "training 24.1 dB, held out 23.0 dB, 32,000 Gaussians, 310k rays/s"
     assert asyncio.run(job()) == [
         "Training",
         f"  450/900: {state}, 0:41 left",

@@ -41,7 +41,7 @@ def rate(per_second: float) -> str:
 
 def training_state(event: TrainingProgress, held_out: HeldOutMeasured | None) -> str:
     """How far the training has come, but for its iterations and the time left."""
-    parts = [f"{event.psnr:.1f} dB"]
+    parts = [f"training {event.psnr:.1f} dB"]
     if held_out is not None:
         parts.append(f"held out {held_out.psnr:.1f} dB")
     parts += [f"{event.gaussians:,} Gaussians", f"{rate(event.rays_per_second)} rays/s"]

@@ -69,8 +69,10 @@ class Attempt:
         return job.state
 
     async def tell(self, kind: str, data: Mapping[str, Any]) -> None:
-        """Add an event to the journal."""
+        """Add an event to the journal; what was measured on held-out views is also the job's PSNR."""
         async with self._fenced() as (connection, job):
+            if kind == "held_out_measured":
+                await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [data["psnr"], job.id])
             await add_event(connection, job.id, job.attempt, kind, self.shown(dict(data)))
 
     async def log(self, lines: Sequence[str]) -> None:
@@ -85,7 +87,7 @@ class Attempt:
         step: int | None,
         total_steps: int | None,
         seconds_left: float | None = None,
-        psnr: float | None = None,
+        training_psnr: float | None = None,
         event: Mapping[str, Any] | None = None,
     ) -> None:
         """Say how far the job is; ``event`` goes to the journal besides."""
@@ -93,10 +95,10 @@ class Attempt:
             await connection.execute(
                 """
                 UPDATE jobs SET stage = %s, step = %s, total_steps = %s, seconds_left = %s,
-                    psnr = coalesce(%s, psnr)
+                    training_psnr = coalesce(%s, training_psnr)
                 WHERE id = %s
                 """,
-                [stage, step, total_steps, seconds_left, psnr, job.id],
+                [stage, step, total_steps, seconds_left, training_psnr, job.id],
             )
             if event is not None:
                 await add_event(connection, job.id, job.attempt, "progress", event)
@@ -131,9 +133,16 @@ class Attempt:
             )
             await add_event(connection, job.id, job.attempt, "preview", preview)
 
-    async def succeed(self, results: Sequence[Result]) -> None:
-        """Publish the results and end the job."""
+    async def succeed(self, results: Sequence[Result], psnr: float | None = None) -> None:
+        """Publish the results and end the job.
+
+        Args:
+            results: all of them.
+            psnr: mean over the held-out views, dB, if they were measured.
+        """
         async with self._fenced() as (connection, job):
+            if psnr is not None:
+                await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [psnr, job.id])
             await _show(connection, job, results)
             await end_job(connection, job, "succeeded", None)
 

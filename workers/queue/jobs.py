@@ -193,6 +193,8 @@ async def retry_job(
             UPDATE jobs SET rescues = 0, error = NULL, stage = NULL, step = NULL, total_steps = NULL,
                 seconds_left = NULL, finished_at = NULL, worker = NULL, expires_at = NULL,
                 checkpoint = CASE WHEN %(fresh)s THEN NULL ELSE checkpoint END,
+                psnr = CASE WHEN %(fresh)s THEN NULL ELSE psnr END,
+                training_psnr = CASE WHEN %(fresh)s THEN NULL ELSE training_psnr END,
                 fresh_after = CASE WHEN %(forget)s THEN attempt ELSE fresh_after END,
                 options = coalesce(%(options)s, options),
                 estimate = CASE WHEN %(options)s::jsonb IS NULL THEN estimate ELSE %(estimate)s END

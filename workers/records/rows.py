@@ -82,7 +82,9 @@ class Job:
         step: steps of the stage that are done.
         total_steps: steps of the stage.
         seconds_left: estimated, of the stage.
-        psnr: training PSNR so far, dB.
+        psnr: of the held-out views: on some of their rays while it trains, of all views once they are
+            measured, dB.
+        training_psnr: running value over the training's own rays, dB.
         worker: name of the worker that has it.
         error: why it failed: ``type``, ``message``.
         checkpoint: manifest of the newest one that is stored.
@@ -119,6 +121,7 @@ class Job:
     total_steps: int | None
     seconds_left: float | None
     psnr: float | None
+    training_psnr: float | None
     worker: str | None
     error: dict[str, Any] | None
     checkpoint: dict[str, Any] | None

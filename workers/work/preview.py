@@ -1,26 +1,28 @@
 """Small pictures of a scene in the making, beside the photographs they answer to."""
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from jaxtyping import Float32
 
-from engine.config import ReconstructionConfig
-from engine.events import CheckpointWritten, Event, Listener, StageFinished
-from engine.gaussians.model import FlatGaussians
+from engine.events import Event, Listener
 from engine.render.images import write_png
-from engine.render.jobs import view_shots
 from engine.render.renderer import background_colour, render_rays
-from engine.scene import SceneModel, load_scene, scene_extent, split_views
-from engine.trace.cpu import CpuTracer
-from engine.train.config import trace_settings
+from engine.scene import Dataset
+from engine.trace.protocol import Tracer
 
 SIDE_PX = 320
+LEAST_SIDE_PX = 96
 FILE = ".preview.png"
-_SHARE_OF_TIME = 0.02
-"""Most of the training's time that pictures may take."""
+EVERY_SECONDS = 12.0
+FIRST_SECONDS = 4.0
+"""The second picture comes so soon after the first, which shows little."""
+SHARE_OF_TIME = 0.02
+"""Pictures are made smaller until they take no more than this share of the time."""
 
 
 @dataclass(frozen=True)
@@ -34,51 +36,59 @@ class PreviewWritten(Event):
 
 
 class Previews:
-    """A listener that renders one view after checkpoints, as often as it takes no more than 2 % of the time.
+    """Watches a training and draws one view of it every few seconds, whatever its checkpoints.
 
-    It reads the checkpoint and has a tracer of its own, so the training is what it would be without.
+    It traces rays with the training's own tracer between two iterations. That changes nothing in it, so the
+    training is what it would be without.
 
     Args:
-        scene: the photographs.
         run: the engine's output folder.
-        config: the run's settings.
+        background: behind the scene, by name.
         listener: told of pictures.
     """
 
-    def __init__(self, scene: Path, run: Path, config: ReconstructionConfig, listener: Listener) -> None:
-        self._scene = scene
+    def __init__(self, run: Path, background: str, listener: Listener) -> None:
         self._run = run
-        self._config = config
+        self._background = background_colour(background)
         self._listener = listener
-        self._began = time.monotonic()
-        self._spent = 0.0
-        self._model: SceneModel | None = None
+        self._side_px = SIDE_PX
+        self._due = -math.inf
+        self._drawn = 0
 
-    def __call__(self, event: Event) -> None:
-        """Hear of a checkpoint."""
-        if isinstance(event, StageFinished) and event.stage == "load":
-            self._began = time.monotonic()
-        if not isinstance(event, CheckpointWritten):
-            return
+    def __call__(self, iteration: int, dataset: Dataset, tracer: Tracer) -> None:
+        """Draw a picture if it is time."""
         began = time.monotonic()
-        if self._spent <= _SHARE_OF_TIME * (began - self._began) or self._spent == 0:
-            self._render(Path(event.path), event.iteration)
-            self._spent += time.monotonic() - began
-
-    def _render(self, checkpoint: Path, iteration: int) -> None:
-        config = self._config
-        if self._model is None:
-            self._model = load_scene(self._scene, max_side=SIDE_PX)
-        model = self._model
-        train, test = split_views([view.name for view in model.views], config.test_every, config.held_out)
-        with checkpoint.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
-            arrays = {n.removeprefix("gaussians."): archive[n] for n in archive.files if n.startswith("gaus")}
-        gaussians = FlatGaussians(**arrays)
-        extent = scene_extent(np.stack([model.views[i].origin_world for i in train]), model.points)
-        tracer = CpuTracer(trace_settings(config.train, extent), threads=1)
-        tracer.build(gaussians)
-        chosen = test if len(test) else train
-        shot = view_shots(model, chosen[:1])[0]
-        image = render_rays(tracer, *shot.rays(), background_colour(config.evaluate_background))
+        if began < self._due:
+            return
+        chosen = int((dataset.test_indices if len(dataset.test_indices) else dataset.train_indices)[0])
+        origin, directions = grid_rays(dataset, chosen, self._side_px)
+        image = render_rays(tracer, origin, directions, self._background)
         write_png(self._run / FILE, image.rgb_srgb)
-        self._listener(PreviewWritten(FILE, iteration, model.views[chosen[0]].name))
+        self._listener(PreviewWritten(FILE, iteration, dataset.views[chosen].name))
+        spent = time.monotonic() - began
+        self._drawn += 1
+        wait = EVERY_SECONDS if self._drawn > 1 else FIRST_SECONDS
+        self._due = began + max(wait, 2 * spent)
+        if spent > 0:
+            fitting_px = self._side_px * math.sqrt(SHARE_OF_TIME * EVERY_SECONDS / spent)
+            self._side_px = int(min(SIDE_PX, max(LEAST_SIDE_PX, fitting_px)))
+
+
+def grid_rays(
+    dataset: Dataset, view: int, side_px: int
+) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]:
+    """Origin and directions, in world coordinates, through evenly spaced pixels of a view.
+
+    Args:
+        dataset: the photographs.
+        view: index of one of them.
+        side_px: about the longer side of the grid; it is never finer than the photograph.
+    """
+    width, height = dataset.views[view].width_px, dataset.views[view].height_px
+    scale = min(1.0, side_px / max(width, height))
+    rows, columns = max(1, round(height * scale)), max(1, round(width * scale))
+    y = ((np.arange(rows) + 0.5) * height / rows).astype(np.int64)
+    x = ((np.arange(columns) + 0.5) * width / columns).astype(np.int64)
+    yy, xx = np.meshgrid(y, x, indexing="ij")
+    origins, directions = dataset.rays(np.full(yy.size, view), yy.ravel(), xx.ravel())
+    return origins[0], directions.reshape(rows, columns, 3)

@@ -11,6 +11,7 @@ from engine.errors import ExportFailed
 from engine.events import Event, StageFinished, StageProgress, broadcast
 from engine.files import ExportOptions
 from engine.files.gaussian_ply import read_gaussian_ply
+from engine.files.options import ExportOptions
 from engine.files.several import export_files
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
@@ -31,7 +32,6 @@ def reconstruct(task: Task) -> None:
     options = ReconstructOptions.model_validate(task.options)
     config = options.config()
     scene = _scene(task, options.poses)
-    previews = Previews(scene, task.run, config, task.listener)
 
     def publish_finished(event: Event) -> None:
         # Whatever becomes of the rest, even if this process is killed.
@@ -45,8 +45,9 @@ def reconstruct(task: Task) -> None:
             config,
             resume=True,
             threads=task.threads,
-            listener=stopping(broadcast([task.listener, previews, publish_finished]), task.should_stop),
+            listener=stopping(broadcast([task.listener, publish_finished]), task.should_stop),
             should_stop=task.should_stop,
+            watch=Previews(task.run, config.evaluate_background, task.listener),
         )
     finally:
         _publish_run(task)

@@ -20,7 +20,7 @@ from workers.cli.progress import PlainLines
 from workers.queue.attempts import Attempt, Fenced
 from workers.queue.storing import storing
 from workers.store.errors import StorageError
-from workers.told_events import told_event
+from workers.told_events import journal_progress, told_event
 from workers.work.task import RUN
 from workers.work.workspace import Checkpoint, Workspace
 
@@ -116,8 +116,8 @@ class Reporter:
                 "step": event["iteration"],
                 "total_steps": event["total_iterations"],
                 "seconds_left": event["seconds_left"],
-                "psnr": event["psnr"],
-                "event": {key: value for key, value in event.items() if key != "kind"},
+                "training_psnr": event["psnr"],
+                "event": journal_progress(event),
             }
         elif kind == "checkpoint_written":
             self._want_checkpoint(event["iteration"])

@@ -141,7 +141,7 @@ class Supervisor:
         try:
             earlier = await asyncio.to_thread(self._workspace.published_before)
             if earlier is not None:
-                await self._said(lambda: self._attempt.succeed(earlier))
+                await self._succeed(earlier)
                 return
             kind = kind_named(self._job.kind)
             task = await self._prepare(kind)
@@ -217,7 +217,11 @@ class Supervisor:
             described = _described(error)
             await self._said(lambda: self._let_go(described))
             return
-        await self._said(lambda: self._attempt.succeed(results))
+        await self._succeed(results)
+
+    async def _succeed(self, results: list[Result]) -> None:
+        psnr = await asyncio.to_thread(self._workspace.measured_psnr, results)
+        await self._said(lambda: self._attempt.succeed(results, psnr))
 
     async def _store_results(self) -> list[Result]:
         """Store the results and publish their manifest, again and again while the job is surely ours."""

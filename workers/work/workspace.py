@@ -2,6 +2,8 @@
 
 import contextlib
 import fcntl
+import json
+import math
 import os
 import re
 import shutil
@@ -27,6 +29,8 @@ _ALWAYS_KEPT = (
     "run/scene.ply", "run/checkpoints/best.npz",
 )  # fmt: skip
 _TRIES = 5
+METRICS = "metrics.json"
+MAX_METRICS_BYTES = 16 << 20
 
 
 @dataclass(frozen=True)
@@ -173,6 +177,17 @@ class Workspace:
         """Store what results there are of a program that failed; its job's row shows them, nothing else."""
         folder = self.folder / RESULTS
         return _results(store_tree(self._storage, folder)) if folder.is_dir() else []
+
+    def measured_psnr(self, results: Sequence[Result]) -> float | None:
+        """Mean PSNR over the held-out views, dB, as the results say; None if they do not."""
+        for result in results:
+            if result.name == METRICS and result.size_bytes <= MAX_METRICS_BYTES:
+                try:
+                    mean = json.loads(b"".join(self._storage.read(result.sha256)))["mean"]["psnr"]
+                except (StorageError, ValueError, TypeError, KeyError):
+                    return None
+                return float(mean) if isinstance(mean, int | float) and math.isfinite(mean) else None
+        return None
 
     def published_before(self) -> list[Result] | None:
         """Results that an earlier attempt published without getting to say so."""

@@ -3,11 +3,13 @@
 import uPlot from "./vendor/uplot.js";
 import { thousands } from "./numbers.js";
 
+// The first of several curves of a chart is the one that is read out.
 const CHARTS = [
-    { key: "psnr", title: "PSNR", unit: "dB", digits: 2 },
-    { key: "loss", title: "Loss", unit: "", digits: 4, logarithmic: true },
-    { key: "gaussians", title: "Gaussians", unit: "", digits: 0 },
+    { title: "PSNR", unit: "dB", digits: 2, curves: [{ key: "held_out_psnr", label: "held-out views", colour: "--accent" }, { key: "training_psnr", label: "training rays", colour: "--soft", dash: [4, 3] }] },
+    { title: "Loss", unit: "", digits: 4, logarithmic: true, curves: [{ key: "loss", label: "loss", colour: "--accent" }] },
+    { title: "Gaussians", unit: "", digits: 0, curves: [{ key: "gaussians", label: "Gaussians", colour: "--accent" }] },
 ];
+const KEYS = CHARTS.flatMap(({ curves }) => curves.map(({ key }) => key));
 const HEIGHT = 170;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const short = new Intl.NumberFormat("en", { notation: "compact", maximumFractionDigits: 1 });
@@ -16,18 +18,37 @@ const short = new Intl.NumberFormat("en", { notation: "compact", maximumFraction
 export class Training {
     constructor() {
         this.iterations = [];
-        this.values = Object.fromEntries(CHARTS.map(({ key }) => [key, []]));
+        this.values = Object.fromEntries(KEYS.map((key) => [key, []]));
     }
 
     add(event) {
         if (typeof event.iteration !== "number" || typeof event.loss !== "number") return false;
-        while (this.iterations.length && this.iterations.at(-1) >= event.iteration) {
-            this.iterations.pop();
-            CHARTS.forEach(({ key }) => this.values[key].pop());
-        }
-        this.iterations.push(event.iteration);
-        CHARTS.forEach(({ key }) => this.values[key].push(event[key] ?? null));
+        // Records of earlier versions call the training's figure psnr.
+        const { loss, gaussians, training_psnr = event.psnr } = event;
+        this.put(event.iteration, { loss, gaussians, training_psnr });
         return true;
+    }
+
+    addHeldOut({ iteration, psnr }) {
+        if (typeof iteration !== "number" || typeof psnr !== "number") return false;
+        this.put(iteration, { held_out_psnr: psnr });
+        return true;
+    }
+
+    put(iteration, values) {
+        while (this.iterations.length && this.iterations.at(-1) > iteration) {
+            this.iterations.pop();
+            KEYS.forEach((key) => this.values[key].pop());
+        }
+        if (this.iterations.at(-1) !== iteration) {
+            this.iterations.push(iteration);
+            KEYS.forEach((key) => this.values[key].push(null));
+        }
+        for (const [key, value] of Object.entries(values)) this.values[key][this.iterations.length - 1] = value ?? null;
+    }
+
+    data({ curves }) {
+        return [this.iterations, ...curves.map(({ key }) => this.values[key])];
     }
 }
 
@@ -45,7 +66,7 @@ export class Charts {
         if (this.training.iterations.length < 2) return;
         if (!this.plots.length) this.build();
         this.plots.forEach(({ plot, chart, output }) => {
-            plot.setData([this.training.iterations, this.training.values[chart.key]]);
+            plot.setData(this.training.data(chart));
             this.say(output, chart, null);
         });
     }
@@ -72,20 +93,35 @@ export class Charts {
                     { ...axis, size: 26, values: (_, ticks) => ticks.map((tick) => short.format(tick)) },
                     { ...axis, size: 44, values: (_, ticks) => ticks.map((tick) => tick === null ? "" : chart.logarithmic ? String(Number(tick.toPrecision(1))) : short.format(tick)) },
                 ],
-                series: [{}, { stroke: colour("--accent"), width: 1.8, points: { show: false } }],
+                series: [{}, ...chart.curves.map((curve) => ({ label: curve.label, stroke: colour(curve.colour), width: 1.8, dash: curve.dash, spanGaps: true, points: { show: false } }))],
                 hooks: { setCursor: [(self) => this.say(output, chart, self.cursor.idx)] },
-            }, [this.training.iterations, this.training.values[chart.key]], card);
+            }, this.training.data(chart), card);
             plot.root.setAttribute("role", "img");
-            plot.root.setAttribute("aria-label", `${chart.title} over the iterations`);
+            const labels = chart.curves.length > 1 ? ` of ${chart.curves.map(({ label }) => label).join(" and ")}` : "";
+            plot.root.setAttribute("aria-label", `${chart.title}${labels} over the iterations`);
             this.say(output, chart, null);
             return { plot, chart, output, card };
         });
     }
 
+    /** Writes the values at a point, or the newest ones, beside the title; with several curves, under their names. */
     say(output, chart, index) {
-        const at = index ?? this.training.iterations.length - 1;
-        const value = this.training.values[chart.key][at];
-        output.textContent = value == null ? "" : `${thousands(value, chart.digits)} at ${thousands(this.training.iterations[at])}`;
+        const last = this.training.iterations.length - 1;
+        const parts = chart.curves.map(({ key, label, colour, dash }) => {
+            const values = this.training.values[key];
+            let at = index ?? last;
+            while (at >= 0 && values[at] == null) at -= 1; // not every point has every value
+            if (at < 0) return null;
+            const part = document.createElement("span");
+            if (chart.curves.length > 1) {
+                const line = Object.assign(document.createElement("i"), { className: dash ? "curve dashed" : "curve" });
+                line.style.color = `var(${colour})`;
+                part.append(line, `${label} `);
+            }
+            part.append(`${thousands(values[at], chart.digits)} at ${thousands(this.training.iterations[at])}`);
+            return part;
+        });
+        output.replaceChildren(...parts.filter((part) => part !== null));
     }
 
     resize() {

@@ -50,8 +50,12 @@ function showProgress(event) {
     const name = text.querySelector("b");
     if (event.stage && name) name.textContent = event.stage;
     if (name) text.replaceChildren(name, ` ${thousands(step)}/${thousands(total)}${left}`);
-    if (event.psnr != null) document.getElementById("live-psnr")?.replaceChildren(event.psnr.toFixed(2), Object.assign(document.createElement("small"), { textContent: " dB" }));
+    showDecibels("live-training-psnr", event.training_psnr);
     if (event.gaussians != null) document.getElementById("live-gaussians")?.replaceChildren(thousands(event.gaussians));
+}
+
+function showDecibels(id, value) {
+    if (value != null) document.getElementById(id)?.replaceChildren(value.toFixed(2), Object.assign(document.createElement("small"), { textContent: " dB" }));
 }
 
 function duration(seconds) {
@@ -68,6 +72,9 @@ function hear(kind, data, id, isNew) {
     if (kind === "progress") {
         if (training.add(data)) redraw();
         if (isNew) showProgress(data);
+    } else if (kind === "held_out_measured") {
+        if (training.addHeldOut(data)) redraw();
+        if (isNew) showDecibels("live-psnr", data.psnr);
     } else if (kind === "preview" && isNew) showPreview(data);
     else if (kind === "state" && isNew && isOver(data.state)) location.reload();
     else if (isNew) refresh();

@@ -103,7 +103,8 @@ def jobs(state: tuple[str, ...], limit: int, server: str | None) -> None:
     if not found:
         click.echo("No jobs.")
     for job in found:
-        click.echo(f"{job['id']}  {job['state']:9}  {job['kind']:11}  {_where(job):22}  {job['label'] or ''}")
+        line = f"{job['id']}  {job['state']:9}  {job['kind']:11}  {_where(job):22}  {_decibels(job):8}"
+        click.echo(f"{line}  {job['label'] or ''}".rstrip())
 
 
 @click.command(short_help="Show a job, or wait for it.")
@@ -128,6 +129,10 @@ def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bo
         click.echo(f"Estimated when it was asked for: {job['estimate']['text']}, within a factor of two.")
     for note in job.get("notes", ()):
         click.echo(note)
+    if job["psnr"] is not None:
+        training = job.get("training_psnr")
+        rest = f"; {training:.2f} dB over the training's own rays" if training is not None else ""
+        click.echo(f"PSNR {_decibels(job)} over held-out views{rest}")
     if job["error"]:
         click.echo(job["error"]["message"])
 
@@ -241,6 +246,11 @@ def _job(api: "Api", job_id: str) -> dict[str, Any]:
         raise ConfigError("There are no jobs.")
     first: dict[str, Any] = newest[0]
     return first
+
+
+def _decibels(job: dict[str, Any]) -> str:
+    """The PSNR over held-out views."""
+    return "" if job["psnr"] is None else f"{job['psnr']:.2f} dB"
 
 
 def _clock(at: str) -> str:

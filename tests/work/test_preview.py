@@ -1,0 +1,118 @@
+"""Pictures of a training come every few seconds, cost little and change nothing."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from engine.config import ReconstructionConfig
+from engine.events import Event
+from engine.pipeline import Watcher, reconstruct
+from engine.scene import Dataset
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.trace.protocol import Tracer
+from workers.work import preview
+from workers.work.kinds.options import resolve_reconstruction
+from workers.work.preview import Previews, PreviewWritten
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(preview, "time", SimpleNamespace(monotonic=clock.monotonic))
+    return clock
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("watched") / "scene"
+    write_generated_scene(
+        root, GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+    )
+    return root
+
+
+def config() -> ReconstructionConfig:
+    train = {
+        "iterations": 60, "rays": 256, "sh_degree": 1, "max_gaussians": 500, "initial_points": 300,
+        "rebuild_every": 20, "checkpoint_every": 1000, "fit_iterations": 10, "probe_rays": 256,
+        "densify": {"interval": 10, "start": 10},
+    }  # fmt: skip
+    return resolve_reconstruction({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()
+
+
+def watched(clock: Clock, previews: Previews, seconds: float) -> Watcher:
+    """Every iteration takes so many seconds."""
+
+    def watch(iteration: int, dataset: Dataset, tracer: Tracer) -> None:
+        clock.now += seconds
+        previews(iteration, dataset, tracer)
+
+    return watch
+
+
+def told_steps(run: Path, told: list[Event]) -> list[int]:
+    found = [event for event in told if isinstance(event, PreviewWritten)]
+    assert all((run / event.path).is_file() and event.view == "view_000.png" for event in found)
+    return [event.step for event in found]
+
+
+def test_pictures_come_between_checkpoints_and_change_nothing(
+    scene: Path, tmp_path: Path, clock: Clock
+) -> None:
+    whole = reconstruct(scene, tmp_path / "whole", config(), threads=1)
+    told: list[Event] = []
+    run = tmp_path / "run"
+    watch = watched(clock, Previews(run, "black", told.append), 1.0)
+    reconstruct(scene, run, config(), threads=1, watch=watch)
+    # At once, after 4 s, and then every 12 s; one that falls on a densification waits for the next iteration.
+    steps = told_steps(run, told)
+    assert len(steps) == 6 and steps[0] == 1
+    assert all(12 <= b - a <= 14 for a, b in pairwise(steps[1:]))
+    drawn_often = tmp_path / "often"
+    watch = watched(clock, Previews(drawn_often, "black", lambda _event: None), 60.0)
+    reconstruct(scene, drawn_often, config(), threads=1, watch=watch)
+    for name in ("scene.ply", "mesh.ply", "checkpoints/best.npz", "renders/view_000.png"):
+        expected = (whole / name).read_bytes()
+        assert (run / name).read_bytes() == expected and (drawn_often / name).read_bytes() == expected
+
+
+@pytest.mark.parametrize(("seconds_per_ray", "least_side_px"), [(1e-9, 320), (2e-5, 120), (1e-2, 96)])
+def test_pictures_become_smaller_where_they_take_long(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, seconds_per_ray: float, least_side_px: int
+) -> None:
+    """A picture takes at most 2 % of 12 s, or is as small as pictures become."""
+
+    def rays(view: np.ndarray, _y: np.ndarray, _x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((len(view), 3), np.float32), np.zeros((len(view), 3), np.float32)
+
+    def render(_tracer: None, _origin: np.ndarray, directions: np.ndarray, _background: np.ndarray) -> Any:
+        clock.now += seconds_per_ray * directions.size / 3
+        return SimpleNamespace(rgb_srgb=directions)
+
+    monkeypatch.setattr(preview, "render_rays", render)
+    view = SimpleNamespace(name="a.jpg", width_px=1600, height_px=1200)
+    dataset = SimpleNamespace(views=(view,), test_indices=np.array([0]), rays=rays)
+    draw: Callable[..., None] = Previews(tmp_path, "black", lambda _event: None)
+    for iteration in range(4):
+        draw(iteration, dataset, None)
+        clock.now += 1000
+    with Image.open(tmp_path / preview.FILE) as picture:
+        width, height = picture.size
+    assert least_side_px <= width <= 320 and abs(width * 0.75 - height) <= 1
+    assert width == 96 or seconds_per_ray * width * height <= 0.25
