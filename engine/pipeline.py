@@ -30,7 +30,7 @@ from engine.events import (
     Warned,
     broadcast,
 )
-from engine.files import ExportOptions, export_scene
+from engine.files import ExportOptions, export_scene, lost_channels
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.gaussians.model import FlatGaussians
 from engine.scene import Dataset, write_held_out
@@ -350,5 +350,7 @@ def _export(output: Path, config: ReconstructionConfig, tell: Listener) -> None:
     gaussians, _ = read_gaussian_ply(output / SCENE)
     options = ExportOptions(q=config.train.trace.q)
     for done, name in enumerate(missing, start=1):
+        if text := lost_channels(gaussians, output / name):
+            tell(Warned(text))
         export_scene(gaussians, output / name, options)
         tell(StageProgress("export", done, len(missing)))

@@ -6,11 +6,13 @@ import zipfile
 import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from engine.errors import CheckpointError, DamagedCheckpoint
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.rows import from_row_arrays, row_arrays
 from engine.train.exposure import Exposures
 from engine.train.optimiser import Adam
 from engine.writing import replacing
@@ -83,8 +85,10 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
         "best_iteration": state.best_iteration,
     }
-    arrays = {f"gaussians.{f.name}": getattr(state.gaussians, f.name) for f in fields(FlatGaussians)}
-    arrays |= {f"adam.{f.name}": getattr(state.adam, f.name) for f in fields(Adam)}
+    arrays: dict[str, Any] = {
+        f"gaussians.{name}": array for name, array in row_arrays(state.gaussians).items()
+    }
+    arrays |= {f"adam.{name}": array for name, array in row_arrays(state.adam).items()}
     arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
     if state.exposures is not None:
         arrays |= {f"exposures.{f.name}": getattr(state.exposures, f.name) for f in fields(Exposures)}
@@ -128,8 +132,8 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
     rng.bit_generator.state = meta["rng"]
     return TrainState(
         iteration=meta["iteration"],
-        gaussians=FlatGaussians(**groups["gaussians"]),
-        adam=Adam(**groups["adam"]),
+        gaussians=from_row_arrays(FlatGaussians, groups["gaussians"]),
+        adam=from_row_arrays(Adam, groups["adam"]),
         rng=rng,
         densifier=groups["densifier"],
         seconds=meta["seconds"],
@@ -143,7 +147,8 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
 def save_best(gaussians: FlatGaussians, folder: Path) -> None:
     """Write the Gaussians that did best so far to ``best.npz``."""
     with replacing(folder / "best.npz") as temporary:
-        np.savez(temporary, **{f.name: getattr(gaussians, f.name) for f in fields(FlatGaussians)})
+        arrays: dict[str, Any] = {**row_arrays(gaussians)}
+        np.savez(temporary, **arrays)
 
 
 def load_best(folder: Path) -> FlatGaussians:
@@ -154,7 +159,7 @@ def load_best(folder: Path) -> FlatGaussians:
     """
     path = folder / "best.npz"
     try:
-        return FlatGaussians(**_read_arrays(path))
+        return from_row_arrays(FlatGaussians, _read_arrays(path))
     except _DAMAGE as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None
 

@@ -10,6 +10,7 @@ import numpy as np
 from engine.config import ReconstructionConfig
 from engine.events import CheckpointWritten, Event, Listener, StageFinished
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.rows import from_row_arrays
 from engine.render.images import write_png
 from engine.render.jobs import view_shots
 from engine.render.renderer import background_colour, render_rays
@@ -73,7 +74,7 @@ class Previews:
         train, test = split_views([view.name for view in model.views], config.test_every, config.held_out)
         with checkpoint.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:
             arrays = {n.removeprefix("gaussians."): archive[n] for n in archive.files if n.startswith("gaus")}
-        gaussians = FlatGaussians(**arrays)
+        gaussians = from_row_arrays(FlatGaussians, arrays)
         extent = scene_extent(np.stack([model.views[i].origin_world for i in train]), model.points)
         tracer = CpuTracer(trace_settings(config.train, extent), threads=1)
         tracer.build(gaussians)

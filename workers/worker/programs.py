@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from engine.config import read_config
-from engine.events import StageProgress, broadcast
-from engine.files import ExportOptions, export_scene
+from engine.events import StageProgress, Warned, broadcast
+from engine.files import ExportOptions, export_scene, lost_channels
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.pipeline import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.pipeline import evaluate as evaluate_run
@@ -69,6 +69,8 @@ def export(task: Task) -> None:
     tell = stopping(task.listener, task.should_stop)
     with staged("export", tell, len(options.files)):
         for done, name in enumerate(options.files, start=1):
+            if text := lost_channels(gaussians, task.results / name):
+                tell(Warned(text))
             export_scene(gaussians, task.results / name, settings)
             tell(StageProgress("export", done, len(options.files)))
 
