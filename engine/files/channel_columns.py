@@ -20,7 +20,7 @@ def chosen_columns(
     Args:
         path: named in errors.
         declared: the channels that the file itself names, with their columns; passed over where one of those
-            is missing.
+            is missing or means something else.
         columns: all that the file has, in its order.
         choice: what is wanted.
 
@@ -28,7 +28,9 @@ def chosen_columns(
         SceneFileError: a channel that was asked for by name is not there.
     """
     every = list(columns)
-    own = {name: named for name, named in declared.items() if set(named) <= set(every)}
+    own = {
+        name: named for name, named in declared.items() if set(named) <= set(every) and is_usable(name, named)
+    }
     taken = {column for named in own.values() for column in named}
     rest = grouped(column for column in every if column not in taken)
     known = {**own, **{name: named for name, named in rest.items() if is_usable(name, named)}}

@@ -26,8 +26,8 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _NUMBERED = re.compile(r"(.+)_(0|[1-9]\d*)")
 
 
-class Channels(Mapping[str, Float32[np.ndarray, "n f"]]):
-    """Channels by name, in the order in which they were set.
+class Channels(Mapping[str, np.ndarray]):
+    """Arrays of shape (n, f) by name, in the order in which they were set.
 
     The set of names never changes; the numbers may be written to, as those of any other parameter.
 
@@ -36,7 +36,7 @@ class Channels(Mapping[str, Float32[np.ndarray, "n f"]]):
     {'albedo': 3, 'metallic': 1}
     """
 
-    def __init__(self, arrays: Mapping[str, Float32[np.ndarray, "n f"]] | None = None) -> None:
+    def __init__(self, arrays: Mapping[str, np.ndarray] | None = None) -> None:
         """Take over ``arrays``, which are not copied.
 
         Raises:

@@ -34,8 +34,8 @@ class GaussianCloud:
         opacity_logits: opacity is their sigmoid; infinite where it is 0 or 1.
         sh: coefficients of the display colour, coefficient-major, as in
             :class:`engine.gaussians.model.FlatGaussians`.
-        channels: what else is known of each, by name.
         notes: what the reader of the file left out or had to assume, one sentence each.
+        channels: what else is known of each, by name.
     """
 
     means_world: Float32[np.ndarray, "n 3"]
@@ -43,8 +43,8 @@ class GaussianCloud:
     log_scales: Float32[np.ndarray, "n s"]
     opacity_logits: Float32[np.ndarray, " n"]
     sh: Float32[np.ndarray, "n k 3"]
-    channels: Channels = field(default_factory=Channels)
     notes: tuple[str, ...] = ()
+    channels: Channels = field(default_factory=Channels)
 
     def __post_init__(self) -> None:
         """Make sure that channels have as many rows as there are Gaussians."""

@@ -88,8 +88,16 @@ class FlatGaussians:
         """The same Gaussians, not copied, with the constant colour only and no channels."""
         return replace(self, sh=self.sh[:, :1], channels=Channels())
 
-    def with_channels(self, channels: Mapping[str, Float32[np.ndarray, "n f"]]) -> "FlatGaussians":
-        """The same Gaussians, not copied, with ``channels`` added, or replaced where the name is taken."""
+    def with_channels(self, channels: Mapping[str, np.ndarray]) -> "FlatGaussians":
+        """The same Gaussians, not copied, with ``channels`` added, or replaced where the name is taken.
+
+        Args:
+            channels: float32 arrays of shape (n, f), not copied either.
+
+        Raises:
+            ConfigError: a name cannot be used.
+            ValueError: an array has another type or shape.
+        """
         return replace(self, channels=Channels({**self.channels, **channels}))
 
     def without_channels(self, names: Sequence[str]) -> "FlatGaussians":

@@ -6,7 +6,7 @@ have no rows. No operation lists fields, so that none can forget one.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, fields, replace
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from engine.gaussians.channels import Channels
 Index = np.ndarray | slice
 
 
+@runtime_checkable
 class Table(Protocol):
     """Any dataclass."""
 
@@ -36,7 +37,7 @@ def row_arrays(table: Table) -> dict[str, np.ndarray]:
     return arrays
 
 
-def from_row_arrays(kind: type[T], arrays: Mapping[str, np.ndarray]) -> T:
+def from_row_arrays(kind: Callable[..., T], arrays: Mapping[str, np.ndarray]) -> T:
     """A table made of the arrays that :func:`row_arrays` gave; everything else has its default."""
     values: dict[str, Any] = {}
     channels: dict[str, dict[str, np.ndarray]] = {}
