@@ -359,5 +359,10 @@ def _export(output: Path, config: ReconstructionConfig, tell: Listener) -> str |
     gaussians, _ = read_gaussian_ply(output / SCENE)
     options = ExportOptions(q=config.train.trace.q)
     return export_files(
-        gaussians, output, missing, options, lambda done: tell(StageProgress("export", done, len(missing)))
+        gaussians,
+        output,
+        missing,
+        options,
+        on_done=lambda done: tell(StageProgress("export", done, len(missing))),
+        on_loss=lambda text: tell(Warned(text)),
     )

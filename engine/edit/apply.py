@@ -1,7 +1,6 @@
 """Gaussians with new centres and legs, block by block: large scenes need little memory beside themselves."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -18,11 +17,6 @@ def blocks(count: int, rows_at_once: int = ROWS_AT_ONCE) -> Iterator[slice]:
     """Slices that cover ``count`` rows in order."""
     for start in range(0, count, rows_at_once):
         yield slice(start, min(start + rows_at_once, count))
-
-
-def without_harmonics(gaussians: FlatGaussians) -> FlatGaussians:
-    """The same Gaussians, not copied, with the constant colour only: geometry needs no more."""
-    return replace(gaussians, sh=gaussians.sh[:, :1])
 
 
 def apply_legs(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from engine.edit.apply import apply_legs_to, blocks, without_harmonics
+from engine.edit.apply import apply_legs_to, blocks
 from engine.edit.local_maps import has_area, legs_world
 from engine.edit.octagon_fit import fit_octagons
 from engine.gaussians.model import FlatGaussians
@@ -52,7 +52,7 @@ def deformation_corners(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 8 3"
     An octagon of radius sqrt(2) standard deviations, whatever the opacity; its mean is the centre.
     """
     corners = np.empty((len(gaussians), SIDES, 3))
-    geometry = without_harmonics(gaussians)
+    geometry = gaussians.bare()
     for block in blocks(len(gaussians)):
         part = geometry.select(block)
         spokes = np.einsum("kc,nic->nki", CUBATURE_RADIUS * corner_directions(), legs_world(part))
@@ -102,7 +102,7 @@ def deform_to(
     means, legs = np.empty((count, 3)), np.empty((count, 3, 2))
     unmoved, collapsed = np.empty(count, dtype=bool), np.empty(count, dtype=bool)
     residuals = np.empty(count)
-    geometry = without_harmonics(gaussians)
+    geometry = gaussians.bare()
     for block in blocks(count):
         moved = moved_world[block].astype(np.float64)
         moves = moved - corners_world[block]

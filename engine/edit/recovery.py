@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from pydantic import BaseModel, ConfigDict, Field
 
-from engine.edit.apply import apply_legs_to, blocks, without_harmonics
+from engine.edit.apply import apply_legs_to, blocks
 from engine.edit.axes import TURNS, Axes, detect_axes, infer_q, usual_axes
 from engine.edit.local_maps import has_area, legs_world, solid_derivatives
 from engine.edit.matching import Octagons, match_octagons
@@ -146,7 +146,7 @@ def recover_edit(
     octagons = match_octagons(path, mesh, opacities, radii)
     file_rounding = mesh.rounding
     del mesh  # the largest thing around, where the caller keeps it no longer
-    geometry = without_harmonics(gaussians)
+    geometry = gaussians.bare()
     report = EditReport(len(gaussians), matched_by=octagons.matched_by, axes_usual=usual_axes(path), q=q)
     if options.axes == "auto":
         some = np.unique(np.linspace(0, len(octagons) - 1, AXES_SAMPLES).astype(np.int64))
@@ -307,7 +307,7 @@ def _assemble(
     # Rows: octagons, then the Gaussians that never had one.
     rest = np.flatnonzero(never)
     pool = originals[recovered.readable[originals]]
-    base = concatenate([old.select(unreadable), without_harmonics(gaussians).select(rest)])
+    base = concatenate([old.select(unreadable), gaussians.bare().select(rest)])
 
     def derivatives_of(known: Int64[np.ndarray, " k"]) -> Float64[np.ndarray, "k 3 3"]:
         rows = pool[known]

@@ -1,11 +1,13 @@
 """Parts of a scene, and scenes put together."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from engine.errors import ConfigError
+from engine.gaussians.channels import common_widths
 from engine.gaussians.model import FlatGaussians, concatenate
 
 
@@ -53,9 +55,21 @@ def with_sh_degree(gaussians: FlatGaussians, degree: int) -> FlatGaussians:
 def merge(scenes: Sequence[FlatGaussians], sh_degree: int | None = None) -> FlatGaussians:
     """All Gaussians of ``scenes``, in order, with harmonics of one degree.
 
+    The result has the channels of all scenes; Gaussians of a scene without one have 0 there
+    (:data:`engine.gaussians.channels.FILL`).
+
     Args:
         scenes: at least one.
         sh_degree: of the result; None takes the highest among the scenes, so that nothing is lost.
+
+    Raises:
+        ConfigError: two scenes have a channel of one name and different widths.
     """
     degree = max(scene.sh_degree for scene in scenes) if sh_degree is None else sh_degree
-    return concatenate([with_sh_degree(scene, degree) for scene in scenes])
+    widths = common_widths(scene.channels for scene in scenes)
+    return concatenate(
+        [
+            replace(with_sh_degree(scene, degree), channels=scene.channels.completed(widths, len(scene)))
+            for scene in scenes
+        ]
+    )

@@ -3,7 +3,8 @@
 The rest of the engine knows the functions that are named here, and no format.
 """
 
-from engine.files.exporting import check_surface_path, export_scene, write_surface
+from engine.files.channel_columns import ChannelChoice
+from engine.files.exporting import check_surface_path, export_scene, lost_channels, write_surface
 from engine.files.mesh import Mesh
 from engine.files.options import ExportOptions
 from engine.files.reading import read_mesh, read_scene
@@ -23,6 +24,7 @@ from engine.files.registry import (
 from engine.gaussians.flattening import ImportReport
 
 __all__ = [
+    "ChannelChoice",
     "ExportOptions",
     "Exporter",
     "ImportReport",
@@ -37,6 +39,7 @@ __all__ = [
     "exporters",
     "importer_for",
     "importers",
+    "lost_channels",
     "read_mesh",
     "read_scene",
     "register",

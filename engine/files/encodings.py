@@ -1,5 +1,7 @@
 """How splat formats write colours, opacities, rotations and axes, in one place for readers and writers."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
@@ -82,10 +84,9 @@ def half_turned(gaussians: FlatGaussians) -> FlatGaussians:
 
     Only signs change, so doing it twice gives the same bits.
     """
-    return FlatGaussians(
-        half_turn_points(gaussians.means_world),
-        half_turn_quats(gaussians.quats_wxyz),
-        gaussians.log_scales,
-        gaussians.opacity_logits,
-        half_turn_sh(gaussians.sh),
+    return replace(
+        gaussians,
+        means_world=half_turn_points(gaussians.means_world),
+        quats_wxyz=half_turn_quats(gaussians.quats_wxyz),
+        sh=half_turn_sh(gaussians.sh),
     )

@@ -14,6 +14,8 @@ def export_scene(
 ) -> tuple[Path, ...]:
     """Write ``gaussians`` to ``path`` in the format that its name or ``format`` says.
 
+    Formats without a place for named channels leave them out; :func:`lost_channels` tells.
+
     Returns:
         Every file written, ``path`` first.
 
@@ -26,6 +28,19 @@ def export_scene(
         return exporter.write(gaussians, path, options or ExportOptions())
     except OSError as error:
         raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
+
+
+def lost_channels(gaussians: FlatGaussians, path: Path, format: str | None = None) -> str | None:
+    """A sentence that says which named channels :func:`export_scene` will leave out; None where it keeps all.
+
+    Raises:
+        SceneFileError: there is no such format.
+    """
+    exporter = exporter_for(path, format)
+    if exporter.holds_channels or not gaussians.channels:
+        return None
+    names = ", ".join(gaussians.channels)
+    return f"The format {exporter.name} has no place for named channels; {names} will be left out."
 
 
 def check_surface_path(path: Path, *, textured: bool) -> None:

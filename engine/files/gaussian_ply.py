@@ -4,15 +4,19 @@ One element ``vertex``, all float32: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..
 channel-major (all red, then green, then blue), ``opacity`` (logit), ``scale_0..2`` (ln of the standard
 deviations) and ``rot_0..3`` (w, x, y, z). The flat axis, the normal r1, is axis 0 with scale ln 1e-5, so that
 every viewer of 3DGS files shows the scene.
+
+Named channels come last, ``metallic`` or ``albedo_0..2``, and a comment ``octasplat_channel albedo 3`` says
+of each that it is one.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from engine.errors import SceneFileError
+from engine.errors import ConfigError, SceneFileError
+from engine.files.channel_columns import ChannelChoice, chosen_columns
 from engine.files.options import ExportOptions
 from engine.files.ply_container import (
     PlyElement,
@@ -24,6 +28,7 @@ from engine.files.ply_container import (
 )
 from engine.files.registry import Exporter, Importer, register
 from engine.files.selection import selected
+from engine.gaussians.channels import Channels, column_names, stacked
 from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
 from engine.gaussians.model import FlatGaussians
 
@@ -32,6 +37,7 @@ ROWS_AT_ONCE = 65536
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_CHANNEL = "octasplat_channel"
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 
@@ -55,9 +61,11 @@ def write_gaussian_ply(gaussians: FlatGaussians, path: Path, *, sh_pad_degree: i
         raise SceneFileError(f"{path}: not written, as sh_pad_degree is {sh_pad_degree} but must be 0 to 3.")
     degree = max(gaussians.sh_degree, sh_pad_degree or 0)
     names = [*_POSITION, *_NORMAL, *_SH_DC, *_rest_names(degree), "opacity", *_scale_names(3), *_ROTATION]
+    widths = gaussians.channels.widths
+    names += [column for name, width in widths.items() for column in column_names(name, width)]
     dtype = np.dtype([(name, "<f4") for name in names])
     element = PlyWriteElement("vertex", len(gaussians), dtype, _row_blocks(gaussians, degree, dtype))
-    write_ply(path, [element])
+    write_ply(path, [element], channel_comments(widths))
 
 
 def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void]) -> Iterator[np.ndarray]:
@@ -77,33 +85,44 @@ def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void])
         tail[:, 1] = FLAT_LOG_SCALE
         tail[:, 2:4] = gaussians.log_scales[part]
         tail[:, 4:8] = gaussians.quats_wxyz[part]
+        if gaussians.channels:
+            tail[:, 8:] = stacked(gaussians.view(part).channels)
         yield values.view(dtype)[:, 0]
 
 
 def read_gaussian_ply(
-    path: Path, *, two_scale_normal: Literal[0, 2] = 0, drop_invalid: bool = False
+    path: Path,
+    *,
+    two_scale_normal: Literal[0, 2] = 0,
+    drop_invalid: bool = False,
+    channels: ChannelChoice = "own",
 ) -> tuple[FlatGaussians, ImportReport]:
     """Read a PLY of Gaussians, flat or not, by property name.
 
-    Properties may come in any order and numeric type, ascii or binary; unknown ones are ignored. A Gaussian
-    with three scales is flattened along its smallest one; a file of ours comes back bit for bit.
+    Properties may come in any order and numeric type, ascii or binary. A Gaussian with three scales is
+    flattened along its smallest one; a file of ours comes back bit for bit.
 
     Args:
         path: the file.
         two_scale_normal: which axis is the normal in a file with two scales: 0 as GaMeS writes it, 2 as
             2DGS does.
         drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
+        channels: which properties become channels beside the parameters.
 
     Raises:
         SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, lacks a
             property, or holds values that are not finite.
     """
-    cloud = read_ply_cloud(path)
+    cloud = read_ply_cloud(path, channels)
     return flatten(cloud, path, two_scale_normal=two_scale_normal, drop_invalid=drop_invalid)
 
 
-def read_ply_cloud(path: Path) -> GaussianCloud:
+def read_ply_cloud(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
     """The Gaussians of a PLY as they are in the file, found by property name.
+
+    Args:
+        path: the file.
+        channels: which properties become channels beside the parameters.
 
     Raises:
         SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, or lacks a
@@ -123,13 +142,34 @@ def read_ply_cloud(path: Path) -> GaussianCloud:
     table = read_ply(path, ["vertex"])[1]["vertex"]
     colours = columns(table, [*_SH_DC, *(f"f_rest_{k}" for k in range(rest_count))])
     rest = colours[:, 3:].reshape(len(table), 3, rest_count // 3).transpose(0, 2, 1)
+    found = chosen_columns(path, _declared(header.comments), vertex.names, channels)
+    try:
+        named = Channels({name: columns(table, own) for name, own in found.items()})
+    except ConfigError as error:
+        raise SceneFileError(f"{path}: {error}") from error
     return GaussianCloud(
         means_world=columns(table, _POSITION),
         quats_wxyz=columns(table, _ROTATION),
         log_scales=columns(table, _scale_names(scale_count)),
         opacity_logits=columns(table, ["opacity"])[:, 0],
         sh=np.ascontiguousarray(np.concatenate([colours[:, None, :3], rest], axis=1)),
+        channels=named,
     )
+
+
+def channel_comments(widths: Mapping[str, int]) -> tuple[str, ...]:
+    """Comments that say which properties of a PLY are channels."""
+    return tuple(f"{_CHANNEL} {name} {width}" for name, width in widths.items())
+
+
+def _declared(comments: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The channels that a PLY's comments name, with their properties."""
+    found = (comment.split() for comment in comments)
+    return {
+        words[1]: column_names(words[1], int(words[2]))
+        for words in found
+        if len(words) == 3 and words[0] == _CHANNEL and words[2].isdecimal() and 0 < int(words[2]) < 1 << 16
+    }
 
 
 def _rest_names(degree: int) -> list[str]:
@@ -181,10 +221,21 @@ def _recognises(head: bytes) -> bool:
 
 
 register(
-    Importer("gaussians", ("*.ply",), "Gaussians in the PLY layout of 3DGS", read_ply_cloud, _recognises)
+    Importer(
+        "gaussians",
+        ("*.ply",),
+        "Gaussians in the PLY layout of 3DGS",
+        read_ply_cloud,
+        _recognises,
+        read_with=read_ply_cloud,
+    )
 )
 register(
     Exporter(
-        "gaussians", ("*.ply",), "Gaussians as a 3DGS PLY, for splat viewers and for octasplat itself", _write
+        "gaussians",
+        ("*.ply",),
+        "Gaussians as a 3DGS PLY, for splat viewers and for octasplat itself",
+        _write,
+        holds_channels=True,
     )
 )

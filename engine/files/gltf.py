@@ -6,7 +6,8 @@ vertex attributes that they do not know or stop at the raw bytes.
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from jaxtyping import Float64
 from numpy.typing import DTypeLike
 
 from engine.errors import SceneFileError
+from engine.gaussians.channels import column_names
 from engine.gaussians.frames import rotation_matrices
 from engine.writing import replacing
 
@@ -30,6 +32,7 @@ HALF_TURN_ABOUT_X = [1.0, 0.0, 0.0, 0.0]
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MAX_DEPTH = 256
+CHANNELS = "octasplat_channels"
 DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError)
 """What reading a document that says nonsense may raise."""
 
@@ -142,6 +145,51 @@ def accessor(view: int, component: int, count: int, kind: str) -> dict[str, obje
 def vector_type(width: int) -> str:
     """How glTF names vectors of 1 to 4 numbers."""
     return "SCALAR" if width == 1 else f"VEC{width}"
+
+
+@dataclass(frozen=True)
+class ChannelAttribute:
+    """A vertex attribute that holds a channel or one number of it.
+
+    Attributes:
+        semantic: such as ``_ALBEDO``.
+        channel: the channel's name.
+        part: which of its numbers.
+        width: how many these are, at most 4.
+    """
+
+    semantic: str
+    channel: str
+    part: slice
+    width: int
+
+
+def channel_attributes(widths: Mapping[str, int]) -> tuple[ChannelAttribute, ...]:
+    """The attributes that hold channels: a vector for up to four numbers, else one scalar a number."""
+    found: list[ChannelAttribute] = []
+    for name, width in widths.items():
+        if width <= max(WIDTHS.values()):
+            found.append(ChannelAttribute(f"_{name.upper()}", name, slice(0, width), width))
+        else:
+            found += [
+                ChannelAttribute(f"_{column.upper()}", name, slice(place, place + 1), 1)
+                for place, column in enumerate(column_names(name, width))
+            ]
+    return tuple(found)
+
+
+def channel_extras(widths: Mapping[str, int]) -> dict[str, object]:
+    """What the ``extras`` of a file say of its channels: their names and widths."""
+    return {CHANNELS: dict(widths)} if widths else {}
+
+
+def declared_channels(document: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """The channels that a file's ``extras`` name, with their attributes in lower case, without the _."""
+    found = document.get("asset", {}).get("extras", {}).get(CHANNELS, {})
+    columns: dict[str, list[str]] = {}
+    for attribute in channel_attributes({name: int(width) for name, width in found.items() if width > 0}):
+        columns.setdefault(attribute.channel, []).append(attribute.semantic[1:].lower())
+    return {name: tuple(own) for name, own in columns.items()}
 
 
 def json_bytes(document: dict[str, object]) -> bytes:

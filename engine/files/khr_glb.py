@@ -6,7 +6,7 @@ readers that evaluate harmonics in world directions are right too. With untransf
 only, so that our own files keep the bits of positions and harmonics.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from engine.colour import linear_to_srgb, rounded_bytes, srgb_to_linear
-from engine.errors import SceneFileError
+from engine.errors import ConfigError, SceneFileError
 from engine.files import gltf
+from engine.files.channel_columns import ChannelChoice, chosen_columns
 from engine.files.encodings import (
     HALF_TURN_SIGNS,
     half_turn_points,
@@ -29,10 +30,12 @@ from engine.files.gltf import FLOAT, UNSIGNED_BYTE, GlbFile, padded, write_glb
 from engine.files.options import ExportOptions
 from engine.files.registry import Exporter, Importer, register
 from engine.files.selection import blocks, check_scales, selected
+from engine.gaussians.channels import Channels, common_widths
 from engine.gaussians.flattening import GaussianCloud
 from engine.gaussians.frames import quaternions, rotation_matrices
 from engine.gaussians.harmonics import rotate_sh
 from engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
+from engine.gaussians.rows import join_rows
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOUR_SPACE = "srgb_rec709_display"
@@ -40,16 +43,21 @@ SIMILARITY = 1e-4
 """Relative error up to which a node may fail to be a rotation with one scale."""
 
 
-def read(path: Path) -> GaussianCloud:
+def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
     """Read all splats of the default scene, node transforms applied.
+
+    Args:
+        path: the file.
+        channels: which of the attributes that begin with _ become channels, by their names in lower case.
 
     Raises:
         SceneFileError: the file is no GLB, is damaged, holds no splats (an octagon mesh, say) or compressed
-            ones, or scales them unevenly.
+            ones, scales them unevenly, or has no such channel.
     """
     file = GlbFile(path)
     clouds = []
     try:
+        declared = gltf.declared_channels(file.document)
         for matrix, primitive in file.primitives():
             splats = primitive.get("extensions", {}).get(EXTENSION)
             if splats is None:
@@ -57,14 +65,27 @@ def read(path: Path) -> GaussianCloud:
             if splats.get("extensions"):
                 names = ", ".join(splats["extensions"])
                 raise SceneFileError(f"{path}: its splats need {names}, which is not read.")
-            clouds.append(_placed(path, _cloud(file, primitive["attributes"], splats), matrix))
+            attributes = primitive["attributes"]
+            cloud = _placed(path, _cloud(file, attributes, splats), matrix)
+            columns = {name[1:].lower(): number for name, number in attributes.items() if name[0] == "_"}
+            wanted = chosen_columns(path, declared, columns, channels)
+            named = Channels({name: _channel(file, columns, own) for name, own in wanted.items()})
+            clouds.append(replace(cloud, channels=named))
+        if not clouds:
+            raise SceneFileError(
+                f"{path}: holds no splats ({EXTENSION}); if it is an edited octagon mesh, use octasplat edit."
+            )
+        return _joined(clouds)
+    except ConfigError as error:
+        raise SceneFileError(f"{path}: {error}") from error
     except gltf.DAMAGE as error:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
-    if not clouds:
-        raise SceneFileError(
-            f"{path}: holds no splats ({EXTENSION}); if it is an edited octagon mesh, use octasplat edit."
-        )
-    return _joined(clouds)
+
+
+def _channel(
+    file: GlbFile, attributes: Mapping[str, int], columns: tuple[str, ...]
+) -> Float32[np.ndarray, "n f"]:
+    return np.concatenate([file.array(attributes[column], np.float32) for column in columns], axis=1)
 
 
 def _cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) -> GaussianCloud:
@@ -135,15 +156,17 @@ def _joined(clouds: list[GaussianCloud]) -> GaussianCloud:
     if len(clouds) == 1:
         return clouds[0]
     most = max(cloud.sh.shape[1] for cloud in clouds)
-    padded = [np.pad(cloud.sh, ((0, 0), (0, most - cloud.sh.shape[1]), (0, 0))) for cloud in clouds]
-    return GaussianCloud(
-        means_world=np.concatenate([cloud.means_world for cloud in clouds]),
-        quats_wxyz=np.concatenate([cloud.quats_wxyz for cloud in clouds]),
-        log_scales=np.concatenate([cloud.log_scales for cloud in clouds]),
-        opacity_logits=np.concatenate([cloud.opacity_logits for cloud in clouds]),
-        sh=np.concatenate(padded),
-        notes=tuple(dict.fromkeys(note for cloud in clouds for note in cloud.notes)),
-    )
+    widths = common_widths(cloud.channels for cloud in clouds)
+    alike = [
+        replace(
+            cloud,
+            sh=np.pad(cloud.sh, ((0, 0), (0, most - cloud.sh.shape[1]), (0, 0))),
+            channels=cloud.channels.completed(widths, len(cloud.sh)),
+        )
+        for cloud in clouds
+    ]
+    notes = tuple(dict.fromkeys(note for cloud in clouds for note in cloud.notes))
+    return replace(join_rows(alike), notes=notes)
 
 
 @dataclass(frozen=True)
@@ -172,8 +195,12 @@ def _coefficient(number: int) -> Callable[[FlatGaussians], np.ndarray]:
     return lambda some: some.sh[:, number] * HALF_TURN_SIGNS[number]
 
 
-def attributes(sh_degree: int) -> tuple[_Attribute, ...]:
-    """All attributes of a scene with harmonics of that degree, in file order."""
+def _numbers(attribute: gltf.ChannelAttribute) -> Callable[[FlatGaussians], np.ndarray]:
+    return lambda some: some.channels[attribute.channel][:, attribute.part]
+
+
+def _attributes(sh_degree: int, widths: Mapping[str, int]) -> tuple[_Attribute, ...]:
+    """All attributes of a scene with harmonics of that degree and these channels, in file order."""
     basic = (
         _Attribute("POSITION", "VEC3", FLOAT, 12, lambda some: half_turn_points(some.means_world)),
         _Attribute("COLOR_0", "VEC4", UNSIGNED_BYTE, 4, _colours),
@@ -194,7 +221,11 @@ def attributes(sh_degree: int) -> tuple[_Attribute, ...]:
         for degree in range(sh_degree + 1)
         for place in range(2 * degree + 1)
     )
-    return basic + harmonics
+    named = tuple(
+        _Attribute(each.semantic, gltf.vector_type(each.width), FLOAT, each.width * 4, _numbers(each))
+        for each in gltf.channel_attributes(widths)
+    )
+    return basic + harmonics + named
 
 
 def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
@@ -207,7 +238,7 @@ def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple
     """
     scene = selected(gaussians, path, options)
     check_scales(scene, path)
-    layout = attributes(scene.sh_degree)
+    layout = _attributes(scene.sh_degree, scene.channels.widths)
     text = gltf.json_bytes(_document(scene, layout))
     room = padded(len(text))
     length = len(scene) * sum(attribute.item_bytes for attribute in layout)
@@ -256,8 +287,9 @@ def _document(scene: FlatGaussians, layout: tuple[_Attribute, ...]) -> dict[str,
             }
         },
     }
+    extras = gltf.channel_extras(scene.channels.widths)
     return {
-        "asset": {"version": "2.0", "generator": "octasplat"},
+        "asset": {"version": "2.0", "generator": "octasplat"} | ({"extras": extras} if extras else {}),
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -273,12 +305,13 @@ def _recognises(head: bytes) -> bool:
     return head.startswith(b"glTF")
 
 
-register(Importer("khr-glb", ("*.glb",), "glTF points with KHR_gaussian_splatting", read, _recognises))
+register(Importer("khr-glb", ("*.glb",), "glTF points with KHR_gaussian_splatting", read, _recognises, read))
 register(
     Exporter(
         "khr-glb",
         ("*.splats.glb", "*_splats.glb", "*-splats.glb", "splats.glb"),
         "Gaussians as glTF points with KHR_gaussian_splatting",
         write,
+        holds_channels=True,
     )
 )

@@ -21,7 +21,7 @@ from jaxtyping import Float32, Int
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
 from engine.files import gltf
-from engine.files.gltf import GlbFile, padded, write_glb
+from engine.files.gltf import GlbFile, channel_attributes, padded, write_glb
 from engine.files.mesh import Mesh
 from engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout
 from engine.files.octagon_soup import OctagonBatch, OctagonSoup
@@ -134,11 +134,12 @@ def _parts(
 ) -> list[tuple[GlbLayout, Chunks]]:
     """The fewest files that hold all chunks; neighbouring chunks stay together."""
     chunks = kd_chunks(soup.means_world, options.chunks)
+    channels = channel_attributes(soup.channel_widths)
     for count in range(1, len(chunks) + 1):
         bounds = np.linspace(0, len(chunks), count + 1).astype(int).tolist()
         groups = [chunks[start:end] for start, end in itertools.pairwise(bounds)]
         parts = [
-            (GlbLayout([len(chunk) for chunk in group], png_size, options, extras), group)
+            (GlbLayout([len(chunk) for chunk in group], png_size, options, extras, channels), group)
             for group, extras in zip(groups, _extras(soup, options, count), strict=True)
         ]
         if all(layout.total <= gltf.MAX_BYTES for layout, _ in parts):
@@ -153,6 +154,7 @@ def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[
     extras: dict[str, object] = {"octasplat_q": options.q, "octasplat_gaussians": soup.scene_size}
     if options.opaque:
         extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF
+    extras |= gltf.channel_extras(soup.channel_widths)
     return [extras | ({"octasplat_part": [part, parts]} if parts > 1 else {}) for part in range(1, parts + 1)]
 
 
@@ -179,6 +181,8 @@ def _chunk_data(batch: OctagonBatch, ids: bool) -> Iterator[bytes]:
     yield batch.uv.astype("<f4").tobytes()
     if ids:
         yield _per_corner(batch.ids[:, None]).tobytes()
+    for attribute in channel_attributes(batch.channels.widths):
+        yield _per_corner(batch.channels[attribute.channel][:, attribute.part]).tobytes()
 
 
 def _per_corner(values: Float32[np.ndarray, "n c"] | Int[np.ndarray, "n c"]) -> Float32[np.ndarray, "m c"]:
@@ -268,7 +272,11 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
 
 register(
     Exporter(
-        "glb", ("*.glb",), "octagon mesh as GLB with opacity and fall-off, for looking at", write_octagons
+        "glb",
+        ("*.glb",),
+        "octagon mesh as GLB with opacity and fall-off, for looking at",
+        write_octagons,
+        holds_channels=True,
     )
 )
 register(MeshReader("glb", ("*.glb",), read))

@@ -11,6 +11,7 @@ from jaxtyping import Float32, Int, Int64
 
 from engine.colour import to_bytes
 from engine.errors import SceneFileError
+from engine.files.gaussian_ply import channel_comments
 from engine.files.mesh import Mesh, stated_q
 from engine.files.octagon_soup import BATCH, OctagonSoup
 from engine.files.options import ExportOptions
@@ -23,6 +24,7 @@ from engine.files.ply_container import (
     write_ply,
 )
 from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
+from engine.gaussians.channels import column_names
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import FAN, SIDES, octagon_triangles
 from engine.surface.mesh import TriangleMesh
@@ -30,13 +32,11 @@ from engine.surface.mesh import TriangleMesh
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 COLOURS = ("red", "green", "blue")
 _FACE_LISTS = ("vertex_indices", "vertex_index")
-VERTEX = np.dtype(
-    [
-        *((name, "<f4") for name in (*_POSITION, "s", "t")),
-        *((name, "u1") for name in (*COLOURS, "alpha")),
-        *((name, "<f4") for name in ("gid", "corner", "radius")),
-    ]
-)
+VERTEX = [
+    *((name, "<f4") for name in (*_POSITION, "s", "t")),
+    *((name, "u1") for name in (*COLOURS, "alpha")),
+    *((name, "<f4") for name in ("gid", "corner", "radius")),
+]
 FACE = np.dtype(list_field("vertex_indices", "i4", 3))
 
 
@@ -100,21 +100,29 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     """Write eight vertices and six triangles per Gaussian.
 
     Per vertex: position (world), texture coordinates ``s t``, display colour and opacity as bytes, and as
-    floats ``gid`` (number of the Gaussian), ``corner`` (0 to 7) and ``radius`` (of the corners, in standard
-    deviations).
+    floats ``gid`` (number of the Gaussian), ``corner`` (0 to 7), ``radius`` (of the corners, in standard
+    deviations) and the Gaussian's channels.
     """
     soup = OctagonSoup(gaussians, path, options)
     count = len(soup)
-    comments = ("octasplat octagons", f"octasplat_q {options.q!r}", f"octasplat_gaussians {soup.scene_size}")
-    vertices = PlyWriteElement("vertex", count * SIDES, VERTEX, _vertices(soup))
+    widths = soup.channel_widths
+    comments = (
+        "octasplat octagons",
+        f"octasplat_q {options.q!r}",
+        f"octasplat_gaussians {soup.scene_size}",
+        *channel_comments(widths),
+    )
+    names = [column for name, width in widths.items() for column in column_names(name, width)]
+    vertex = np.dtype([*VERTEX, *((name, "<f4") for name in names)])
+    vertices = PlyWriteElement("vertex", count * SIDES, vertex, _vertices(soup, vertex))
     faces = PlyWriteElement("face", count * len(FAN), FACE, _faces(count))
     write_ply(path, [vertices, faces], comments)
     return (path,)
 
 
-def _vertices(soup: OctagonSoup) -> Iterator[np.ndarray]:
+def _vertices(soup: OctagonSoup, vertex: np.dtype[np.void]) -> Iterator[np.ndarray]:
     for batch in soup.batches():
-        rows = np.empty((len(batch.ids), SIDES), dtype=VERTEX)
+        rows = np.empty((len(batch.ids), SIDES), dtype=vertex)
         for axis, name in enumerate(_POSITION):
             rows[name] = batch.corners_world[..., axis]
         rows["s"], rows["t"] = batch.uv[..., 0], batch.uv[..., 1]
@@ -124,6 +132,9 @@ def _vertices(soup: OctagonSoup) -> Iterator[np.ndarray]:
         rows["gid"] = batch.ids[:, None]
         rows["corner"] = np.arange(SIDES)
         rows["radius"] = batch.radii[:, None]
+        for name, values in batch.channels.items():
+            for place, column in enumerate(column_names(name, values.shape[1])):
+                rows[column] = values[:, place, None]
         yield rows.reshape(-1)
 
 
@@ -168,6 +179,7 @@ register(
         ("mesh.ply", "*.mesh.ply", "*_mesh.ply", "*-mesh.ply"),
         "octagon mesh as a binary PLY with Gaussian numbers, for editing",
         write_octagons,
+        holds_channels=True,
     )
 )
 register(MeshReader("mesh-ply", ("*.ply",), read))

@@ -1,5 +1,6 @@
 """Where everything lies in a GLB of octagons, and the JSON that says so."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from engine.files.gltf import (
     HALF_TURN_ABOUT_X,
     LINEAR,
     UNSIGNED_INT,
+    ChannelAttribute,
     accessor,
     glb_bytes,
     json_bytes,
@@ -58,12 +60,23 @@ class GlbLayout:
         total: bytes of the whole file.
     """
 
-    def __init__(self, chunk_sizes: list[int], png_size: int, options: ExportOptions, extras: object) -> None:
+    def __init__(
+        self,
+        chunk_sizes: list[int],
+        png_size: int,
+        options: ExportOptions,
+        extras: object,
+        channels: Sequence[ChannelAttribute] = (),
+    ) -> None:
         """Plan a file of chunks of so many octagons; ``extras`` goes into the JSON's ``asset``."""
         self._chunk_sizes = chunk_sizes
         self._options = options
         self._extras = extras
-        self._attributes = (*OWN_ATTRIBUTES, *((GID,) if options.ids else ()))
+        self._attributes = (
+            *OWN_ATTRIBUTES,
+            *((GID,) if options.ids else ()),
+            *(Attribute(channel.semantic, channel.width) for channel in channels),
+        )
         self._views: list[dict[str, object]] = []
         self.largest = max(chunk_sizes)
         self.length = 0

@@ -10,6 +10,7 @@ from jaxtyping import Float32, Int
 
 from engine.errors import SceneFileError
 from engine.files.options import ExportOptions
+from engine.gaussians.channels import Channels
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import APOTHEM, corner_directions, octagon_corners_world, octagon_radii
 
@@ -30,6 +31,7 @@ class OctagonBatch:
         rgb_srgb: colour of the constant harmonic in [0, 1], display values.
         opacities: in (0, 1].
         radii: corner radii in standard deviations.
+        channels: what else is known of the Gaussians.
     """
 
     ids: Int[np.ndarray, " n"]
@@ -38,6 +40,7 @@ class OctagonBatch:
     rgb_srgb: Float32[np.ndarray, "n 3"]
     opacities: Float32[np.ndarray, " n"]
     radii: Float32[np.ndarray, " n"]
+    channels: Channels
 
 
 class OctagonSoup:
@@ -88,6 +91,11 @@ class OctagonSoup:
         return len(self.ids)
 
     @property
+    def channel_widths(self) -> dict[str, int]:
+        """The channels of the batches, with their numbers a Gaussian."""
+        return self._gaussians.channels.widths
+
+    @property
     def means_world(self) -> Float32[np.ndarray, "n 3"]:
         """Centres of the octagons, world units, in the order of ``ids``."""
         return self._gaussians.means_world[self.ids]
@@ -95,14 +103,7 @@ class OctagonSoup:
     def batch(self, places: slice | Int[np.ndarray, " n"]) -> OctagonBatch:
         """The octagons at ``places``, which count along ``ids``."""
         ids = self.ids[places]
-        scene = self._gaussians
-        part = FlatGaussians(
-            scene.means_world[ids],
-            scene.quats_wxyz[ids],
-            scene.log_scales[ids],
-            scene.opacity_logits[ids],
-            scene.sh[ids, :1],
-        )
+        part = self._gaussians.bare().select(ids)
         radii = self._radii[ids]
         with np.errstate(over="ignore", invalid="ignore"):
             corners = octagon_corners_world(part, radii)
@@ -113,7 +114,10 @@ class OctagonSoup:
         half = 0.5 * radii.astype(np.float64) / np.sqrt(self.q)
         uv = 0.5 + half[:, None, None] * corner_directions()
         rgb = np.clip(part.base_rgb_srgb, 0.0, 1.0)
-        return OctagonBatch(ids, corners, uv.astype(np.float32), rgb, self._opacities[ids], radii)
+        channels = {name: array[ids] for name, array in self._gaussians.channels.items()}
+        return OctagonBatch(
+            ids, corners, uv.astype(np.float32), rgb, self._opacities[ids], radii, Channels(channels)
+        )
 
     def batches(self) -> Iterator[OctagonBatch]:
         """All octagons in the order of ``ids``, a few thousand at a time."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from engine.errors import SceneFileError
 from engine.events import Listener, StageFinished, StageStarted, ignore
+from engine.files.channel_columns import ChannelChoice
 from engine.files.mesh import Mesh
 from engine.files.registry import importer_for, mesh_reader_for
 from engine.gaussians.flattening import ImportReport, flatten
@@ -17,7 +18,12 @@ FOLDER_FILES = ("scene.ply", "meta.json")
 
 
 def read_scene(
-    path: Path, format: str | None = None, *, drop_invalid: bool = False, listener: Listener = ignore
+    path: Path,
+    format: str | None = None,
+    *,
+    drop_invalid: bool = False,
+    channels: ChannelChoice = "own",
+    listener: Listener = ignore,
 ) -> tuple[FlatGaussians, ImportReport]:
     """Read the Gaussians of a file of any known format, or of the folder of a run, and flatten them.
 
@@ -25,19 +31,26 @@ def read_scene(
         path: the file, or a folder with ``scene.ply`` or with the ``meta.json`` of an unpacked SOG.
         format: the name of its format; by default the file shows it.
         drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
+        channels: which named channels are wanted: those that the file says are channels, as ours do; all that
+            nothing else is known of, too; or names.
         listener: told when reading begins and ends (stage ``read``).
 
     Returns:
         Flat Gaussians, and what flattening and reading lost.
 
     Raises:
-        SceneFileError: the file cannot be read; the text names it and says why.
+        SceneFileError: the file cannot be read, or has no such channel; the text names it and says why.
     """
     source = _file_of(path)
     importer = importer_for(source, format)
     listener(StageStarted("read"))
     began = time.monotonic()
-    cloud = importer.read(source)
+    if importer.read_with is not None:
+        cloud = importer.read_with(source, channels)
+    elif channels not in ("own", "all", ()):
+        raise SceneFileError(f"{source}: the format {importer.name} has no place for channels.")
+    else:
+        cloud = importer.read(source)
     scene = flatten(cloud, source, drop_invalid=drop_invalid)
     listener(StageFinished("read", time.monotonic() - began))
     return scene

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import ClassVar, TypeVar
 
 from engine.errors import SceneFileError
+from engine.files.channel_columns import ChannelChoice
 from engine.files.format_table import Entry, FormatTable
 from engine.files.mesh import Mesh
 from engine.files.options import ExportOptions
@@ -33,12 +34,14 @@ class Importer(Entry):
         description: one line for help texts.
         read: reads the Gaussians as the file has them, in the world frame of the 3DGS family (y down).
         recognises: whether a file that begins with these bytes (up to ``HEAD_BYTES``) is of this format.
+        read_with: reads the channels that are wanted, too; None where the format has no place for any.
     """
 
     noun: ClassVar[str] = "import"
     description: str
     read: SceneReader
     recognises: Callable[[bytes], bool] = lambda _head: False
+    read_with: Callable[[Path, ChannelChoice], GaussianCloud] | None = None
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,14 @@ class Exporter(Entry):
         description: one line for help texts.
         write: writes the Gaussians to the path and returns every file written, the path itself first.
         lacking: what is missing on this machine to write it, to be read after the file's name, or None.
+        holds_channels: whether it writes named channels, too.
     """
 
     noun: ClassVar[str] = "export"
     description: str
     write: SceneWriter
     lacking: Callable[[], str | None] = lambda: None
+    holds_channels: bool = False
 
 
 @dataclass(frozen=True)

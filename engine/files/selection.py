@@ -45,10 +45,4 @@ def blocks(scene: FlatGaussians) -> Iterator[FlatGaussians]:
     """The scene in order, a few thousand Gaussians at a time, without copying it."""
     for start in range(0, len(scene), ROWS_AT_ONCE):
         part = slice(start, start + ROWS_AT_ONCE)
-        yield FlatGaussians(
-            scene.means_world[part],
-            scene.quats_wxyz[part],
-            scene.log_scales[part],
-            scene.opacity_logits[part],
-            scene.sh[part],
-        )
+        yield scene.view(part)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from engine.errors import OctasplatError
-from engine.files.exporting import export_scene
+from engine.files.exporting import export_scene, lost_channels
 from engine.files.options import ExportOptions
 from engine.gaussians.model import FlatGaussians
 
@@ -15,6 +15,7 @@ def export_files(
     names: Sequence[str],
     options: ExportOptions,
     on_done: Callable[[int], None],
+    on_loss: Callable[[str], None],
 ) -> str | None:
     """Write ``gaussians`` to files in ``folder``, all of them that can be written.
 
@@ -24,6 +25,7 @@ def export_files(
         names: of the files; they say the formats.
         options: of all of them.
         on_done: told how many files have been dealt with, after each; it may raise to stop.
+        on_loss: told in a sentence what of the scene a format cannot hold.
 
     Returns:
         What could not be written and why, in a sentence for each file, or None.
@@ -31,6 +33,8 @@ def export_files(
     failed: list[str] = []
     for done, name in enumerate(names, start=1):
         try:
+            if lost := lost_channels(gaussians, folder / name):
+                on_loss(lost)
             export_scene(gaussians, folder / name, options)
         except OctasplatError as error:
             failed.append(str(error).replace(f"{folder / name}", name).rstrip("."))

@@ -121,6 +121,10 @@ def _write_stage(pxr: dict[str, ModuleType], scene: FlatGaussians, layer: Path) 
     colours = srgb_to_linear(np.clip(scene.base_rgb_srgb, 0.0, 1.0))
     fallback.CreateDisplayColorPrimvar(geom.Tokens.vertex).Set(vt.Vec3fArray.FromNumpy(colours))
     fallback.CreateDisplayOpacityPrimvar(geom.Tokens.vertex).Set(vt.FloatArray.FromNumpy(scene.opacities))
+    primvars, kinds = geom.PrimvarsAPI(prim), pxr["Sdf"].ValueTypeNames
+    for name, values in scene.channels.items():
+        primvar = primvars.CreatePrimvar(name, kinds.FloatArray, geom.Tokens.vertex, values.shape[1])
+        primvar.Set(vt.FloatArray.FromNumpy(np.ascontiguousarray(values).reshape(-1)))
     prim.GetAttribute("primvars:displayColor").SetColorSpace("lin_rec709_scene")
     stage.GetRootLayer().Save()
 
@@ -132,5 +136,6 @@ register(
         "USD ParticleField with the surflet kernel; needs usd-core",
         write,
         lacking,
+        holds_channels=True,
     )
 )

@@ -1,6 +1,6 @@
 """From the three-dimensional Gaussians of other programs to flat ones, and what that loses."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 
 from engine.errors import SceneFileError
+from engine.gaussians.channels import Channels, check_rows
 from engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from engine.gaussians.rows import select_rows
 
 FLAT_LOG_SCALE = np.float32(np.log(FLAT_SCALE))
 ROUNDING = np.float32(1e-5)
@@ -33,6 +35,7 @@ class GaussianCloud:
         sh: coefficients of the display colour, coefficient-major, as in
             :class:`engine.gaussians.model.FlatGaussians`.
         notes: what the reader of the file left out or had to assume, one sentence each.
+        channels: what else is known of each, by name.
     """
 
     means_world: Float32[np.ndarray, "n 3"]
@@ -41,6 +44,11 @@ class GaussianCloud:
     opacity_logits: Float32[np.ndarray, " n"]
     sh: Float32[np.ndarray, "n k 3"]
     notes: tuple[str, ...] = ()
+    channels: Channels = field(default_factory=Channels)
+
+    def __post_init__(self) -> None:
+        """Make sure that channels have as many rows as there are Gaussians."""
+        check_rows(self.channels, len(self.means_world))
 
 
 @dataclass(frozen=True)
@@ -100,15 +108,16 @@ def flatten(
     cloud = replace(cloud, opacity_logits=logits.astype(np.float32))
     valid = _valid(cloud, path, drop_invalid)
     if not valid.all():
-        arrays = {field.name: getattr(cloud, field.name) for field in fields(cloud) if field.name != "notes"}
-        cloud = replace(cloud, **{name: array[valid] for name, array in arrays.items()})
+        cloud = select_rows(cloud, valid)
     scale_count = cloud.log_scales.shape[1]
     if scale_count == 3:
         quats, in_plane, thickness = _flattened(cloud.quats_wxyz, cloud.log_scales)
     else:
         axis = np.full(len(cloud.means_world), two_scale_normal)
         quats, in_plane, thickness = turned(cloud.quats_wxyz, axis), cloud.log_scales, np.empty(0, np.float32)
-    gaussians = FlatGaussians(cloud.means_world, quats, in_plane, cloud.opacity_logits, cloud.sh)
+    gaussians = FlatGaussians(
+        cloud.means_world, quats, in_plane, cloud.opacity_logits, cloud.sh, cloud.channels
+    )
     report = ImportReport(
         count=len(gaussians),
         sh_degree=gaussians.sh_degree,
@@ -136,6 +145,7 @@ def _valid(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np.ndar
         "scale": bad_scale,
         "opacity": ~np.isfinite(cloud.opacity_logits),
         "colour": ~np.isfinite(cloud.sh).all(axis=(1, 2)),
+        **{name: ~np.isfinite(array).all(axis=1) for name, array in cloud.channels.items()},
     }
     no_length = (cloud.quats_wxyz == 0).all(axis=1)
     valid: Bool[np.ndarray, " n"] = ~np.logical_or.reduce([*bad.values(), no_length])

@@ -1,11 +1,14 @@
 """A set of flat Gaussians as plain arrays."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float32
 
+from engine.gaussians.channels import Channels, check_rows
 from engine.gaussians.frames import rotation_matrices
+from engine.gaussians.rows import Index, join_rows, map_rows, put_rows, row_arrays, select_rows
 
 FLAT_SCALE = 1e-5
 """Standard deviation along the normal, s1 = eps of the paper, in world units."""
@@ -26,6 +29,7 @@ class FlatGaussians:
         opacity_logits: opacity is their sigmoid.
         sh: spherical-harmonic coefficients of the display (sRGB-encoded) colour, coefficient-major, with
             1, 4, 9 or 16 coefficients; colour = max(0, 1/2 + sum_k sh[k] Y_k(ray direction)).
+        channels: what else is known of each Gaussian, by name.
     """
 
     means_world: Float32[np.ndarray, "n 3"]
@@ -33,6 +37,11 @@ class FlatGaussians:
     log_scales: Float32[np.ndarray, "n 2"]
     opacity_logits: Float32[np.ndarray, " n"]
     sh: Float32[np.ndarray, "n k 3"]
+    channels: Channels = field(default_factory=Channels)
+
+    def __post_init__(self) -> None:
+        """Make sure that channels have as many rows as there are Gaussians."""
+        check_rows(self.channels, len(self))
 
     def __len__(self) -> int:
         return len(self.means_world)
@@ -63,26 +72,47 @@ class FlatGaussians:
         """Colour of the constant harmonic alone, 1/2 + C0 sh[0], clipped below at 0; display values."""
         return np.maximum(0.5 + np.float32(SH_C0) * self.sh[:, 0], 0.0).astype(np.float32)
 
-    def select(self, index: np.ndarray | slice) -> "FlatGaussians":
+    def select(self, index: Index) -> "FlatGaussians":
         """The Gaussians at ``index`` (integers, a mask or a slice), copied."""
-        return FlatGaussians(
-            **{field.name: getattr(self, field.name)[index].copy() for field in fields(self)}
-        )
+        return select_rows(self, index)
+
+    def view(self, part: slice) -> "FlatGaussians":
+        """The Gaussians of a slice, not copied."""
+        return map_rows(self, lambda array: array[part])
+
+    def put(self, index: Index, others: "FlatGaussians") -> None:
+        """Overwrite the Gaussians at ``index`` by ``others``, in place."""
+        put_rows(self, index, others)
+
+    def bare(self) -> "FlatGaussians":
+        """The same Gaussians, not copied, with the constant colour only and no channels."""
+        return replace(self, sh=self.sh[:, :1], channels=Channels())
+
+    def with_channels(self, channels: Mapping[str, np.ndarray]) -> "FlatGaussians":
+        """The same Gaussians, not copied, with ``channels`` added, or replaced where the name is taken.
+
+        Args:
+            channels: float32 arrays of shape (n, f), not copied either.
+
+        Raises:
+            ConfigError: a name cannot be used.
+            ValueError: an array has another type or shape.
+        """
+        return replace(self, channels=Channels({**self.channels, **channels}))
+
+    def without_channels(self, names: Sequence[str]) -> "FlatGaussians":
+        """The same Gaussians, not copied, without the channels ``names``."""
+        return replace(self, channels=Channels({n: a for n, a in self.channels.items() if n not in names}))
 
     def copy(self) -> "FlatGaussians":
         """An independent copy."""
-        return self.select(np.arange(len(self)))
+        return map_rows(self, lambda array: array.copy())
 
     def is_finite(self) -> bool:
         """Whether every parameter is a finite number."""
-        return all(bool(np.isfinite(getattr(self, field.name)).all()) for field in fields(self))
+        return all(bool(np.isfinite(array).all()) for array in row_arrays(self).values())
 
 
 def concatenate(parts: list[FlatGaussians]) -> FlatGaussians:
-    """All Gaussians of ``parts``, in order; the parts share one spherical-harmonic degree."""
-    return FlatGaussians(
-        **{
-            field.name: np.concatenate([getattr(part, field.name) for part in parts])
-            for field in fields(FlatGaussians)
-        }
-    )
+    """All Gaussians of ``parts``, in order; the parts share their harmonics' degree and their channels."""
+    return join_rows(parts)

@@ -5,13 +5,14 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from engine.errors import CheckpointError, DamagedCheckpoint
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.rows import from_row_arrays, row_arrays
 from engine.train.optimiser import Adam
 from engine.train.state import TrainState
 from engine.writing import replacing
@@ -56,8 +57,10 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
         "best_iteration": state.best_iteration,
     }
-    arrays = {f"gaussians.{f.name}": getattr(state.gaussians, f.name) for f in fields(FlatGaussians)}
-    arrays |= {f"adam.{f.name}": getattr(state.adam, f.name) for f in fields(Adam)}
+    arrays: dict[str, Any] = {
+        f"gaussians.{name}": array for name, array in row_arrays(state.gaussians).items()
+    }
+    arrays |= {f"adam.{name}": array for name, array in row_arrays(state.adam).items()}
     arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
     arrays |= {f"shading.{name}": value for name, value in state.shading.items()}
     meta["arrays"] = sorted(arrays)
@@ -96,8 +99,8 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
     rng.bit_generator.state = meta["rng"]
     return TrainState(
         iteration=meta["iteration"],
-        gaussians=FlatGaussians(**groups["gaussians"]),
-        adam=Adam(**groups["adam"]),
+        gaussians=from_row_arrays(FlatGaussians, groups["gaussians"]),
+        adam=from_row_arrays(Adam, groups["adam"]),
         rng=rng,
         densifier=groups["densifier"],
         shading=groups["shading"],
@@ -110,7 +113,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
 
 def save_best(gaussians: FlatGaussians, shading: Mapping[str, np.ndarray], folder: Path) -> None:
     """Write the Gaussians that did best so far, and the shading model's state then, to ``best.npz``."""
-    arrays = {f"gaussians.{f.name}": getattr(gaussians, f.name) for f in fields(FlatGaussians)}
+    arrays: dict[str, Any] = {f"gaussians.{name}": array for name, array in row_arrays(gaussians).items()}
     arrays |= {f"shading.{name}": value for name, value in shading.items()}
     with replacing(folder / "best.npz") as temporary:
         np.savez(temporary, **arrays)
@@ -125,7 +128,7 @@ def load_best(folder: Path) -> tuple[FlatGaussians, dict[str, np.ndarray]]:
     path = folder / "best.npz"
     try:
         groups = _grouped(_read_arrays(path))
-        return FlatGaussians(**groups["gaussians"]), groups["shading"]
+        return from_row_arrays(FlatGaussians, groups["gaussians"]), groups["shading"]
     except _DAMAGE as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None
 

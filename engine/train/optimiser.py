@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from engine.gaussians.model import SH_C0, FlatGaussians
+from engine.gaussians.rows import join_rows, row_arrays, select_rows
 from engine.trace.protocol import GaussianGradients
 from engine.train.config import LearningRates, LossWeights
 from engine.train.kernels_adam import adam_step
@@ -22,7 +23,8 @@ class Adam:
     """First and second moments of every parameter, one row a Gaussian, and each Gaussian's step count.
 
     Columns: mean 3, quaternion 4, log scales 2, opacity 1, then the harmonics. A Gaussian that no ray of
-    the batch hits is left alone: neither its moments nor its parameters change.
+    the batch hits is left alone: neither its moments nor its parameters change. Named channels have no
+    columns: nothing here trains them.
     """
 
     first: Float32[np.ndarray, "n p"]
@@ -41,21 +43,16 @@ class Adam:
 
     def select(self, index: np.ndarray) -> "Adam":
         """The state of the Gaussians at ``index``, copied."""
-        return Adam(self.first[index].copy(), self.second[index].copy(), self.steps[index].copy())
+        return select_rows(self, index)
 
     def reset(self, index: np.ndarray) -> None:
         """Forget the past of the Gaussians at ``index``."""
-        self.first[index] = 0
-        self.second[index] = 0
-        self.steps[index] = 0
+        for array in row_arrays(self).values():
+            array[index] = 0
 
     def append(self, other: "Adam") -> "Adam":
         """This state followed by ``other``."""
-        return Adam(
-            np.concatenate([self.first, other.first]),
-            np.concatenate([self.second, other.second]),
-            np.concatenate([self.steps, other.steps]),
-        )
+        return join_rows([self, other])
 
     def widen(self, basis_count: int) -> "Adam":
         """Room for ``basis_count`` harmonics; the new ones start with zero moments."""

@@ -100,3 +100,26 @@ def write_thick(path, thicknesses):
     rows["scale_0"] = np.log(thicknesses)
     rows["rot_0"] = 1
     write_ply(path, [PlyWriteElement("vertex", len(rows), rows.dtype, iter([rows]))])
+
+
+def test_further_numbers_are_kept_where_they_are_wanted(octasplat, flat, tmp_path):
+    label = np.arange(60, dtype=np.float32)[:, None]
+    write_gaussian_ply(flat.with_channels({"label": label, "albedo": np.tile(label, 3)}), tmp_path / "a.ply")
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(content.replace(b"comment octasplat_", b"comment elsewhere_"))
+    for wanted, widths in (
+        ("", {}), ("all", {"label": 1, "albedo": 3}), ("albedo, label", {"albedo": 3, "label": 1})
+    ):  # fmt: skip
+        arguments = ["--channels", wanted] if wanted else []
+        result = octasplat("import", *arguments, tmp_path / "a.ply", tmp_path / "b.ply")
+        assert result.exit_code == 0, result.output
+        assert ("Channels: " + ", ".join(widths) in result.stdout) == bool(widths)
+        back, _ = read_gaussian_ply(tmp_path / "b.ply")
+        assert back.channels.widths == widths
+        if widths:
+            np.testing.assert_array_equal(back.channels["label"], label)
+    refused = octasplat("import", "--channels", "roughness", tmp_path / "a.ply", tmp_path / "c.ply")
+    assert refused.exit_code == 1 and "has no channel 'roughness'; it has label, albedo." in refused.stderr
+    octasplat("export", tmp_path / "b.ply", tmp_path / "a.spz")
+    none = octasplat("import", "--channels", "label", tmp_path / "a.spz", tmp_path / "c.ply")
+    assert none.exit_code == 1 and "the format spz has no place for channels" in none.stderr

@@ -6,8 +6,8 @@ import numpy as np
 
 from engine.edit.local_maps import legs_world
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.rows import row_arrays
 
-FIELDS = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh")
 Map = Callable[[np.ndarray], np.ndarray]
 
 
@@ -22,8 +22,9 @@ def covariance_errors(actual: FlatGaussians, expected: np.ndarray) -> np.ndarray
 
 
 def assert_same(actual: FlatGaussians, expected: FlatGaussians) -> None:
-    for field in FIELDS:
-        np.testing.assert_array_equal(getattr(actual, field), getattr(expected, field), err_msg=field)
+    wanted = row_arrays(expected)
+    for name, array in row_arrays(actual).items():
+        np.testing.assert_array_equal(array, wanted[name], err_msg=name)
 
 
 def random_turn(seed: int) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 
 from engine.errors import SceneFileError
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.files.ply_container import read_ply
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
 
@@ -292,3 +293,61 @@ def test_files_of_other_programs_are_read(tmp_path: Path, name: str) -> None:
     back, again = read_gaussian_ply(tmp_path / "own.ply")
     assert_same_bits(back, g)
     assert again.flattened == 0
+
+
+def test_channels_are_properties_by_name(make_gaussians: Make, tmp_path: Path) -> None:
+    g = make_gaussians(5)
+    albedo = np.arange(15, dtype=np.float32).reshape(5, 3)
+    metallic = np.arange(5, dtype=np.float32)[:, None]
+    write_gaussian_ply(g.with_channels({"metallic": metallic, "albedo": albedo}), tmp_path / "a.ply")
+    header, tables = read_ply(tmp_path / "a.ply", ["vertex"])
+    assert tables["vertex"].dtype.names[-4:] == ("metallic", "albedo_0", "albedo_1", "albedo_2")
+    assert header.comments == ("octasplat_channel metallic 1", "octasplat_channel albedo 3")
+    np.testing.assert_array_equal(tables["vertex"]["albedo_2"], albedo[:, 2])
+    assert_same_bits(read_gaussian_ply(tmp_path / "a.ply", channels=())[0], g)
+
+
+def test_unknown_properties_become_channels_where_they_are_wanted(
+    make_gaussians: Make, tmp_path: Path
+) -> None:
+    g = make_gaussians(6)
+    own = columns_of(g)
+    extra = {
+        "semantic_1": np.arange(6), "Label": np.arange(6) * 2, "semantic_0": np.arange(6) * 3,
+        "red": np.full(6, 255), "odd-name": np.zeros(6), "lonely_4": np.ones(6),
+    }  # fmt: skip
+    path = write_columns(tmp_path / "a.ply", {**own, **{k: v.astype(np.float32) for k, v in extra.items()}})
+    assert read_gaussian_ply(path)[0].channels.widths == {}
+    found, _ = read_gaussian_ply(path, channels="all")
+    assert found.channels.widths == {"semantic": 2, "Label": 1, "lonely_4": 1}
+    np.testing.assert_array_equal(found.channels["semantic"], np.stack([np.arange(6) * 3, np.arange(6)], 1))
+    chosen, _ = read_gaussian_ply(path, channels=("Label",))
+    assert chosen.channels.widths == {"Label": 1}
+    write_gaussian_ply(found, tmp_path / "b.ply")
+    assert read_gaussian_ply(tmp_path / "b.ply")[0].channels.widths == found.channels.widths
+    with pytest.raises(
+        SceneFileError, match=r"a\.ply: has no channel 'albedo'; it has semantic, Label, lonely_4"
+    ):
+        read_gaussian_ply(path, channels=("albedo",))
+
+
+def test_channels_that_are_not_finite_are_refused_by_name(make_gaussians: Make, tmp_path: Path) -> None:
+    g = make_gaussians(4)
+    label = np.array([0, np.nan, 2, 3], np.float32)
+    path = write_columns(tmp_path / "a.ply", {**columns_of(g), "label": label})
+    with pytest.raises(SceneFileError, match=r"1 of 4 Gaussians have no finite label"):
+        read_gaussian_ply(path, channels="all")
+    kept, report = read_gaussian_ply(path, channels="all", drop_invalid=True)
+    assert kept.channels["label"][:, 0].tolist() == [0, 2, 3] and report.dropped == 1
+
+
+@pytest.mark.parametrize(
+    "comment", ["octasplat_channel albedo 3", "octasplat_channel x 1", "octasplat_channel"]
+)
+def test_comments_that_promise_what_is_not_there_are_passed_over(
+    make_gaussians: Make, tmp_path: Path, comment: str
+) -> None:
+    write_gaussian_ply(make_gaussians(4), tmp_path / "a.ply")
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(content.replace(b"element", f"comment {comment}\nelement".encode(), 1))
+    assert read_gaussian_ply(tmp_path / "a.ply")[0].channels.widths == {}

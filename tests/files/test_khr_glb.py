@@ -197,3 +197,35 @@ def test_what_is_no_splat_is_refused(make_scene: Make, tmp_path: Path) -> None:
     document["accessors"][0]["count"] = 10**9
     with pytest.raises(SceneFileError, match="damaged or not understood"):
         read_scene(join(tmp_path / "b.glb", document, binary))
+
+
+def test_attributes_of_other_programs_become_channels_where_they_are_wanted(
+    make_scene: Make, tmp_path: Path
+) -> None:
+    scene = make_scene(30)
+    albedo = np.random.default_rng(0).random((30, 3), np.float32)
+    export_scene(scene.with_channels({"albedo": albedo}), tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    np.testing.assert_array_equal(attribute(document, binary, "_ALBEDO"), albedo)
+    del document["asset"]["extras"]  # as if somebody else had written it
+    foreign = join(tmp_path / "b.glb", document, binary)
+    assert read_scene(foreign)[0].channels.widths == {}
+    np.testing.assert_array_equal(read_scene(foreign, channels="all")[0].channels["albedo"], albedo)
+    with pytest.raises(SceneFileError, match=r"b\.glb: has no channel 'label'; it has albedo"):
+        read_scene(foreign, channels=("label",))
+
+
+def test_primitives_without_a_channel_get_zeros(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(10).with_channels({"label": np.arange(10, dtype=np.float32)[:, None]})
+    export_scene(scene, tmp_path / "a.splats.glb")
+    document, binary = parts(tmp_path / "a.splats.glb")
+    primitives = document["meshes"][0]["primitives"]
+    bare = json.loads(json.dumps(primitives[0]))
+    del bare["attributes"]["_LABEL"]
+    primitives.insert(0, bare)
+    back, _ = read_scene(join(tmp_path / "b.glb", document, binary))
+    assert back.channels["label"][:, 0].tolist() == [0.0] * 10 + list(range(10))
+    primitives[1]["attributes"]["_LABEL"] = document["meshes"][0]["primitives"][1]["attributes"]["POSITION"]
+    document["asset"]["extras"] = {"octasplat_channels": {"label": "many"}}
+    with pytest.raises(SceneFileError, match="its glTF is damaged"):
+        read_scene(join(tmp_path / "c.glb", document, binary))

@@ -138,3 +138,14 @@ def test_trimesh_reads_the_same_octagons_colours_and_texture_coordinates(
     colours = np.asarray(mesh.vertex_attributes["color"])[::8, :3].astype(np.float64)
     colours /= 255.0 if colours.max() > 1.0 else 1.0
     np.testing.assert_allclose(colours, np.clip(scene.base_rgb_srgb, 0, 1)[ids], atol=0.51 / 255)
+
+
+def test_mesh_ply_holds_channels(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(40)
+    albedo = np.random.default_rng(0).random((40, 3), np.float32)
+    export_scene(scene.with_channels({"albedo": albedo}), tmp_path / "mesh.ply")
+    header, tables = read_ply(tmp_path / "mesh.ply", ["vertex"])
+    assert "octasplat_channel albedo 3" in header.comments
+    vertex = tables["vertex"]
+    found = np.stack([vertex[f"albedo_{place}"] for place in range(3)], axis=1)
+    np.testing.assert_array_equal(found, albedo[vertex["gid"].astype(np.int64)])

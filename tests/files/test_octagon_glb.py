@@ -243,3 +243,19 @@ def test_the_opaque_variant_cuts_alpha_and_loses_nothing_above_the_cut(
     rho2 = ExportOptions().q * np.sum((2 * middles.astype(np.float64) - 1) ** 2, axis=1)
     alpha = arrays["COLOR_0"][:, 3] * np.exp(-rho2 / 2)
     np.testing.assert_allclose(alpha, OPAQUE_CUTOFF, rtol=1e-4)
+
+
+def test_channels_are_attributes_of_every_corner(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(1200)
+    random = np.random.default_rng(0)
+    albedo, spectrum = random.random((1200, 3), np.float32), random.random((1200, 5), np.float32)
+    scene = scene.with_channels({"albedo": albedo, "spectrum": spectrum})
+    export_scene(scene, tmp_path / "a.glb", ExportOptions(chunks=2))
+    glb = Glb(tmp_path / "a.glb")
+    assert glb.json["asset"]["extras"]["octasplat_channels"] == {"albedo": 3, "spectrum": 5}
+    assert len(glb.primitives()) == 2
+    for primitive in glb.primitives():
+        ids = primitive["_GID"].astype(np.int64)
+        np.testing.assert_array_equal(primitive["_ALBEDO"], albedo[ids])
+        for place in range(5):
+            np.testing.assert_array_equal(primitive[f"_SPECTRUM_{place}"], spectrum[ids, place])

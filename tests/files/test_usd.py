@@ -77,3 +77,17 @@ def test_without_usd_core_it_says_what_to_install(
     with pytest.raises(SceneFileError, match=r"a\.usdz: needs the package usd-core; .*pip install 'usd-core"):
         export_scene(make_scene(3), tmp_path / "a.usdz")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_channels_are_primvars(make_scene: Make, tmp_path: Path) -> None:
+    from pxr import UsdGeom
+
+    albedo, label = np.random.default_rng(0).random((20, 3), np.float32), np.arange(20, dtype=np.float32)
+    scene = make_scene(20).with_channels({"albedo": albedo, "label": label[:, None]})
+    export_scene(scene, tmp_path / "a.usda")
+    stage = usd.Stage.Open(str(tmp_path / "a.usda"))
+    primvars = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/octasplat/gaussians"))
+    for name, array in (("albedo", albedo), ("label", label[:, None])):
+        primvar = primvars.GetPrimvar(name)
+        assert (primvar.GetInterpolation(), primvar.GetElementSize()) == ("vertex", array.shape[1])
+        np.testing.assert_array_equal(np.array(primvar.Get()).reshape(array.shape), array)

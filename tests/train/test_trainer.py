@@ -1,7 +1,6 @@
 """The loop on a painted plane: it learns, it stops and goes on, it fails in words."""
 
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from flat_world import FlatWorld, small_config
 from engine.errors import Cancelled, TrainingFailure
 from engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.rows import row_arrays
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint, save_best
 from engine.train.config import McmcConfig, PaperConfig, TrainConfig
 from engine.train.state import TrainState, fresh_state
@@ -42,7 +42,7 @@ def train(
 
 
 def content(gaussians: FlatGaussians) -> list[bytes]:
-    return [getattr(gaussians, field.name).tobytes() for field in fields(FlatGaussians)]
+    return [array.tobytes() for array in row_arrays(gaussians).values()]
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from engine.errors import ConfigError, SceneFileError
 from engine.files import Mesh, export_scene, exporter_for, read_mesh
 from engine.gaussians.model import FlatGaussians
 from engine.writing import write_json
-from workers.cli.scene_files import open_scene
+from workers.cli.scene_files import open_scene, warn_of_lost_channels
 
 Say = Callable[[str], None]
 
@@ -96,8 +96,10 @@ def targets_for(output: Path, sources: Sequence[Path], inputs: Sequence[Path]) -
     return tuple(targets)
 
 
-def write_scene(gaussians: FlatGaussians, target: Path, say: Say) -> None:
-    """Write a scene in the format of its name and tell so."""
+def write_scene(gaussians: FlatGaussians, target: Path, say: Say, *, warn: bool = True) -> None:
+    """Write a scene in the format of its name and tell so, and with ``warn`` what the format leaves out."""
+    if warn:
+        warn_of_lost_channels(gaussians, target)
     export_scene(gaussians, target)
     say(f"Wrote {target} ({len(gaussians):,} Gaussians).")
 
@@ -136,7 +138,7 @@ def run_edit(
                 click.echo(warning, err=True)
         for line in edit_lines(path, report):
             say(line)
-        write_scene(result, target, say)
+        write_scene(result, target, say, warn=target == targets[0])
         reports.append({"mesh": str(path), "output": str(target), **asdict(report)})
     if report_path is not None:
         write_json(report_path, reports)
@@ -235,7 +237,7 @@ def run_deform(
         result, report = deform_to(gaussians, corners, binding.deform(vertices), binding.mirrored(vertices))
         for line in deform_lines(path, report):
             say(line)
-        write_scene(result, target, say)
+        write_scene(result, target, say, warn=target == targets[0])
         reports.append({"deformed": str(path), "output": str(target), **asdict(report)})
     if report_path is not None:
         write_json(report_path, reports)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from engine.files import read_scene
+from engine.files import lost_channels, read_scene
 from engine.gaussians.flattening import ImportReport
 from engine.gaussians.model import FlatGaussians
 
@@ -25,6 +25,16 @@ def open_scene(path: Path, *, drop_invalid: bool = False, quiet: bool = False) -
         if not quiet or line.startswith("Warning"):
             click.echo(line, err=True)
     return gaussians
+
+
+def warn_of_lost_channels(gaussians: FlatGaussians, target: Path, format_name: str | None = None) -> None:
+    """Tell on stderr which named channels of a scene the format of ``target`` will leave out.
+
+    Raises:
+        SceneFileError: there is no such format.
+    """
+    if text := lost_channels(gaussians, target, format_name):
+        click.echo(f"Warning: {text}", err=True)
 
 
 def losses(path: Path, report: ImportReport) -> tuple[str, ...]:

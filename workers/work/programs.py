@@ -8,10 +8,9 @@ from typing import Any
 
 from engine.config import read_config
 from engine.errors import ExportFailed
-from engine.events import Event, StageFinished, StageProgress, broadcast
+from engine.events import Event, StageFinished, StageProgress, Warned, broadcast
 from engine.files import ExportOptions
 from engine.files.gaussian_ply import read_gaussian_ply
-from engine.files.options import ExportOptions
 from engine.files.several import export_files
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
@@ -94,7 +93,8 @@ def export(task: Task) -> None:
             task.results,
             options.files,
             settings,
-            lambda done: tell(StageProgress("export", done, count)),
+            on_done=lambda done: tell(StageProgress("export", done, count)),
+            on_loss=lambda text: tell(Warned(text)),
         )
     if failed is not None:
         raise ExportFailed(failed)

@@ -103,8 +103,7 @@ class Mcmc:
         made = gaussians.select(chosen)
         spread = rng.standard_normal((wanted, 2)) * made.scales
         made.means_world += np.einsum("nij,nj->ni", made.rotations[:, :, 1:], spread).astype(np.float32)
-        for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):
-            getattr(gaussians, name)[dead] = getattr(made, name)[: len(dead)]
+        gaussians.put(dead, made.view(slice(len(dead))))
         adam.reset(dead)
         if born == 0:
             return gaussians, adam

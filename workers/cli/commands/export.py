@@ -86,7 +86,7 @@ def export(
     """
     from engine.files import ExportOptions, export_scene, exporter_for
     from engine.gaussians.octagon import CHI2_2_99
-    from workers.cli.scene_files import open_scene
+    from workers.cli.scene_files import open_scene, warn_of_lost_channels
     from workers.cli.signals import orderly_termination
 
     exporter = exporter_for(target, format_name)  # complain before the long work
@@ -103,6 +103,7 @@ def export(
         ids=not no_ids,
         spz_version=4 if spz_version == "4" else 3,
     )
+    warn_of_lost_channels(gaussians, target, exporter.name)
     with orderly_termination():
         files = export_scene(gaussians, target, options, exporter.name)
     for path in files:

@@ -8,6 +8,7 @@ import click
 from workers.cli.options import quiet_option
 
 if TYPE_CHECKING:
+    from engine.files import ChannelChoice
     from engine.gaussians.flattening import ImportReport
 
 
@@ -21,6 +22,13 @@ if TYPE_CHECKING:
 @click.option(
     "--sh-degree", type=click.IntRange(0, 3), help="Keep the spherical harmonics up to this degree only."
 )
+@click.option(
+    "--channels",
+    metavar="NAMES",
+    default="",
+    help="Further numbers of each Gaussian to keep, as albedo,metallic; all for whatever is there.  "
+    "[default: those that octasplat wrote]",
+)
 @quiet_option
 def import_(
     source: Path,
@@ -28,6 +36,7 @@ def import_(
     format_name: str | None,
     drop_invalid: bool,
     sh_degree: int | None,
+    channels: str,
     quiet: bool,
 ) -> None:
     """Read IN, a scene of Gaussians in any known format, and write OUT.ply in the layout of 3DGS.
@@ -45,7 +54,9 @@ def import_(
     if target.suffix.lower() != ".ply":
         raise click.UsageError(f"{target} should end in .ply; octasplat export writes the other formats.")
     with orderly_termination(), show_progress(quiet=quiet) as listener:
-        gaussians, report = read_scene(source, format_name, drop_invalid=drop_invalid, listener=listener)
+        gaussians, report = read_scene(
+            source, format_name, drop_invalid=drop_invalid, channels=_choice(channels), listener=listener
+        )
         for line in losses(source, report):
             if not quiet or line.startswith("Warning"):
                 click.echo(line, err=True)
@@ -55,7 +66,15 @@ def import_(
     if not quiet:
         for line in _summary(report):
             click.echo(line)
+        if gaussians.channels:
+            click.echo(f"Channels: {', '.join(gaussians.channels)}.")
         click.echo(f"Wrote {target} ({target.stat().st_size / 1e6:.1f} MB).")
+
+
+def _choice(channels: str) -> "ChannelChoice":
+    if channels in ("", "all"):
+        return "all" if channels else "own"
+    return tuple(name.strip() for name in channels.split(","))
 
 
 def _summary(report: "ImportReport") -> tuple[str, ...]:

@@ -17,7 +17,10 @@ from workers.cli.options import quiet_option
 )
 @quiet_option
 def merge(sources: tuple[Path, ...], output: Path, sh_degree: int | None, quiet: bool) -> None:
-    """Put all Gaussians of two or more scenes into one file, each where it is in its own frame."""
+    """Put all Gaussians of two or more scenes into one file, each where it is in its own frame.
+
+    Named channels that only some of the scenes have are 0 for the Gaussians of the others.
+    """
     if len(sources) < 2:
         raise click.UsageError("Name at least two scenes.")
 
@@ -29,4 +32,8 @@ def merge(sources: tuple[Path, ...], output: Path, sh_degree: int | None, quiet:
     (target,) = targets_for(output, [sources[0]], sources)
     with orderly_termination():
         scenes = [open_scene(source, quiet=quiet) for source in sources]
+        every = dict.fromkeys(name for scene in scenes for name in scene.channels)
+        for source, scene in zip(sources, scenes, strict=True):
+            if missing := ", ".join(name for name in every if name not in scene.channels):
+                click.echo(f"Warning: {source}: has no channel {missing}; it is 0 there.", err=True)
         write_scene(merge_scenes(scenes, sh_degree), target, speaker(quiet))

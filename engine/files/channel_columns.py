@@ -1,0 +1,44 @@
+"""Which columns of a file are channels of its Gaussians, and which of them are wanted."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Literal
+
+from engine.errors import SceneFileError
+from engine.gaussians.channels import grouped, is_usable
+
+ChannelChoice = Literal["own", "all"] | tuple[str, ...]
+"""``own``: those that the file says are channels, as ours do; ``all``: every column of which nothing else is
+known, too; or names."""
+
+
+def chosen_columns(
+    path: Path, declared: Mapping[str, tuple[str, ...]], columns: Iterable[str], choice: ChannelChoice
+) -> dict[str, tuple[str, ...]]:
+    """The columns of each channel that is wanted, by the channel's name.
+
+    Args:
+        path: named in errors.
+        declared: the channels that the file itself names, with their columns; passed over where one of those
+            is missing or means something else.
+        columns: all that the file has, in its order.
+        choice: what is wanted.
+
+    Raises:
+        SceneFileError: a channel that was asked for by name is not there.
+    """
+    every = list(columns)
+    own = {
+        name: named for name, named in declared.items() if set(named) <= set(every) and is_usable(name, named)
+    }
+    taken = {column for named in own.values() for column in named}
+    rest = grouped(column for column in every if column not in taken)
+    known = {**own, **{name: named for name, named in rest.items() if is_usable(name, named)}}
+    if choice == "own":
+        return own
+    if choice == "all":
+        return known
+    for name in choice:
+        if name not in known:
+            raise SceneFileError(f"{path}: has no channel '{name}'; it has {', '.join(known) or 'none'}.")
+    return {name: known[name] for name in choice}

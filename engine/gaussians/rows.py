@@ -1,0 +1,104 @@
+"""Tables with a row a Gaussian: what is done to one of their arrays is done to all.
+
+A table is a dataclass whose fields are arrays with a row for every Gaussian, named channels, or things that
+have no rows. No operation lists fields, so that none can forget one.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import Field, fields, replace
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+
+from engine.gaussians.channels import Channels
+
+Index = np.ndarray | slice
+
+
+@runtime_checkable
+class Table(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+T = TypeVar("T", bound=Table)
+
+
+def row_arrays(table: Table) -> dict[str, np.ndarray]:
+    """Every array of a table by the name of its field; a channel is called ``channels.<name>``."""
+    arrays: dict[str, np.ndarray] = {}
+    for field in fields(table):
+        value = getattr(table, field.name)
+        if isinstance(value, Channels):
+            arrays |= {f"{field.name}.{name}": array for name, array in value.items()}
+        elif isinstance(value, np.ndarray):
+            arrays[field.name] = value
+    return arrays
+
+
+def from_row_arrays(kind: Callable[..., T], arrays: Mapping[str, np.ndarray]) -> T:
+    """A table made of the arrays that :func:`row_arrays` gave; everything else has its default."""
+    values: dict[str, Any] = {}
+    channels: dict[str, dict[str, np.ndarray]] = {}
+    for name, array in arrays.items():
+        field, dot, channel = name.partition(".")
+        if dot:
+            channels.setdefault(field, {})[channel] = array
+        else:
+            values[field] = array
+    return kind(**values, **{field: Channels(named) for field, named in channels.items()})
+
+
+def map_rows(table: T, function: Callable[[np.ndarray], np.ndarray]) -> T:
+    """The table with ``function`` applied to each array; what has no rows is kept."""
+    changes: dict[str, Any] = {}
+    for field in fields(table):
+        value = getattr(table, field.name)
+        if isinstance(value, Channels):
+            changes[field.name] = value.map(function)
+        elif isinstance(value, np.ndarray):
+            changes[field.name] = function(value)
+    return replace(table, **changes)
+
+
+def select_rows(table: T, index: Index) -> T:
+    """The rows at ``index`` (integers, a mask or a slice), copied."""
+    return map_rows(table, lambda array: array[index].copy())
+
+
+def put_rows(table: Table, index: Index, other: Table) -> None:
+    """Overwrite the rows at ``index`` by all rows of ``other``, in place.
+
+    Raises:
+        ValueError: the tables do not have the same arrays.
+    """
+    arrays, values = row_arrays(table), row_arrays(other)
+    _check_alike([arrays, values])
+    for name, array in arrays.items():
+        array[index] = values[name]
+
+
+def join_rows(parts: Sequence[T]) -> T:
+    """All rows of ``parts``, in order; what has no rows is taken from the first.
+
+    Raises:
+        ValueError: the parts do not have the same arrays.
+    """
+    every = [row_arrays(part) for part in parts]
+    _check_alike(every)
+    joined = {name: np.concatenate([arrays[name] for arrays in every]) for name in every[0]}
+    whole = from_row_arrays(type(parts[0]), joined)
+    others = {
+        field.name: getattr(parts[0], field.name)
+        for field in fields(parts[0])
+        if not isinstance(getattr(parts[0], field.name), np.ndarray | Channels)
+    }
+    return replace(whole, **others)
+
+
+def _check_alike(every: Sequence[Mapping[str, np.ndarray]]) -> None:
+    for arrays in every[1:]:
+        if arrays.keys() != every[0].keys():
+            odd = ", ".join(sorted(arrays.keys() ^ every[0].keys()))
+            raise ValueError(f"some parts have {odd} and others have not")
