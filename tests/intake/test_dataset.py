@@ -73,7 +73,7 @@ def test_oddities_are_warned_of(local_storage: LocalStorage) -> None:
 
 
 def test_text_models_too(local_storage: LocalStorage) -> None:
-    lines = "\n".join(f"{i + 1} 1 0 0 0 0 0 4 1 v{i}.png\n" for i in range(4))
+    lines = "\n".join(f"{i + 1} 1 0 0 0 {i} 0 4 1 v{i}.png\n" for i in range(4))
     files = {
         "sparse/cameras.txt": b"1 PINHOLE 32 24 30 31 16 12\n",
         "sparse/images.txt": lines.encode() + b"\n",
