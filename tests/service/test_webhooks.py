@@ -2,20 +2,22 @@
 
 import asyncio
 import base64
+import socket
 import uuid
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from hook_receiver import Receiver, receiving
-from httpx_secure import SSRFProtectionError
 from service_bench import claimed, committed_dataset, running, with_token
 from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 
 from service.state import Service
 from workers.records.database import open_pool
+from workers.upkeep.webhooks import addresses
 from workers.upkeep.webhooks.addresses import AddressRefused, check_url
 from workers.upkeep.webhooks.outbox import WAITS_SECONDS, take_due
 from workers.upkeep.webhooks.sending import guarded_client, send_due
@@ -29,7 +31,7 @@ SECRET = "whsec_" + base64.b64encode(b"0123456789abcdef01234567").decode()
 def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
     def run(conversation: Conversation, **settings: Any) -> None:
         async def whole() -> None:
-            async with running(conninfo, tmp_path, webhook_hosts=HERE, **settings) as (http, service):
+            async with running(conninfo, tmp_path, **{"webhook_hosts": HERE, **settings}) as (http, service):
                 await conversation(http, service)
 
         asyncio.run(whole())
@@ -235,6 +237,10 @@ def test_two_senders_share_and_a_lost_one_is_replaced(talk: Callable[..., None],
         "https://localhost/", "https://printer.local/", "https://intranet/", "https://127.0.0.1/",
         "https://10.1.2.3/", "https://169.254.169.254/latest", "https://[::ffff:10.0.0.1]/",
         "https://[fd00::1]/", "https://100.64.0.1/", "https://example.org:99999/", "https://127.0.0.1./",
+        "https://127.1:8443/", "https://0x7f.1/", "https://0x7f.1./", "https://2130706433/", "https://0177.0.0.1/",
+        "https://127.0.0.0x1/", "https://127.0.0.1.../", "https://10.1/", "https://[::127.0.0.1]/",
+        "https://[64:ff9b::10.0.0.1]/", "https://[2002:7f00:1::]/", "https://１２７.0.0.1/", "https://127。0。0。1/",
+        "https://example.1/", "https://example.0x/",
     ],
 )  # fmt: skip
 def test_addresses_that_are_refused(url: str) -> None:
@@ -254,18 +260,92 @@ def test_addresses_that_are_taken() -> None:
 @pytest.mark.parametrize(
     "host",
     ["127.0.0.1", "[::1]", "[::ffff:127.0.0.1]", "2130706433", "0x7f000001", "localhost", "[64:ff9b::7f00:1]",
-     "100.64.0.1", "169.254.169.254", "[fd00::1]", "224.0.0.1", "0.0.0.0"],
+     "100.64.0.1", "169.254.169.254", "[fd00::1]", "224.0.0.1", "0.0.0.0", "127.1", "0x7f.1",
+     "[::127.0.0.1]", "127。0。0。1"],
 )  # fmt: skip
 def test_connections_into_inner_networks_are_not_made(host: str, allowed: tuple[str, ...]) -> None:
-    with receiving() as receiver:
+    """Not even to see whether there is somebody: what is asked is the same for a port that is open."""
+    with listening() as (port, accepted):
 
         async def try_it() -> None:
             async with guarded_client(allowed) as client:
-                with pytest.raises(SSRFProtectionError):
-                    await client.post(f"http://{host}:{receiver.port}/hook", content=b"x")
+                with pytest.raises(AddressRefused):
+                    await client.post(f"http://{host}:{port}/hook", content=b"x")
 
         asyncio.run(try_it())
-        assert receiver.heard == []
+        assert accepted() == 0
+
+
+@contextmanager
+def listening() -> Iterator[tuple[int, Callable[[], int]]]:
+    """A port that is open, and how many connections it was asked for."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+
+        def accepted() -> int:
+            count = 0
+            with suppress(BlockingIOError):
+                while True:
+                    server.accept()[0].close()
+                    count += 1
+            return count
+
+        yield server.getsockname()[1], accepted
+
+
+class Names:
+    """What names are looked up to, one answer after the other and then the last for good."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **answers: list[str]) -> None:
+        self.asked: list[str] = []
+        self._answers = answers
+        self._ask = socket.getaddrinfo
+        monkeypatch.setattr(socket, "getaddrinfo", self._look_up)
+
+    def _look_up(self, host: Any, *arguments: Any, **more: Any) -> Any:
+        answers = self._answers.get(str(host).partition(".")[0])
+        if answers is None:
+            return self._ask(host, *arguments, **more)
+        self.asked.append(host)
+        found = answers.pop(0) if len(answers) > 1 else answers[0]
+        return [entry for each in found.split() for entry in self._ask(each, *arguments, **more)]
+
+
+@pytest.mark.parametrize("found", ["127.0.0.1", "93.184.216.34 127.0.0.1", "::ffff:127.0.0.1"])
+def test_a_name_with_an_inner_address_opens_nothing(
+    talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch, found: str
+) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with listening() as (port, accepted):
+            monkeypatch.setattr(addresses, "PORTS", (port,))
+            names = Names(monkeypatch, hooks=[found])
+            answer = await http.post("/v1/webhooks", json={"url": f"https://hooks.example.org:{port}/"})
+            assert answer.status_code == 201 and names.asked == []
+            await http.post(f"/v1/webhooks/{answer.json()['id']}/test")
+            assert await send_due(service.pool, HERE) == 1
+            (told,) = await deliveries(http, answer.json())
+            assert told["state"] == "pending" and "network" in told["error"]
+            assert names.asked == ["hooks.example.org"] and accepted() == 0
+
+    talk(conversation)
+
+
+def test_what_was_looked_up_is_what_is_connected_to(
+    talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving() as receiver:
+            # The second answer comes too late for anybody to use it; 127.0.0.2 does not answer at all.
+            names = Names(monkeypatch, hooks=["127.0.0.2 127.0.0.1", "127.0.0.3"])
+            hook = await make(http, receiver, url=f"http://hooks.inner.example:{receiver.port}/hook")
+            await http.post(f"/v1/webhooks/{hook['id']}/test")
+            await send_due(service.pool, (*HERE, "hooks.inner.example"))
+            ((_, headers, body),) = receiver.heard
+            assert headers["host"] == f"hooks.inner.example:{receiver.port}"
+            assert names.asked == ["hooks.inner.example"]
+            assert Webhook(hook["secret"]).verify(body, headers)["type"] == "webhook.test"
+
+    talk(conversation, webhook_hosts=(*HERE, "hooks.inner.example"))
 
 
 def test_name_that_leads_inside_is_found_out_when_sending(talk: Callable[..., None]) -> None:

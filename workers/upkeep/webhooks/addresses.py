@@ -1,12 +1,18 @@
 """Which addresses messages are sent to."""
 
 import ipaddress
+import re
+import unicodedata
 from urllib.parse import urlsplit
 
 from engine.errors import OctasplatError
 
 PORTS = (443, 8443)
 MAX_URL = 2000
+IPAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
+# Behind these, the last 32 bits are an IPv4 address that is meant.
+_EMBEDDING = (ipaddress.IPv6Network("64:ff9b::/96"), ipaddress.IPv6Network("::/96"))
+_NUMBER = re.compile(r"[0-9]+|0[xX][0-9a-fA-F]*")
 
 
 class AddressRefused(OctasplatError):
@@ -48,13 +54,37 @@ def check_url(url: str, allowed_hosts: tuple[str, ...] = ()) -> str:
 
 def is_allowed(host: str, allowed_hosts: tuple[str, ...]) -> bool:
     """Whether a host may be an inner one."""
-    return host.lower() in {name.lower() for name in allowed_hosts}
+    return host.lower().rstrip(".") in {name.lower() for name in allowed_hosts}
+
+
+def read_address(text: str) -> IPAddress:
+    """A numeric address, also with the zone of a link.
+
+    Raises:
+        ValueError: it is none.
+    """
+    return ipaddress.ip_address(text.partition("%")[0])
+
+
+def is_public(address: IPAddress) -> bool:
+    """Whether an address is one of the public network, also where it stands for an IPv4 address."""
+    if isinstance(address, ipaddress.IPv6Address):
+        embedded = address.ipv4_mapped or address.sixtofour
+        if embedded is None and any(address in network for network in _EMBEDDING):
+            embedded = ipaddress.IPv4Address(address.packed[-4:])
+        if embedded is not None:
+            return embedded.is_global and not embedded.is_multicast
+    return address.is_global and not address.is_multicast
 
 
 def _is_inner(host: str) -> bool:
     """Whether it is surely an inner one; what a name leads to is only known when it is looked up."""
+    # Full-width digits and dots are plain ones to whoever looks the name up.
+    name = unicodedata.normalize("NFKC", host).replace("\N{IDEOGRAPHIC FULL STOP}", ".").lower().rstrip(".")
     try:
-        return not ipaddress.ip_address(host).is_global
+        return not is_public(read_address(name))
     except ValueError:
-        name = host.lower()
-        return "." not in name or name.endswith((".localhost", ".local", ".internal", ".home.arpa"))
+        pass
+    if _NUMBER.fullmatch(name.rpartition(".")[2]):
+        return True  # 127.1, 0x7f.1 or 2130706433: an address in a spelling that hides which one
+    return "." not in name or name.endswith((".localhost", ".local", ".internal", ".home.arpa"))

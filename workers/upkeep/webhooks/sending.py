@@ -1,15 +1,14 @@
 """Sending messages to addresses that others chose."""
 
 import asyncio
-import ipaddress
 import logging
 from datetime import UTC, datetime
 
 import httpx
-from httpx_secure import SSRFProtectionError, httpx_ssrf_protection
 
 from workers.records.database import Pool
-from workers.upkeep.webhooks.addresses import AddressRefused, check_url, is_allowed
+from workers.upkeep.webhooks.addresses import AddressRefused, check_url
+from workers.upkeep.webhooks.guarding import GuardedTransport
 from workers.upkeep.webhooks.outbox import Outcome, settle, take_due
 from workers.upkeep.webhooks.rows import Delivery, Endpoint
 from workers.upkeep.webhooks.signing import message
@@ -46,21 +45,13 @@ async def send_due(pool: Pool, allowed_hosts: tuple[str, ...] = ()) -> int:
 
 def guarded_client(allowed_hosts: tuple[str, ...] = ()) -> httpx.AsyncClient:
     """A client that connects to addresses of the public network only, and to what ``allowed_hosts`` names."""
-
-    def may_connect(
-        hostname: str, address: ipaddress.IPv4Address | ipaddress.IPv6Address, _port: int
-    ) -> bool:
-        return is_allowed(hostname, allowed_hosts) or _is_public(address)
-
     # No proxy of the environment, as it would be the proxy that looks names up.
-    client = httpx.AsyncClient(
+    inner = httpx.AsyncHTTPTransport(trust_env=False, limits=httpx.Limits(max_keepalive_connections=0))
+    return httpx.AsyncClient(
         trust_env=False,
         follow_redirects=False,
         timeout=TIMEOUT_SECONDS,
-        limits=httpx.Limits(max_keepalive_connections=0),
-    )
-    return httpx_ssrf_protection(
-        client, check_globally_reachable=not allowed_hosts, custom_validator=may_connect
+        transport=GuardedTransport(allowed_hosts, inner),
     )
 
 
@@ -76,7 +67,7 @@ async def send(
             client.stream("POST", endpoint.url, content=body, headers=headers) as answer,
         ):
             status = answer.status_code
-    except (AddressRefused, SSRFProtectionError):
+    except AddressRefused:
         return Outcome(None, "The address leads into a network that messages are not sent to.")
     except (TimeoutError, httpx.TimeoutException):
         return Outcome(None, f"There was no answer within {TIMEOUT_SECONDS:g} s.")
@@ -97,17 +88,3 @@ async def _send(
         logger.info("message %s of webhook %s: %s", delivery.id, endpoint.id, outcome.error)
     async with pool.connection() as connection:
         await settle(connection, delivery, outcome)
-
-
-def _is_public(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
-    """Whether an address is one of the public network, also where it stands for an IPv4 address."""
-    if isinstance(address, ipaddress.IPv6Address):
-        embedded = address.ipv4_mapped or address.sixtofour
-        if embedded is None and address in _NAT64:
-            embedded = ipaddress.IPv4Address(address.packed[-4:])
-        if embedded is not None:
-            return embedded.is_global and not embedded.is_multicast
-    return address.is_global and not address.is_multicast
-
-
-_NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
