@@ -20,7 +20,7 @@ import psutil
 from PIL import Image
 
 from engine.config import resolve_config
-from workers.work.kinds.estimates import Sizes, estimate_reconstruction
+from workers.records.sizes import Sizes, estimate_reconstruction
 from workers.work.kinds.options import ReconstructOptions
 
 

@@ -1,7 +1,16 @@
 """How many threads the libraries below may take: numba's kernels, torch, and through the tracer Embree."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+
+def available_threads() -> int:
+    """Most threads that can be used: ``NUMBA_NUM_THREADS``, or the cores this process may run on."""
+    limit = os.environ.get("NUMBA_NUM_THREADS", "")
+    if limit.isdigit() and int(limit) > 0:
+        return int(limit)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def use_threads(threads: int) -> int:

@@ -10,10 +10,11 @@ from service.auth import Principal
 from service.problems import Problem
 from service.settings import ServiceSettings
 from workers.records.rows import WorkerRow
+from workers.records.sizes import Sizes
 from workers.settings import PREFIX
 from workers.work.kinds import JobKind
 from workers.work.kinds.demands import excesses
-from workers.work.kinds.estimates import Estimate, Sizes
+from workers.work.kinds.estimates import Estimate
 
 
 def check_ceilings(

@@ -13,7 +13,7 @@ from service.state import ServiceDep
 from workers.queue.jobs import get_job
 from workers.records.database import Connection
 from workers.records.datasets import get_dataset, photograph_sizes
-from workers.work.kinds.estimates import Sizes
+from workers.records.sizes import Sizes
 
 router = APIRouter(prefix="/v1/estimates", tags=["jobs"])
 

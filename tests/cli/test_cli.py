@@ -8,7 +8,7 @@ import pytest
 
 import engine
 from engine.files import exporters
-from workers.cli.options import available_threads
+from engine.threads import available_threads
 
 COMMANDS = ("reconstruct", "evaluate", "export", "render", "demo")
 HEAVY = ("torch", "numba", "pycolmap", "numpy", "pydantic", "OpenImageIO", "scipy")

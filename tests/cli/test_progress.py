@@ -17,8 +17,9 @@ from engine.events import (
     Warned,
 )
 from engine.stages import stopping
-from workers.cli.progress import Bars, PlainLines
-from workers.cli.wording import clock, duration, rate
+from workers.cli.progress import Bars, show_progress
+from workers.telling.lines import PlainLines
+from workers.telling.wording import clock, duration, rate
 
 TRAINING = TrainingProgress(
     iteration=310, total_iterations=1500, loss=0.1, psnr=24.13, gaussians=32000, rays_per_second=310_400,
@@ -51,7 +52,8 @@ def test_plain_lines_come_at_intervals():
 
 
 def test_warnings_go_to_stderr(capsys):
-    PlainLines(lambda _line: None)(Warned("The sky is green."))
+    with show_progress(quiet=True) as show:
+        show(Warned("The sky is green."))
     assert capsys.readouterr().err == "Warning: The sky is green.\n"
 
 

@@ -11,7 +11,7 @@ from workers.queue.attempts import Attempt, Result, claim
 from workers.queue.jobs import get_job
 from workers.records.database import open_pool
 from workers.store.local import LocalStorage
-from workers.told_events import journal_progress
+from workers.telling.events import journal_progress
 from workers.work.media_types import media_type
 
 LEFT_OUT = ("checkpoints", "cache")

@@ -1,6 +1,5 @@
 """Options that several commands share, and what they mean."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -8,16 +7,9 @@ from typing import Any, TypeVar
 import click
 
 from engine.errors import ConfigError
+from engine.threads import available_threads
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-
-def available_threads() -> int:
-    """Most threads that can be used: ``NUMBA_NUM_THREADS``, or the cores this process may run on."""
-    limit = os.environ.get("NUMBA_NUM_THREADS", "")
-    if limit.isdigit() and int(limit) > 0:
-        return int(limit)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _cap(_context: click.Context, _parameter: click.Parameter, value: int) -> int:

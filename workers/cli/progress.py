@@ -1,7 +1,6 @@
 """The engine's events as progress bars, or as plain lines where the output is no terminal."""
 
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
@@ -12,7 +11,6 @@ from rich.text import Text
 
 from engine.events import (
     Event,
-    HeldOutMeasured,
     Listener,
     StageFinished,
     StageProgress,
@@ -20,107 +18,10 @@ from engine.events import (
     TrainingProgress,
     Warned,
 )
-from workers.cli.wording import clock, duration, training_state
+from workers.telling.lines import DOING, PlainLines, StageState
+from workers.telling.wording import clock, training_state
 
-SECONDS_BETWEEN_LINES = 5.0
 _STOPPING = "Stopping at the next safe point; press Ctrl-C again to stop at once."
-_DOING = {
-    "load": "Loading",
-    "train": "Training",
-    "evaluate": "Evaluating",
-    "export": "Exporting",
-    "generate": "Generating",
-    "render": "Rendering",
-    "features": "Finding features",
-    "matches": "Matching",
-    "poses": "Finding poses",
-    "upload": "Uploading",
-    "download": "Downloading",
-    "read": "Reading",
-    "depth": "Rendering depth",
-    "fusing": "Fusing depth",
-    "meshing": "Meshing",
-    "unwrapping": "Unwrapping",
-    "colouring": "Colouring",
-}
-# What a finished stage did, and what its steps are; "" where nobody would want them counted.
-_DONE = {
-    "load": ("Loaded", "photograph"),
-    "train": ("Trained", "iteration"),
-    "evaluate": ("Evaluated", "held-out view"),
-    "export": ("Exported", "file"),
-    "generate": ("Generated", "photograph"),
-    "render": ("Rendered", "image"),
-    "features": ("Found features", "photograph"),
-    "matches": ("Matched", "pair"),
-    "poses": ("Found the poses", "photograph"),
-    "upload": ("Uploaded", "kB"),
-    "download": ("Downloaded", "kB"),
-    "read": ("Read", "file"),
-    "depth": ("Rendered", "depth map"),
-    "fusing": ("Fused the depth maps", ""),
-    "meshing": ("Made the mesh", ""),
-    "unwrapping": ("Cut the mesh open for the texture", ""),
-    "colouring": ("Coloured", "point"),
-}
-
-
-class _State:
-    """What both displays remember of the events so far."""
-
-    def __init__(self) -> None:
-        self.step = 0
-        self.held_out: HeldOutMeasured | None = None
-        self.training: TrainingProgress | None = None
-
-    def update(self, event: Event) -> None:
-        if isinstance(event, StageStarted):
-            self.step = 0
-        elif isinstance(event, StageProgress):
-            self.step = event.step
-        elif isinstance(event, TrainingProgress):
-            self.step, self.training = event.iteration, event
-        elif isinstance(event, HeldOutMeasured):
-            self.held_out = event
-
-    def finished(self, event: StageFinished) -> str:
-        verb, what = _DONE.get(event.stage, (f"Finished {event.stage}", "step"))
-        plural = "" if self.step == 1 or what == "kB" else "s"
-        count = f" {self.step:,} {what}{plural}" if self.step and what else ""
-        line = f"{verb}{count} in {duration(event.seconds)}"
-        if event.stage == "train" and self.training is not None:
-            line += f": {training_state(self.training, self.held_out)}"
-        return line
-
-
-class PlainLines:
-    """Writes a line at the start and end of a stage and every few seconds in between."""
-
-    def __init__(self, write: Callable[[str], None], every_seconds: float = SECONDS_BETWEEN_LINES) -> None:
-        self._write = write
-        self._every = every_seconds
-        self._next = 0.0
-        self._state = _State()
-
-    def __call__(self, event: Event) -> None:
-        """Show ``event``, or leave it out if the last line is only a moment old."""
-        self._state.update(event)
-        if isinstance(event, StageStarted):
-            self._write(_DOING.get(event.stage, event.stage))
-            self._next = time.monotonic() + self._every
-        elif isinstance(event, StageFinished):
-            self._write(self._state.finished(event))
-        elif isinstance(event, Warned):
-            click.echo(f"Warning: {event.message}", err=True)
-        elif isinstance(event, StageProgress | TrainingProgress) and time.monotonic() >= self._next:
-            self._next = time.monotonic() + self._every
-            self._write(self._line(event))
-
-    def _line(self, event: StageProgress | TrainingProgress) -> str:
-        if isinstance(event, StageProgress):
-            return f"  {event.step}/{event.total_steps}"
-        state = training_state(event, self._state.held_out)
-        return f"  {event.iteration}/{event.total_iterations}: {state}, {clock(event.seconds_left)} left"
 
 
 class _Bars(Progress):
@@ -152,7 +53,7 @@ class Bars:
 
     def __init__(self, console: Console, should_stop: Callable[[], bool]) -> None:
         self._console = console
-        self._state = _State()
+        self._state = StageState()
         self._task: TaskID | None = None
         self.bars = _Bars(console, should_stop)
 
@@ -175,7 +76,7 @@ class Bars:
     def _begin(self, event: StageStarted) -> None:
         self._end()
         self._task = self.bars.add_task(
-            _DOING.get(event.stage, event.stage), total=event.total_steps or None, count="", left=""
+            DOING.get(event.stage, event.stage), total=event.total_steps or None, count="", left=""
         )
 
     def _move(self, step: int, total: int, left: str = "") -> None:
@@ -204,11 +105,11 @@ def show_progress(
         should_stop: whether the user asked to stop, which the bar then acknowledges.
     """
     if quiet:
-        yield PlainLines(lambda _line: None)
+        yield PlainLines(lambda _line: None, warn=_complain)
         return
     console = Console(file=sys.stdout)
     if not sys.stdout.isatty() or console.is_dumb_terminal:
-        yield PlainLines(_echo)
+        yield PlainLines(_echo, warn=_complain)
         return
     display = Bars(console, should_stop)
     with display.bars:
@@ -218,3 +119,7 @@ def show_progress(
 def _echo(line: str) -> None:
     click.echo(line)
     sys.stdout.flush()
+
+
+def _complain(line: str) -> None:
+    click.echo(line, err=True)

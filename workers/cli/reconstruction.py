@@ -10,7 +10,7 @@ from engine.pipeline import reconstruct
 from engine.stages import stopping
 from workers.cli.progress import show_progress
 from workers.cli.signals import Stopped, stop_on_signals
-from workers.cli.wording import run_summary
+from workers.telling.wording import run_summary
 
 
 def run_reconstruction(

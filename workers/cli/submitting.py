@@ -7,10 +7,10 @@ from typing import Any
 import click
 
 from workers.cli.progress import show_progress
-from workers.cli.wording import run_summary
 from workers.client import submission
 from workers.client.api import TOKEN, Api
 from workers.client.submission import JobFailed, Submission
+from workers.telling.wording import run_summary
 
 DEMO_OUTPUT = Path("octasplat-demo")
 

@@ -9,7 +9,7 @@ import httpx
 
 from engine.events import Listener
 from workers.client.api import Api, check_stream
-from workers.told_events import TOLD_KINDS, told_event
+from workers.telling.events import TOLD_KINDS, told_event
 
 TERMINAL = frozenset({"succeeded", "failed", "canceled"})
 _PATIENCE_SECONDS = 120.0

@@ -11,7 +11,7 @@ from workers.records.database import Connection
 from workers.records.errors import Conflict
 from workers.records.ids import new_id
 from workers.records.rows import Dataset, DatasetFile
-from workers.work.kinds.estimates import Sizes
+from workers.records.sizes import Sizes
 
 
 async def create_dataset(connection: Connection, owner: str, name: str) -> Dataset:

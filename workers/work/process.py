@@ -18,7 +18,7 @@ from procrastinate.exceptions import ConnectorException
 
 import engine
 from engine.files import writable_formats
-from workers.cli.options import available_threads
+from engine.threads import available_threads
 from workers.parent import die_with_server
 from workers.queue.attempts import claim
 from workers.queue.jobs import get_job, queue_again

@@ -16,11 +16,11 @@ import psycopg
 from psycopg_pool import PoolTimeout
 
 from engine.events import Warned
-from workers.cli.progress import PlainLines
 from workers.queue.attempts import Attempt, Fenced
 from workers.queue.storing import storing
 from workers.store.errors import StorageError
-from workers.told_events import journal_progress, told_event
+from workers.telling.events import journal_progress, told_event
+from workers.telling.lines import PlainLines
 from workers.work.task import RUN
 from workers.work.workspace import Checkpoint, Workspace
 

@@ -23,7 +23,7 @@ def evaluate(output: Path, scene: Path | None, threads: int, quiet: bool) -> Non
     from engine.run_folder import CONFIG
     from workers.cli.progress import show_progress
     from workers.cli.signals import orderly_termination
-    from workers.cli.wording import run_summary
+    from workers.telling.wording import run_summary
 
     with orderly_termination(), show_progress(quiet=quiet) as listener:
         pipeline.evaluate(output, scene=scene, threads=threads, listener=listener)

@@ -6,9 +6,9 @@ from typing import cast
 from pydantic import BaseModel
 
 from engine.train.config import iteration_count, most_gaussians
+from workers.records.sizes import Sizes
 from workers.work.kinds.demands import Demand
 from workers.work.kinds.estimates import (
-    Sizes,
     estimate_reconstruction,
     estimate_render,
     rendered_pixels,

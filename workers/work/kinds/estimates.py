@@ -6,12 +6,12 @@ within a factor of two, not better. Imports neither torch nor numba.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from pydantic import BaseModel, computed_field
 
 from engine.train.config import TrainConfig, iteration_count, most_gaussians
-from workers.cli.wording import duration
+from workers.records.sizes import Sizes
+from workers.telling.wording import duration
 from workers.work.kinds.options import ReconstructOptions, RenderJobOptions
 
 _START_CPU_SECONDS = 16.0
@@ -38,15 +38,6 @@ _PIXEL_BYTES = 250
 _CORE_POWER = 0.79
 """Two cores train 1.73 times as fast as one."""
 _TYPICAL_RENDER_GAUSSIANS = 100_000
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """Photographs of one size: width and height in px, and how many there are."""
-
-    width_px: int
-    height_px: int
-    count: int
 
 
 class Estimate(BaseModel):

@@ -7,8 +7,9 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 
 from engine.errors import ConfigError
+from workers.records.sizes import Sizes
 from workers.work.kinds.demands import Demand
-from workers.work.kinds.estimates import Estimate, Sizes
+from workers.work.kinds.estimates import Estimate
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,12 @@
+"""How large the photographs of a dataset are."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Photographs of one size: width and height in px, and how many there are."""
+
+    width_px: int
+    height_px: int
+    count: int

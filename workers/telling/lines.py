@@ -1,0 +1,129 @@
+"""The engine's events as lines of text."""
+
+import time
+from collections.abc import Callable
+
+from engine.events import (
+    Event,
+    HeldOutMeasured,
+    StageFinished,
+    StageProgress,
+    StageStarted,
+    TrainingProgress,
+    Warned,
+)
+from workers.telling.wording import clock, duration, training_state
+
+SECONDS_BETWEEN_LINES = 5.0
+DOING = {
+    "load": "Loading",
+    "train": "Training",
+    "evaluate": "Evaluating",
+    "export": "Exporting",
+    "generate": "Generating",
+    "render": "Rendering",
+    "features": "Finding features",
+    "matches": "Matching",
+    "poses": "Finding poses",
+    "upload": "Uploading",
+    "download": "Downloading",
+    "read": "Reading",
+    "depth": "Rendering depth",
+    "fusing": "Fusing depth",
+    "meshing": "Meshing",
+    "unwrapping": "Unwrapping",
+    "colouring": "Colouring",
+}
+# What a finished stage did, and what its steps are; "" where nobody would want them counted.
+_DONE = {
+    "load": ("Loaded", "photograph"),
+    "train": ("Trained", "iteration"),
+    "evaluate": ("Evaluated", "held-out view"),
+    "export": ("Exported", "file"),
+    "generate": ("Generated", "photograph"),
+    "render": ("Rendered", "image"),
+    "features": ("Found features", "photograph"),
+    "matches": ("Matched", "pair"),
+    "poses": ("Found the poses", "photograph"),
+    "upload": ("Uploaded", "kB"),
+    "download": ("Downloaded", "kB"),
+    "read": ("Read", "file"),
+    "depth": ("Rendered", "depth map"),
+    "fusing": ("Fused the depth maps", ""),
+    "meshing": ("Made the mesh", ""),
+    "unwrapping": ("Cut the mesh open for the texture", ""),
+    "colouring": ("Coloured", "point"),
+}
+
+
+class StageState:
+    """What both displays remember of the events so far."""
+
+    def __init__(self) -> None:
+        self.step = 0
+        self.held_out: HeldOutMeasured | None = None
+        self.training: TrainingProgress | None = None
+
+    def update(self, event: Event) -> None:
+        """Remember what ``event`` tells."""
+        if isinstance(event, StageStarted):
+            self.step = 0
+        elif isinstance(event, StageProgress):
+            self.step = event.step
+        elif isinstance(event, TrainingProgress):
+            self.step, self.training = event.iteration, event
+        elif isinstance(event, HeldOutMeasured):
+            self.held_out = event
+
+    def finished(self, event: StageFinished) -> str:
+        """What the stage did and how long it took, as a line."""
+        verb, what = _DONE.get(event.stage, (f"Finished {event.stage}", "step"))
+        plural = "" if self.step == 1 or what == "kB" else "s"
+        count = f" {self.step:,} {what}{plural}" if self.step and what else ""
+        line = f"{verb}{count} in {duration(event.seconds)}"
+        if event.stage == "train" and self.training is not None:
+            line += f": {training_state(self.training, self.held_out)}"
+        return line
+
+
+class PlainLines:
+    """Writes a line at the start and end of a stage and every few seconds in between.
+
+    Args:
+        write: takes a line.
+        every_seconds: between two lines of one stage.
+        warn: takes a warning; by default as any other line.
+    """
+
+    def __init__(
+        self,
+        write: Callable[[str], None],
+        every_seconds: float = SECONDS_BETWEEN_LINES,
+        *,
+        warn: Callable[[str], None] | None = None,
+    ) -> None:
+        self._write = write
+        self._warn = warn or write
+        self._every = every_seconds
+        self._next = 0.0
+        self._state = StageState()
+
+    def __call__(self, event: Event) -> None:
+        """Show ``event``, or leave it out if the last line is only a moment old."""
+        self._state.update(event)
+        if isinstance(event, StageStarted):
+            self._write(DOING.get(event.stage, event.stage))
+            self._next = time.monotonic() + self._every
+        elif isinstance(event, StageFinished):
+            self._write(self._state.finished(event))
+        elif isinstance(event, Warned):
+            self._warn(f"Warning: {event.message}")
+        elif isinstance(event, StageProgress | TrainingProgress) and time.monotonic() >= self._next:
+            self._next = time.monotonic() + self._every
+            self._write(self._line(event))
+
+    def _line(self, event: StageProgress | TrainingProgress) -> str:
+        if isinstance(event, StageProgress):
+            return f"  {event.step}/{event.total_steps}"
+        state = training_state(event, self._state.held_out)
+        return f"  {event.iteration}/{event.total_iterations}: {state}, {clock(event.seconds_left)} left"
