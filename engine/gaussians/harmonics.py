@@ -6,13 +6,29 @@ value that the old one had at O^T d, and 2l + 1 or more directions in general po
 That needs no recursion over degrees and holds for whatever signs and order the basis has.
 """
 
+import math
 from functools import cache
 
 import numpy as np
 from jaxtyping import Float, Float32
 
+from engine.gaussians.model import SH_C0
+
 ROWS_AT_ONCE = 65536
 SAMPLES = 16
+
+
+def _norm(numerator: int, denominator: int) -> float:
+    return math.sqrt(numerator / (denominator * math.pi))
+
+
+SH_C1 = _norm(3, 4)
+SH_C2 = (_norm(15, 4), -_norm(15, 4), _norm(5, 16), -_norm(15, 4), _norm(15, 4) / 2)
+SH_C3 = (
+    -_norm(35, 32), _norm(105, 4), -_norm(21, 32), _norm(7, 16), -_norm(21, 32), _norm(105, 4) / 2,
+    -_norm(35, 32),
+)  # fmt: skip
+"""Factors of the harmonics of degree 1, 2 and 3, in order."""
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -20,18 +36,14 @@ def sh_basis(directions: Float[np.ndarray, "*n 3"], degree: int) -> Float[np.nda
     """Real harmonics of degree 0 to ``degree`` (at most 3) at unit directions, signs and order of 3DGS."""
     x, y, z = np.moveaxis(directions, -1, 0)
     xx, yy, zz = x * x, y * y, z * z
-    pi = np.pi
-    c1 = np.sqrt(3 / (4 * pi))
-    c2 = np.sqrt(15 / (4 * pi))
-    c30, c31, c32 = np.sqrt(35 / (32 * pi)), np.sqrt(105 / (4 * pi)), np.sqrt(21 / (32 * pi))
+    c1, c2, c3 = SH_C1, SH_C2, SH_C3
     functions = [
-        np.full_like(x, 0.5 / np.sqrt(pi)),
+        np.full_like(x, SH_C0),
         -c1 * y, c1 * z, -c1 * x,
-        c2 * x * y, -c2 * y * z, np.sqrt(5 / (16 * pi)) * (2 * zz - xx - yy), -c2 * x * z,
-        c2 / 2 * (xx - yy),
-        -c30 * y * (3 * xx - yy), c31 * x * y * z, -c32 * y * (4 * zz - xx - yy),
-        np.sqrt(7 / (16 * pi)) * z * (2 * zz - 3 * xx - 3 * yy),
-        -c32 * x * (4 * zz - xx - yy), c31 / 2 * z * (xx - yy), -c30 * x * (xx - 3 * yy),
+        c2[0] * x * y, c2[1] * y * z, c2[2] * (2 * zz - xx - yy), c2[3] * x * z, c2[4] * (xx - yy),
+        c3[0] * y * (3 * xx - yy), c3[1] * x * y * z, c3[2] * y * (4 * zz - xx - yy),
+        c3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+        c3[4] * x * (4 * zz - xx - yy), c3[5] * z * (xx - yy), c3[6] * x * (xx - 3 * yy),
     ]  # fmt: skip
     return np.stack(functions[: (degree + 1) ** 2], axis=-1)
 

@@ -13,7 +13,11 @@ def morton_codes(points: Float[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     cell = (points - low) / np.maximum(high - low, 1e-30) * 2**_BITS
     grid = np.clip(cell, 0, 2**_BITS - 1).astype(np.uint64)
-    return _spread(grid[:, 0]) | (_spread(grid[:, 1]) << np.uint64(1)) | (_spread(grid[:, 2]) << np.uint64(2))
+    return (
+        spread_bits(grid[:, 0])
+        | (spread_bits(grid[:, 1]) << np.uint64(1))
+        | (spread_bits(grid[:, 2]) << np.uint64(2))
+    )
 
 
 def morton_order(points: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
@@ -21,8 +25,8 @@ def morton_order(points: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     return np.argsort(morton_codes(points), kind="stable")
 
 
-def _spread(bits: UInt64[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
-    """Two zero bits between each of the low 21 bits."""
+def spread_bits(bits: UInt64[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
+    """Two zero bits between each of the low 21 bits; numba compiles this for single numbers as it is."""
     x = bits
     for shift, mask in (
         (32, 0x1F00000000FFFF),
