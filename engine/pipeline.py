@@ -3,15 +3,16 @@
 Each stage leaves its result on disk and is skipped when the result is there, so that a run that was stopped
 or killed goes on where it was.
 
-    load -> train (initialise, fit) -> scene.ply -> evaluate -> export
+    (features -> matches -> poses ->) load -> train (initialise, fit) -> scene.ply -> evaluate -> export
 """
 
 import hashlib
 import importlib.metadata
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,11 @@ from engine.export.registry import export_scene
 from engine.files import write_json
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply, write_gaussian_ply
+from engine.poses import find_poses
+from engine.poses.find import read_record
 from engine.scene import Dataset, write_held_out
+from engine.scene.colmap import has_model
+from engine.scene.load import photograph_folder
 from engine.threads import use_threads
 from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count, most_gaussians
@@ -46,7 +51,7 @@ from engine.train.trainer import Trainer, fresh_state, trace_settings
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json",
 )  # fmt: skip
-CHECKPOINTS, CACHE = "checkpoints", "cache"
+CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 MIN_POINTS = 50
 """Fewer sparse points than this are no use to begin from; random ones are taken."""
 
@@ -67,7 +72,8 @@ def reconstruct(
     ``checkpoints/``, ``config.json``, ``held_out.json`` and ``events.jsonl``.
 
     Args:
-        scene: folder with photographs and a COLMAP model, see :meth:`engine.scene.Dataset.open`.
+        scene: folder with photographs and a COLMAP model, see :meth:`engine.scene.Dataset.open`; one of
+            photographs alone, if ``config`` says that poses are to be found, which then are in ``poses/``.
         output: a folder that does not exist, is empty, or holds the same run if ``resume``.
         config: all settings.
         resume: go on with the run that is in ``output``.
@@ -76,7 +82,8 @@ def reconstruct(
         should_stop: asked now and then; True stops the run after a checkpoint.
 
     Raises:
-        DatasetError: the photographs or the model cannot be used.
+        DatasetError: the photographs or the model cannot be used, or no poses be found.
+        PosesCrashed: COLMAP died.
         OutputError: ``output`` holds something else or cannot be written.
         ConfigError: with ``resume``, other settings than the run's.
         TrainingFailure: training collapsed.
@@ -84,19 +91,25 @@ def reconstruct(
     """
     began = time.perf_counter()
     use_threads(threads)
+    is_made = not output.exists()
     is_new = _claim_output(scene, output, config, resume)
     events = JsonLinesListener(output / EVENTS)
     tell = broadcast([events, listener])
     try:
-        with _stage("load", tell):
-            try:
+        try:
+            _find_poses(scene, output, config, threads, tell, should_stop)
+            with _stage("load", tell):
                 dataset = _open_dataset(scene, output, config, threads, tell)
-            except DatasetError:
-                if is_new:  # so that the corrected command finds the folder free
-                    (output / CONFIG).unlink()
-                    (output / EVENTS).unlink()
-                raise
-            write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
+                write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
+        except DatasetError:
+            if is_new:  # so that the corrected command finds the folder free
+                (output / CONFIG).unlink()
+                (output / EVENTS).unlink()
+                shutil.rmtree(output / POSES, ignore_errors=True)
+                if is_made:
+                    with suppress(OSError):  # it holds something
+                        output.rmdir()
+            raise
         if not (output / SCENE).exists():
             with _stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)):
                 gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
@@ -219,6 +232,30 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
     return True
 
 
+def found_model(output: Path) -> Path | None:
+    """The folder of the COLMAP model that a run found by itself; None where its scene brought one."""
+    folder = output / POSES
+    return folder if folder.is_dir() else None
+
+
+def _find_poses(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Find the poses, if that is asked for and not done yet."""
+    if config.poses == "given" or (config.poses == "missing" and has_model(scene)):
+        return
+    if not scene.is_dir():
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    find_poses(
+        photograph_folder(scene), output / POSES, threads=threads, listener=tell, should_stop=should_stop
+    )
+
+
 def _open_dataset(
     scene: Path, output: Path, config: ReconstructionConfig, threads: int, tell: Listener
 ) -> Dataset:
@@ -231,6 +268,7 @@ def _open_dataset(
         masks=config.masks,
         threads=threads,
         progress=lambda done, total: tell(StageProgress("load", done, total)),
+        model_folder=found_model(output),
     )
     for warning in dataset.warnings:
         tell(Warned(warning))
@@ -337,11 +375,18 @@ def _evaluate(
             "resolution": {"max_side": config.max_side},
             "background": config.evaluate_background,
             "versions": versions(),
+            **_placed(output),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
         threads=threads,
         tell=tell,
     )
+
+
+def _placed(output: Path) -> dict[str, object]:
+    """How many photographs have poses, where a run found these by itself."""
+    record = read_record(output / POSES)
+    return {"poses": {name: record[name] for name in ("placed", "photographs")}} if record else {}
 
 
 def _export(output: Path, config: ReconstructionConfig, tell: Listener) -> None:

@@ -13,7 +13,7 @@ from engine.errors import OutputError
 from engine.events import Listener
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply
-from engine.pipeline import CONFIG, SCENE, run_scene
+from engine.pipeline import CONFIG, SCENE, found_model, run_scene
 from engine.render.cameras import RenderCamera
 from engine.render.jobs import (
     DEFAULT_FOV_Y_DEGREES,
@@ -113,7 +113,9 @@ def _read_run(options: dict[str, Any]) -> _Source:
     if not (run / SCENE).exists():
         raise OutputError(f"{run} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume.")
     photographs = load_scene(
-        options["scene"] or run_scene(run), max_side=options["max_side"] or config.max_side
+        options["scene"] or run_scene(run),
+        max_side=options["max_side"] or config.max_side,
+        model_folder=found_model(run),
     )
     train, test = split_views([view.name for view in photographs.views], config.test_every, config.held_out)
     origins = np.stack([photographs.views[index].origin_world for index in train])

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from engine.config import read_config
 from engine.errors import ConfigError, DatasetError, OutputError
 from engine.gaussians.model import FlatGaussians
-from engine.pipeline import CONFIG, SCENE, run_scene
+from engine.pipeline import CONFIG, SCENE, found_model, run_scene
 from engine.render.cameras import RenderCamera
 from engine.scene import load_scene, scene_extent, split_views
 from engine.surface.cameras import cameras_around, photograph_cameras
@@ -89,7 +89,9 @@ def _cameras(
     """Where to render depth from, and with which settings of the tracer."""
     if is_run(source) and (source / CONFIG).exists():
         config = read_config(source / CONFIG)
-        photographs = load_scene(scene or run_scene(source), max_side=config.max_side)
+        photographs = load_scene(
+            scene or run_scene(source), max_side=config.max_side, model_folder=found_model(source)
+        )
         names = [view.name for view in photographs.views]
         indices, _ = split_views(names, config.test_every, config.held_out)
         origins = np.stack([photographs.views[index].origin_world for index in indices])

@@ -110,6 +110,7 @@ class Dataset:
         threads: int = 0,
         progress: Callable[[int, int], None] | None = None,
         max_table_bytes: int = MAX_TABLE_BYTES,
+        model_folder: Path | None = None,
     ) -> "Dataset":
         """Load a scene and decode its photographs into ``cache_dir``, or find them there.
 
@@ -125,13 +126,14 @@ class Dataset:
             threads: decoding threads; 0 takes one a processor.
             progress: told (photographs done, photographs in all) while decoding.
             max_table_bytes: limit on the ray tables of cameras that are not pinholes.
+            model_folder: of a model that was found for the photographs, instead of that in ``root``.
 
         Raises:
             DatasetError: something is missing, damaged or does not fit together.
             OutputError: the cache cannot be written.
             ConfigError: a setting is out of range.
         """
-        scene = load_scene(root, max_side=max_side)
+        scene = load_scene(root, max_side=max_side, model_folder=model_folder)
         split_views(
             [view.name for view in scene.views], test_every, held_out
         )  # complain before the long work

@@ -10,6 +10,7 @@ import numpy as np
 from engine.config import ReconstructionConfig
 from engine.events import CheckpointWritten, Event, Listener, StageFinished
 from engine.gaussians.model import FlatGaussians
+from engine.pipeline import found_model
 from engine.render.images import write_png
 from engine.render.jobs import view_shots
 from engine.render.renderer import background_colour, render_rays
@@ -68,7 +69,7 @@ class Previews:
     def _render(self, checkpoint: Path, iteration: int) -> None:
         config = self._config
         if self._model is None:
-            self._model = load_scene(self._scene, max_side=SIDE_PX)
+            self._model = load_scene(self._scene, max_side=SIDE_PX, model_folder=found_model(self._run))
         model = self._model
         train, test = split_views([view.name for view in model.views], config.test_every, config.held_out)
         with checkpoint.open("rb") as handle, np.load(handle, allow_pickle=False) as archive:

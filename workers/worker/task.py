@@ -7,8 +7,8 @@ from typing import Any
 
 from engine.events import Listener, ignore
 
-RUN, POSES, RESULTS, SCENE = "run", "poses", "results", "scene"
-"""Folders of an attempt: the engine's output, found poses, what is to be published, the photographs."""
+RUN, RESULTS, SCENE = "run", "results", "scene"
+"""Folders of an attempt: the engine's output, what is to be published, the photographs."""
 
 EXIT_REFUSED = 1
 """The job cannot be done and another try would end the same way; the last line says why."""
