@@ -22,6 +22,8 @@ class ReconstructionConfig(BaseModel):
         max_side: cap on the longer side of the photographs, px; None keeps their size.
         test_every: every how-manieth view by name is held out; 0 holds out none.
         held_out: names of the views to hold out instead.
+        poses: ``given`` takes the COLMAP model of the scene; ``auto`` finds the poses first, by COLMAP's
+            features, matching and mapping; ``missing`` does so only where the scene holds no model.
         masks: ``ignore`` leaves masked pixels out of the loss, ``alpha`` takes the mask as the alpha.
         evaluate_background: what lies behind renders and photographs with alpha when they are compared.
         exports: files to write besides ``scene.ply``; their names say the format.
@@ -34,6 +36,7 @@ class ReconstructionConfig(BaseModel):
     max_side: int | None = Field(None, ge=16)
     test_every: int = Field(8, ge=0)
     held_out: tuple[str, ...] | None = None
+    poses: Literal["given", "auto", "missing"] = "given"
     masks: Literal["ignore", "alpha"] = "ignore"
     evaluate_background: Literal["black", "white"] = "black"
     exports: tuple[str, ...] = ("mesh.ply", "mesh.obj", "mesh.glb")

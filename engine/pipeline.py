@@ -3,12 +3,14 @@
 Each stage leaves its result on disk and is skipped when the result is there, so that a run that was stopped
 or killed goes on where it was.
 
-    load -> train (initialise, fit) -> scene.ply -> evaluate -> export
+    (features -> matches -> poses ->) load -> train (initialise, fit) -> scene.ply -> evaluate -> export
 """
 
 import json
+import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from engine.config import ReconstructionConfig, read_config
@@ -34,12 +36,15 @@ from engine.files import ExportOptions, check_writable
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
 from engine.gaussians.model import FlatGaussians
+from engine.poses import find_poses
+from engine.poses.find import read_record
 from engine.run_folder import (
     CACHE,
     CHECKPOINTS,
     CONFIG,
     EVENTS,
     HELD_OUT,
+    POSES,
     SCENE,
     TRAINING,
     VIEWS,
@@ -48,6 +53,8 @@ from engine.run_folder import (
     run_scene,
 )
 from engine.scene import Dataset, write_held_out
+from engine.scene.colmap import has_model
+from engine.scene.load import photograph_folder
 from engine.scene.views_file import ViewsRecord, read_views, write_views
 from engine.stages import StageClock, stage
 from engine.threads import use_threads
@@ -84,7 +91,8 @@ def reconstruct(
     ``checkpoints/``, ``config.json``, ``held_out.json``, ``views.json`` and ``events.jsonl``.
 
     Args:
-        scene: folder with photographs and a COLMAP model, see :meth:`engine.scene.Dataset.open`.
+        scene: folder with photographs and a COLMAP model, see :meth:`engine.scene.Dataset.open`; one of
+            photographs alone, if ``config`` says that poses are to be found, which then are in ``poses/``.
         output: a folder that does not exist, is empty, or holds the same run if ``resume``.
         config: all settings.
         resume: go on with the run that is in ``output``; only ``exports`` may then be others than the run's.
@@ -94,7 +102,8 @@ def reconstruct(
         watch: shown the training after each iteration; it must change nothing.
 
     Raises:
-        DatasetError: the photographs or the model cannot be used.
+        DatasetError: the photographs or the model cannot be used, or no poses be found.
+        PosesCrashed: COLMAP died.
         OutputError: ``output`` holds something else or cannot be written.
         ConfigError: settings that the photographs rule out or, with ``resume``, other ones than the run's.
         SceneFileError: a file of ``exports`` could not be written on this machine; told before the training.
@@ -107,6 +116,7 @@ def reconstruct(
         check_writable(config.exports)
     began = time.perf_counter()
     use_threads(threads)
+    is_made = not output.exists()
     is_new = _claim_output(scene, output, config, resume)
     recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
     events = JsonLinesListener(output / EVENTS, hold=recorded is not None)
@@ -122,22 +132,34 @@ def reconstruct(
 
     tell = broadcast([events, listener])
     try:
-        with stage("load", tell):
-            try:
+        try:
+            _find_poses(scene, output, config, threads, tell, should_stop)
+            with stage("load", tell):
                 dataset = _open_dataset(
-                    scene, output, config, threads, tell, accept=None if recorded is None else accept
+                    scene,
+                    output,
+                    config,
+                    threads,
+                    tell,
+                    model_folder=found_model(output),
+                    accept=None if recorded is None else accept,
                 )
                 BatchSource(dataset, config.train)  # refuses settings that do not suit the photographs
-            except (DatasetError, ConfigError):
-                if is_new:  # so that the corrected command finds the folder free
-                    (output / CONFIG).unlink()
-                    (output / EVENTS).unlink()
-                raise
-            write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
-            if recorded is None:
-                write_views(output / VIEWS, dataset.record)
-            if run_scene(output) != scene.resolve() or read_config(output / CONFIG) != config:
-                _write_config(scene, output, config)  # the photographs have moved, or other files are wanted
+                write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
+                if recorded is None:
+                    write_views(output / VIEWS, dataset.record)
+                if run_scene(output) != scene.resolve() or read_config(output / CONFIG) != config:
+                    # The photographs have moved, or other files are wanted.
+                    _write_config(scene, output, config)
+        except (DatasetError, ConfigError):
+            if is_new:  # so that the corrected command finds the folder free
+                (output / CONFIG).unlink()
+                (output / EVENTS).unlink()
+                shutil.rmtree(output / POSES, ignore_errors=True)
+                if is_made:
+                    with suppress(OSError):  # it holds something
+                        output.rmdir()
+            raise
         if not (output / SCENE).exists():
             with stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)) as clock:
                 gaussians = _train(dataset, output, config.train, threads, tell, should_stop, clock, watch)
@@ -251,6 +273,24 @@ def _write_config(scene: Path, output: Path, config: ReconstructionConfig) -> No
     write_json(output / CONFIG, content)
 
 
+def _find_poses(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Find the poses, if that is asked for and not done yet."""
+    if config.poses == "given" or (config.poses == "missing" and has_model(scene)):
+        return
+    if not scene.is_dir():
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    find_poses(
+        photograph_folder(scene), output / POSES, threads=threads, listener=tell, should_stop=should_stop
+    )
+
+
 def _open_dataset(
     scene: Path,
     output: Path,
@@ -344,11 +384,18 @@ def _evaluate(
             "resolution": {"max_side": config.max_side},
             "background": config.evaluate_background,
             "versions": versions(),
+            **_placed(output),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
         threads=threads,
         tell=tell,
     )
+
+
+def _placed(output: Path) -> dict[str, object]:
+    """How many photographs have poses, where a run found these by itself."""
+    record = read_record(output / POSES)
+    return {"poses": {name: record[name] for name in ("placed", "photographs")}} if record else {}
 
 
 def _export(output: Path, config: ReconstructionConfig, tell: Listener) -> str | None:

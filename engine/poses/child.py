@@ -9,29 +9,11 @@ import os
 import signal
 import sys
 import threading
-from pathlib import Path
 from typing import NoReturn
-
-from pydantic import BaseModel, ConfigDict
 
 from engine.errors import DatasetError
 from engine.events import Event
-from engine.poses.config import PosesConfig
-
-FOUND, FOUND_RECORD = "found", "found.json"
-"""Where the result is put, below the folder for the work."""
-
-
-class Request(BaseModel):
-    """What to search, and where to put it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    images: Path
-    names: tuple[str, ...]
-    work: Path
-    config: PosesConfig
-    threads: int
+from engine.poses.config import FOUND, Request
 
 
 def main() -> NoReturn:
@@ -53,7 +35,7 @@ def main() -> NoReturn:
         from engine.poses.search import Search
 
         search = Search(request.images, request.names, request.work, request.config, request.threads, tell)
-        search.run(request.work / FOUND, request.work / FOUND_RECORD)
+        search.run(request.work / FOUND)
         write({"kind": "done"})
     except DatasetError as error:
         write({"kind": "error", "message": str(error)})

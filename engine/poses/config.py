@@ -6,10 +6,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 FEATURES, MATCHES, STAGE = "features", "matches", "poses"
 """The stages of the search."""
-MODEL = Path("sparse") / "0"
-"""Where the model is put, below the output folder."""
 RECORD = "poses.json"
-"""What was found, and for which photographs; beside the model."""
+"""What was found, and for which photographs; beside the model's files."""
+FOUND = "found"
+"""The model's folder, while it lies below the one for the work."""
 MIN_PHOTOGRAPHS = 3
 
 
@@ -49,3 +49,15 @@ class PosesConfig(BaseModel):
 
 
 DEFAULT_CONFIG = PosesConfig()
+
+
+class Request(BaseModel):
+    """What the process in which COLMAP works is asked: see :class:`engine.poses.search.Search`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    images: Path
+    names: tuple[str, ...]
+    work: Path
+    config: PosesConfig
+    threads: int

@@ -3,12 +3,11 @@
 import contextlib
 import json
 import os
-import queue
+import select
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,12 +16,10 @@ from typing import IO, Any
 
 from engine.errors import Cancelled, DatasetError, PosesCrashed
 from engine.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
-from engine.poses.child import FOUND, FOUND_RECORD, Request
-from engine.poses.config import DEFAULT_CONFIG, MODEL, RECORD, PosesConfig
+from engine.poses.config import DEFAULT_CONFIG, FOUND, RECORD, PosesConfig, Request
 from engine.poses.photographs import photographs_in, photographs_sha256
 from engine.writing import write_json
 
-_WORK = "work"
 _LOOK_SECONDS = 0.5
 _SIGN_SECONDS = 30.0
 """How often a step that takes long tells that it is alive."""
@@ -37,7 +34,7 @@ def find_poses(
     threads: int = 0,
     listener: Listener = ignore,
     should_stop: Callable[[], bool] = lambda: False,
-) -> Path:
+) -> None:
     """Find where photographs were taken, and a sparse point cloud.
 
     There are three stages: ``features``, whose steps are photographs, ``matches``, whose steps are pairs of
@@ -47,15 +44,12 @@ def find_poses(
 
     Args:
         images: folder of photographs, also in folders below it if it is called ``images``.
-        output: receives ``sparse/0`` and ``poses.json``; what is needed on the way lies in ``work`` beside
-            them and is removed.
+        output: becomes the folder of the COLMAP model, with ``poses.json`` beside its files. What is needed
+            on the way lies in a hidden folder next to it and is removed.
         config: settings.
         threads: to use; 0 means all cores.
         listener: hears the progress.
         should_stop: asked now and then; True gives up.
-
-    Returns:
-        The folder of the COLMAP model.
 
     Raises:
         DatasetError: too few photographs, or they do not fit together; the text says what to do. Also if the
@@ -63,17 +57,16 @@ def find_poses(
         PosesCrashed: COLMAP died.
         Cancelled: stopped as asked.
     """
-    model = output / MODEL
     names = photographs_in(images)
     sha256 = photographs_sha256(images, names)
-    if model.is_dir():
+    if output.is_dir():
         if read_record(output).get("photographs_sha256", sha256) != sha256:
             raise DatasetError(
                 f"{output} holds poses of other photographs than those in {images}; name another folder for "
                 f"the results, or remove {output} to find them anew."
             )
-        return model
-    work = output / _WORK
+        return
+    work = output.with_name(f".{output.name}.work")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     try:
@@ -81,15 +74,11 @@ def find_poses(
             images=images.resolve(), names=tuple(names), work=work.resolve(), config=config, threads=threads
         )
         _Waiting(request, listener, should_stop).wait()
-        record = json.loads((work / FOUND_RECORD).read_text(encoding="utf-8"))
-        write_json(output / RECORD, {**record, "photographs_sha256": sha256})
-        model.parent.mkdir(parents=True, exist_ok=True)
-        (work / FOUND).rename(model)
+        record = read_record(work / FOUND)
+        write_json(work / FOUND / RECORD, {**record, "photographs_sha256": sha256})
+        (work / FOUND).rename(output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
-        with contextlib.suppress(OSError):  # it holds something
-            output.rmdir()
-    return model
 
 
 def read_record(output: Path) -> dict[str, Any]:
@@ -125,27 +114,30 @@ class _Waiting:
         log = self._request.work / "log.txt"
         with log.open("wb") as noise, _process(self._request, noise) as process:
             assert process.stdout is not None
-            lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-            threading.Thread(target=_read, args=(process.stdout, lines), daemon=True).start()
-            while (line := self._next(lines)) is not None:
-                self._hear(line)
+            rest = b""
+            while piece := self._piece(process.stdout.fileno()):
+                *lines, rest = (rest + piece).split(b"\n")
+                for line in lines:
+                    self._hear(line)
             code = process.wait()
         if self._error is not None:
             raise DatasetError(self._error)
         if not self._done:
             raise PosesCrashed(_how_it_died(code, self._stage, log))
 
-    def _next(self, lines: "queue.SimpleQueue[str | None]") -> str | None:
+    def _piece(self, pipe: int) -> bytes:
+        """What the process says next; nothing at its end."""
         while True:
             if self._should_stop():
-                raise Cancelled("Stopped while finding poses; the same command begins them again.")
-            try:
-                return lines.get(timeout=_LOOK_SECONDS)
-            except queue.Empty:
-                if self._last is not None and time.monotonic() - self._told > _SIGN_SECONDS:
-                    self._tell(self._last)
+                raise Cancelled(
+                    "Stopped while finding poses; the same command with --resume begins them again."
+                )
+            if select.select([pipe], [], [], _LOOK_SECONDS)[0]:
+                return os.read(pipe, 1 << 16)
+            if self._last is not None and time.monotonic() - self._told > _SIGN_SECONDS:
+                self._tell(self._last)
 
-    def _hear(self, line: str) -> None:
+    def _hear(self, line: bytes) -> None:
         content = json.loads(line)
         kind = content.pop("kind")
         if kind == "done":
@@ -164,7 +156,7 @@ class _Waiting:
 
 
 @contextmanager
-def _process(request: Request, noise: IO[bytes]) -> Iterator["subprocess.Popen[str]"]:
+def _process(request: Request, noise: IO[bytes]) -> Iterator["subprocess.Popen[bytes]"]:
     """The process at work; killed in the end, whatever happens. In the caller's group, to die with it."""
     environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1")}  # COLMAP has threads of its own
     process = subprocess.Popen(
@@ -172,29 +164,20 @@ def _process(request: Request, noise: IO[bytes]) -> Iterator["subprocess.Popen[s
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=noise,
-        text=True,
-        encoding="utf-8",
         env=environment,
     )
-    stdin = process.stdin
-    assert stdin is not None
+    assert process.stdin is not None and process.stdout is not None
     try:
         with contextlib.suppress(BrokenPipeError):  # it is dead, which is told soon
-            stdin.write(request.model_dump_json() + "\n")
-            stdin.flush()
+            process.stdin.write(request.model_dump_json().encode() + b"\n")
+            process.stdin.flush()
         yield process
     finally:
         process.kill()
         process.wait()
-        with contextlib.suppress(OSError):
-            stdin.close()
-
-
-def _read(stream: IO[str], lines: "queue.SimpleQueue[str | None]") -> None:
-    with contextlib.suppress(ValueError):  # closed
-        for line in stream:
-            lines.put(line)
-    lines.put(None)
+        for pipe in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                pipe.close()
 
 
 def _how_it_died(code: int, stage: str, log: Path) -> str:

@@ -10,11 +10,6 @@ from engine.poses.config import MIN_PHOTOGRAPHS
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 
-def photograph_folder(scene: Path) -> Path:
-    """``images/`` of a scene, or the scene itself where it is a bare folder of photographs."""
-    return scene / "images" if (scene / "images").is_dir() else scene
-
-
 def photographs_in(folder: Path) -> list[str]:
     """Names of the photographs that poses can be found for, relative to ``folder``.
 

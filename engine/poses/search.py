@@ -10,7 +10,7 @@ import pycolmap
 
 from engine.errors import DatasetError
 from engine.events import Listener, StageFinished, StageProgress, StageStarted, Warned
-from engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, STAGE, PosesConfig
+from engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, RECORD, STAGE, PosesConfig
 from engine.poses.features import find_features, match_pairs, quick_pairs
 from engine.poses.mapping import map_photographs, rank
 from engine.poses.pairs import Pair, all_pairs, pairs_with
@@ -58,12 +58,11 @@ class Search:
         self._one_camera = self._look_at_sizes()
         pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
 
-    def run(self, found: Path, record: Path) -> None:
+    def run(self, found: Path) -> None:
         """Search, a second time if photographs are left out, and write the best model.
 
         Args:
-            found: folder to make for the model.
-            record: receives what was found, as JSON.
+            found: folder to make for the model, and for what is to be said of it as JSON.
 
         Raises:
             DatasetError: too few photographs have poses, or these do not fit.
@@ -88,7 +87,7 @@ class Search:
         best.write_binary(found)
         posed = {best.image(number).name for number in best.reg_image_ids()}
         write_json(
-            record,
+            found / RECORD,
             {
                 "photographs": count,
                 "placed": len(posed),

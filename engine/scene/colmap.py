@@ -75,13 +75,24 @@ def find_model_folder(root: Path) -> Path:
         missing = [f"{part}{suffix}" for part in _PARTS if not (folder / f"{part}{suffix}").is_file()]
         raise DatasetError(f"{folder} lacks {' and '.join(missing)}; copy the whole COLMAP model there.")
     raise DatasetError(
-        f"{root} holds no COLMAP model; put cameras, images and points3D (.bin or .txt) "
-        f"into {root / 'sparse/0'}."
+        f"{root} holds no COLMAP model; put cameras, images and points3D (.bin or .txt) into "
+        f"{root / 'sparse/0'}, or have the poses found: octasplat reconstruct with --poses auto, or "
+        "octasplat submit."
+    )
+
+
+def has_model(root: Path) -> bool:
+    """Whether the scene brings a COLMAP model, or at least a part of one."""
+    return any(
+        (root / name / f"{part}{suffix}").is_file()
+        for name in MODEL_FOLDERS
+        for part in _PARTS
+        for suffix in (".bin", ".txt")
     )
 
 
 def read_colmap_model(root: Path, folder: Path | None = None) -> ColmapModel:
-    """Read the COLMAP model of the scene in ``root``, or the one in ``folder`` if given.
+    """Read the COLMAP model of the scene in ``root``, or the one in ``folder``.
 
     Raises:
         DatasetError: there is no model, it is damaged, or it holds values that are not finite.

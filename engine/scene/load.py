@@ -42,7 +42,8 @@ def load_scene(root: Path, *, max_side: int | None = None, model_folder: Path | 
         root: folder with ``images/``, a COLMAP model (see :mod:`engine.scene.colmap`) and, if there are any,
             ``masks/<image name>.png``.
         max_side: cap on the longer side of the photographs, in pixels.
-        model_folder: where the COLMAP model is, if not in ``root``.
+        model_folder: of a model that was found for the photographs, see :mod:`engine.poses`; ``root`` may
+            then be a bare folder of photographs.
 
     Raises:
         DatasetError: something is missing, damaged or does not fit together.
@@ -52,7 +53,12 @@ def load_scene(root: Path, *, max_side: int | None = None, model_folder: Path | 
         raise ConfigError(f"max_side is {max_side}; it must be at least 1 pixel.")
     if not root.is_dir():
         raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
-    if not (root / "images").is_dir():
+    if model_folder is None and not (root / "images").is_dir():
+        if any(path.suffix.lower() in _IMAGE_SUFFIXES for path in root.iterdir()):
+            raise DatasetError(
+                f"{root} is a bare folder of photographs, without camera poses; have them found: octasplat "
+                "reconstruct with --poses auto, or octasplat submit."
+            )
         raise DatasetError(f"{root} has no folder images; put the photographs into {root / 'images'}.")
     model = read_colmap_model(root, model_folder)
     if len(model.images) < MIN_VIEWS:
@@ -61,9 +67,10 @@ def load_scene(root: Path, *, max_side: int | None = None, model_folder: Path | 
             f"at least {MIN_VIEWS} are needed."
         )
     warnings = list(model.warnings)
-    paths = _image_paths(root, model, warnings)
+    paths = _image_paths(photograph_folder(root), model, warnings, tell_unposed=model_folder is None)
     masks = _mask_paths(root, [image.name for image in model.images], warnings)
-    _warn_of_other_models(model.folder, warnings)
+    if model_folder is None:
+        _warn_of_other_models(model.folder, warnings)
 
     views: list[View] = []
     infos: list[ImageInfo] = []
@@ -98,8 +105,12 @@ def load_scene(root: Path, *, max_side: int | None = None, model_folder: Path | 
     )
 
 
-def _image_paths(root: Path, model: ColmapModel, warnings: list[str]) -> list[Path]:
-    folder = root / "images"
+def photograph_folder(root: Path) -> Path:
+    """``images/`` of a scene, or the scene itself where it is a bare folder of photographs."""
+    return root / "images" if (root / "images").is_dir() else root
+
+
+def _image_paths(folder: Path, model: ColmapModel, warnings: list[str], *, tell_unposed: bool) -> list[Path]:
     on_disk = _files_below(folder)
     paths: list[Path] = []
     missing: list[str] = []
@@ -116,7 +127,7 @@ def _image_paths(root: Path, model: ColmapModel, warnings: list[str]) -> list[Pa
             f"({_some(missing)}); put them there or run COLMAP without them."
         )
     unposed = sorted(name for name, path in on_disk.items() if path.suffix.lower() in _IMAGE_SUFFIXES)
-    if unposed:
+    if unposed and tell_unposed:
         warnings.append(
             f"{len(unposed)} images in {folder} have no pose and are left out ({_some(unposed)})."
         )

@@ -1,14 +1,17 @@
 """Poses found from photographs alone, compared with those they were taken from."""
 
 import json
+import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pycolmap
 import pytest
 from jaxtyping import Float64
 
-from engine.errors import Cancelled, DatasetError
+from engine.errors import Cancelled, DatasetError, PosesCrashed
 from engine.events import Event, StageFinished, StageProgress, StageStarted
 from engine.poses import find_poses
 from engine.poses.find import PosesConfig
@@ -43,8 +46,9 @@ def aligned(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def test_poses_are_those_of_the_cameras(scene: Path, tmp_path: Path) -> None:
     events: list[Event] = []
-    model = find_poses(scene / "images", tmp_path, threads=2, listener=events.append)
-    assert model == tmp_path / "sparse" / "0" and not (tmp_path / "work").exists()
+    model = tmp_path / "poses"
+    find_poses(scene / "images", model, threads=2, listener=events.append)
+    assert [path.name for path in tmp_path.iterdir()] == ["poses"]
     found, truth = centres(model), centres(scene / "sparse" / "0")
     assert len(found) >= 0.8 * len(truth) and found.keys() <= truth.keys()
     names = sorted(found)
@@ -59,9 +63,13 @@ def test_poses_are_those_of_the_cameras(scene: Path, tmp_path: Path) -> None:
     ]
     for stage, total in wanted:
         steps = [e.step for e in events if isinstance(e, StageProgress) and e.stage == stage]
-        assert steps == sorted(steps) and steps[-1] == total
+        assert steps == sorted(steps) and steps[-1] == (len(found) if stage == "poses" else total)
+    record = json.loads((model / "poses.json").read_text())
+    assert (record["placed"], record["photographs"]) == (len(found), 24)
+    assert set(record["left_out"]) == truth.keys() - found.keys()
     events.clear()
-    assert find_poses(scene / "images", tmp_path, listener=events.append) == model and events == []
+    find_poses(scene / "images", model, listener=events.append)
+    assert events == []
 
 
 def test_photographs_of_nothing_are_refused(tmp_path: Path) -> None:
@@ -71,7 +79,7 @@ def test_photographs_of_nothing_are_refused(tmp_path: Path) -> None:
         write_png(images / f"{number}.png", rng.random((96, 128, 3)).astype(np.float32))
     with pytest.raises(DatasetError, match=r"overlap"):
         find_poses(images, tmp_path / "out", threads=1)
-    assert not (tmp_path / "out" / "sparse").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 
 def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
@@ -95,8 +103,45 @@ def test_most_photographs_must_be_placed(scene: Path, tmp_path: Path) -> None:
 def test_stops_when_asked(scene: Path, tmp_path: Path) -> None:
     asked = iter(range(1000))
     with pytest.raises(Cancelled):
-        find_poses(scene / "images", tmp_path, threads=1, should_stop=lambda: next(asked) >= 1)
-    assert not (tmp_path / "work").exists() and not (tmp_path / "sparse").exists()
+        find_poses(scene / "images", tmp_path / "out", threads=1, should_stop=lambda: next(asked) >= 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_photographs_give_the_same_bytes(scene: Path, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for number, path in enumerate(sorted((scene / "images").iterdir())[:10]):
+        (images / f"view {number}.png").hardlink_to(path)  # a name with a space
+    quick = PosesConfig(exhaustive_up_to=5, partners=4)  # pairs are chosen
+    for threads in (1, 2):
+        find_poses(images, tmp_path / f"poses{threads}", config=quick, threads=threads)
+    one, two = (
+        {path.name: path.read_bytes() for path in (tmp_path / f"poses{threads}").iterdir()}
+        for threads in (1, 2)
+    )
+    assert one == two and {"cameras.bin", "images.bin", "points3D.bin", "poses.json"} <= one.keys()
+    assert {name.startswith("view ") for name in centres(tmp_path / "poses1")} == {True}
+
+
+def test_a_result_of_other_photographs_is_refused(scene: Path, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    shutil.copytree(scene / "images", images)
+    (tmp_path / "poses").mkdir()
+    record = {"photographs": 24, "placed": 24, "photographs_sha256": "another"}
+    (tmp_path / "poses" / "poses.json").write_text(json.dumps(record))
+    with pytest.raises(DatasetError, match="other photographs"):
+        find_poses(images, tmp_path / "poses")
+
+
+def test_death_of_colmap_is_told(scene: Path, tmp_path: Path) -> None:
+    def kill(event: Event) -> None:
+        if isinstance(event, StageStarted) and event.stage == "features":
+            (child,) = psutil.Process().children()
+            child.send_signal(signal.SIGSEGV)
+
+    with pytest.raises(PosesCrashed, match=r"SIGSEGV while looking for features.*run the same command again"):
+        find_poses(scene / "images", tmp_path / "poses", threads=1, listener=kill)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_settings_are_json() -> None:

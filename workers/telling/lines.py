@@ -44,7 +44,7 @@ _DONE = {
     "render": ("Rendered", "image"),
     "features": ("Found features", "photograph"),
     "matches": ("Matched", "pair"),
-    "poses": ("Found the poses", "photograph"),
+    "poses": ("Found the poses of", "photograph"),
     "upload": ("Uploaded", "kB"),
     "download": ("Downloaded", "kB"),
     "read": ("Read", "file"),
@@ -60,16 +60,16 @@ class StageState:
     """What both displays remember of the events so far."""
 
     def __init__(self) -> None:
-        self.step = 0
+        self.step = self.total = 0
         self.held_out: HeldOutMeasured | None = None
         self.training: TrainingProgress | None = None
 
     def update(self, event: Event) -> None:
         """Remember what ``event`` tells."""
         if isinstance(event, StageStarted):
-            self.step = 0
+            self.step, self.total = 0, event.total_steps
         elif isinstance(event, StageProgress):
-            self.step = event.step
+            self.step, self.total = event.step, event.total_steps
         elif isinstance(event, TrainingProgress):
             self.step, self.training = event.iteration, event
         elif isinstance(event, HeldOutMeasured):
@@ -78,8 +78,11 @@ class StageState:
     def finished(self, event: StageFinished) -> str:
         """What the stage did and how long it took, as a line."""
         verb, what = _DONE.get(event.stage, (f"Finished {event.stage}", "step"))
-        plural = "" if self.step == 1 or what == "kB" else "s"
-        count = f" {self.step:,} {what}{plural}" if self.step and what else ""
+        if event.stage == "poses":  # some may be left out
+            count = f" {self.step:,} of {self.total:,} photographs"
+        else:
+            plural = "" if self.step == 1 or what == "kB" else "s"
+            count = f" {self.step:,} {what}{plural}" if self.step and what else ""
         line = f"{verb}{count} in {duration(event.seconds)}"
         if event.stage == "train" and self.training is not None:
             line += f": {training_state(self.training, self.held_out)}"

@@ -62,7 +62,9 @@ def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
     """What a finished run in ``output`` reached and where its files are."""
     metrics: dict[str, Any] = json.loads((output / "metrics.json").read_text(encoding="utf-8"))
     files = [("Report", "report.html"), ("Scene", "scene.ply"), *(("Mesh", name) for name in exports)]
+    found = metrics.get("poses")
     return [
+        *([f"Poses found for {found['placed']} of {found['photographs']} photographs"] if found else []),
         mean_metrics(metrics),
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
         f"trained in {duration(metrics['seconds'])}",

@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from workers.work.task import POSES, RUN
+from workers.work.task import RUN
 
 # A path begins where no word, address or other path goes on.
 _ABSOLUTE = re.compile(r"""(?<![\w.~/…])(?!(?<=:)//)(?:/+[^\s/"'`:;,()<>|\[\]{}]+)+/?""")
@@ -31,11 +31,8 @@ class Places:
         for root in _spellings(folder):
             # Longer ones first; what lies in the scene or the result is called as it is there.
             names += [
-                (rf"{root}/posed/[^/\s]+/", ""),
-                (rf"{root}/posed/[^/\s\"']+", "the scene"),
                 (rf"{root}/{RUN}/", ""),
                 (rf"{root}/{RUN}\b", "the result"),
-                (rf"{root}/{POSES}/", f"{POSES}/"),
                 (rf"{root}/", ""),
                 (rf"{root}\b", "the job's folder"),
             ]

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +19,15 @@ from engine.writing import write_json
 from workers.work.kinds.options import ExportJobOptions, ReconstructOptions, RenderJobOptions
 from workers.work.places import Places
 from workers.work.preview import Previews
-from workers.work.task import POSES, Task
+from workers.work.task import Task
 
 REPORT = "report.html"
-_MODEL_SUFFIXES = (".bin", ".txt")
 
 
 def reconstruct(task: Task) -> None:
     """Photographs to a scene, its meshes and measurements; goes on from what an earlier attempt left."""
-    options = ReconstructOptions.model_validate(task.options)
-    config = options.config()
-    scene = _scene(task, options.poses)
+    assert task.scene is not None
+    config = ReconstructOptions.model_validate(task.options).config()
 
     def publish_finished(event: Event) -> None:
         # Whatever becomes of the rest, even if this process is killed.
@@ -39,7 +36,7 @@ def reconstruct(task: Task) -> None:
 
     try:
         reconstruct_scene(
-            scene,
+            task.scene,
             task.run,
             config,
             resume=True,
@@ -61,15 +58,13 @@ def _publish_run(task: Task) -> None:
         hidden = any(part.startswith(".") for part in name.parts)
         if path.is_file() and not hidden and name.parts[0] not in (CHECKPOINTS, CACHE):
             _publish(task, path, name.as_posix())
-    for path in sorted((task.folder / POSES).glob("sparse/0/*")):
-        _publish(task, path, f"{POSES}/{path.name}")
 
 
 def evaluate(task: Task) -> None:
     """The held-out views of a finished reconstruction, measured again."""
     evaluate_run(
         task.run,
-        scene=_source_scene(task),
+        scene=task.scene,
         threads=task.threads,
         listener=stopping(task.listener, task.should_stop),
     )
@@ -108,7 +103,7 @@ def render(task: Task) -> None:
     target = task.results / "turntable.mp4" if options.format == "mp4" else task.results / "views"
     arguments: dict[str, Any] = {
         "source": task.run,
-        "scene": _source_scene(task),
+        "scene": task.scene,
         "output": target,
         "views": options.views if options.mode == "views" else None,
         "frames": options.frames,
@@ -124,53 +119,6 @@ def render(task: Task) -> None:
         "threads": task.threads,
     }
     render_files(options.mode, arguments, stopping(task.listener, task.should_stop))
-
-
-def _scene(task: Task, poses: str) -> Path:
-    """The folder to reconstruct: the dataset as it is, or with poses that are found now."""
-    assert task.scene is not None
-    if poses == "given" or (poses == "missing" and _has_model(task.scene)):
-        return task.scene
-    from engine.poses import find_poses
-
-    find_poses(
-        task.scene / "images",
-        task.folder / POSES,
-        threads=task.threads,
-        listener=task.listener,
-        should_stop=task.should_stop,
-    )
-    return _posed(task, task.folder / POSES / "sparse" / "0")
-
-
-def _source_scene(task: Task) -> Path:
-    """The photographs of the source job, with the poses that it found, if it did."""
-    assert task.scene is not None
-    found = task.run / POSES
-    return _posed(task, found) if found.is_dir() else task.scene
-
-
-def _posed(task: Task, model: Path) -> Path:
-    """A scene folder made of the dataset's photographs and another model."""
-    assert task.scene is not None
-    posed = task.folder / "posed" / task.scene.name
-    shutil.rmtree(posed, ignore_errors=True)
-    (posed / "sparse").mkdir(parents=True)
-    for name in ("images", "masks"):
-        if (task.scene / name).is_dir():
-            (posed / name).symlink_to(task.scene / name)
-    (posed / "sparse" / "0").symlink_to(model)
-    return posed
-
-
-def _has_model(scene: Path) -> bool:
-    from engine.scene.colmap import MODEL_FOLDERS
-
-    return any(
-        (scene / folder / f"cameras{suffix}").is_file()
-        for folder in MODEL_FOLDERS
-        for suffix in _MODEL_SUFFIXES
-    )
 
 
 def _places(task: Task) -> Places:

@@ -7,8 +7,8 @@ from typing import Any
 
 from engine.events import Listener, ignore
 
-RUN, POSES, RESULTS, SCENE = "run", "poses", "results", "scene"
-"""Folders of an attempt: the engine's output, found poses, what is to be published, the photographs."""
+RUN, RESULTS, SCENE = "run", "results", "scene"
+"""Folders of an attempt: the engine's output, what is to be published, the photographs."""
 
 NO_SPACE = "no_space"
 """Type of the error of a job that met a full disk, which is no fault of its own."""

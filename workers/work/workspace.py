@@ -20,7 +20,10 @@ from workers.store.errors import StorageError
 from workers.store.protocol import Storage
 from workers.store.trees import Manifest, TreeFile, fetch_tree, publish_manifest, read_manifest, store_tree
 from workers.work.media_types import media_type
-from workers.work.task import POSES, RESULTS, RUN
+from workers.work.task import RESULTS, RUN
+
+POSES = "poses"
+"""Poses that the engine found, in its output folder and among the results."""
 
 _LOCK = ".lock"
 _CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
@@ -139,8 +142,7 @@ class Workspace:
 
     def discard_run(self) -> None:
         """Forget what was restored."""
-        for name in (RUN, POSES):
-            shutil.rmtree(self.folder / name, ignore_errors=True)
+        shutil.rmtree(self.folder / RUN, ignore_errors=True)
 
     def keep(self, stage: str, step: int) -> Checkpoint | None:
         """Store what is needed to go on from here; None if there is nothing yet."""
@@ -203,9 +205,10 @@ class Workspace:
 
     def _names_to_keep(self) -> list[str]:
         names = [name for name in _ALWAYS_KEPT if (self.folder / name).is_file()]
-        names += [
-            path.relative_to(self.folder).as_posix() for path in (self.folder / POSES).glob("sparse/0/*")
+        poses = [
+            path.relative_to(self.folder).as_posix() for path in sorted((self.folder / RUN / POSES).glob("*"))
         ]
+        names += poses
         if "run/scene.ply" in names:  # the training is done, its checkpoints are of no more use
             return [name for name in names if not name.endswith(".npz")]
         checkpoints = [
@@ -215,7 +218,7 @@ class Workspace:
         newest = max((name for name in checkpoints if _CHECKPOINT.fullmatch(name)), default=None)
         if newest is not None:
             return [*names, newest]
-        return names if any(name.startswith(f"{POSES}/") for name in names) else []
+        return names if poses else []
 
 
 def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:

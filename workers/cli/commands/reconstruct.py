@@ -28,6 +28,11 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
 @click.option(
     "--preset", type=click.Choice(PRESETS), help="Where the settings come from.  [default: standard]"
 )
+@click.option(
+    "--poses",
+    type=click.Choice(["given", "auto", "missing"]),
+    help="Take the poses of the COLMAP model, find them, or find them if it is missing.  [default: given]",
+)
 @click.option("--max-side", type=int, metavar="PX", help="Shrink photographs to this longer side.")
 @click.option(
     "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
@@ -69,6 +74,8 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
 def reconstruct(**options: Any) -> None:
     """Reconstruct SCENE, a folder with images/ and a COLMAP model in sparse/0.
 
+    With --poses auto it may hold photographs alone, in images/ or by themselves: COLMAP finds their poses.
+
     The output folder gets scene.ply, meshes, metrics.json, report.html, renders of the held-out views and
     checkpoints. Ctrl-C stops after writing a checkpoint; the same command with --resume goes on.
     """
@@ -100,6 +107,7 @@ def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
         options["preset"] or "standard",
         settings={
             "max_side": options["max_side"],
+            "poses": options["poses"],
             "test_every": options["test_every"],
             "held_out": options["held_out"] or None,
             "masks": options["masks"],

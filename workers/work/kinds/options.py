@@ -36,19 +36,13 @@ ExportName = Annotated[str, AfterValidator(check_export_name)]
 
 
 class ReconstructOptions(ReconstructionConfig):
-    """Options of ``reconstruct``: those of the engine, and where poses come from.
-
-    Attributes:
-        poses: ``given`` takes the COLMAP model of the dataset; ``auto`` finds the poses first, by COLMAP's
-            features, matching and mapping; ``missing`` does so only where the dataset holds no model.
-    """
+    """Options of ``reconstruct``: those of the engine, with names of exports that are fit to publish."""
 
     exports: tuple[ExportName, ...] = Field(("mesh.ply", "mesh.obj", "mesh.glb"), max_length=100)
-    poses: Literal["given", "auto", "missing"] = "given"
 
     def config(self) -> ReconstructionConfig:
         """The engine's part."""
-        return ReconstructionConfig.model_validate(self.model_dump(mode="json", exclude={"poses"}))
+        return ReconstructionConfig.model_validate(self.model_dump(mode="json"))
 
 
 class EvaluateOptions(BaseModel):
