@@ -37,7 +37,7 @@ from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count, trace_settings
 from engine.train.fingerprint import run_fingerprint
 from engine.train.initialise import initial_gaussians
-from engine.train.parts import make_shading
+from engine.train.shading import make_shading
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 from engine.versions import versions

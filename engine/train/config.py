@@ -178,9 +178,9 @@ def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
     return config.rebuild_every * (1 + gaussians // 500_000)
 
 
-def trace_settings(config: TrainConfig, extent: float) -> TraceSettings:
-    """The run's trace settings with the near distance in world units."""
-    return config.trace.model_copy(update={"t_min": config.near * extent})
+def near_distance(config: TrainConfig, extent: float) -> float:
+    """Where rays begin, world units."""
+    return config.near * extent
 
 
 def preset(name: str) -> TrainConfig:
