@@ -34,7 +34,7 @@ from engine.scene import Dataset, write_held_out
 from engine.threads import use_threads
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from engine.train.config import TrainConfig, iteration_count, trace_settings
+from engine.train.config import TrainConfig, iteration_count
 from engine.train.fingerprint import run_fingerprint
 from engine.train.initialise import initial_gaussians
 from engine.train.shading import make_shading
@@ -214,6 +214,7 @@ def _open_dataset(
         test_every=config.test_every,
         held_out=config.held_out,
         masks=config.masks,
+        near=config.train.near,
         threads=threads,
         progress=lambda done, total: tell(StageProgress("load", done, total)),
     )
@@ -271,7 +272,7 @@ def _evaluate(
         dataset,
         gaussians,
         output,
-        settings=trace_settings(config.train, dataset.extent),
+        settings=config.train.trace,
         shading=make_shading(config.train, len(dataset.views)),
         background=config.evaluate_background,
         run={

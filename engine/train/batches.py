@@ -11,7 +11,7 @@ from engine.colour import composited
 from engine.errors import ConfigError
 from engine.rays import RayBatch
 from engine.scene import View
-from engine.train.config import TrainConfig, near_distance, window_side_px
+from engine.train.config import TrainConfig, window_side_px
 
 
 @runtime_checkable
@@ -20,8 +20,8 @@ class Pixels(Protocol):
 
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
-    ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, "r 3"]]:
-        """Origins and unit directions, world frame, of pixels."""
+    ) -> RayBatch:
+        """Unit rays of pixels, world frame."""
         ...
 
     def pixels(
@@ -179,7 +179,7 @@ class BatchSource:
         if self._patches:
             drawn.append(sampler.patches(rng, self._patches, side))
         view, y, x = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-        rays = pixel_rays(self._dataset, config, view, y, x)
+        rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
         background = self._background(rng)
         return Batch(rays, rgb, alpha, weight, view, self._patches, side, background)
@@ -210,18 +210,6 @@ class BatchSource:
         if name == "random":
             return rng.random(3, dtype=np.float32)
         return still_background(self._config)
-
-
-def pixel_rays(
-    dataset: TrainingData,
-    config: TrainConfig,
-    view: Int64[np.ndarray, " r"],
-    y: Int64[np.ndarray, " r"],
-    x: Int64[np.ndarray, " r"],
-) -> RayBatch:
-    """Rays of pixels, which begin at the near distance of the training."""
-    origins, directions = dataset.rays(view, y, x)
-    return RayBatch(origins, directions, near_distance(config, dataset.extent))
 
 
 def still_background(config: TrainConfig) -> Float32[np.ndarray, "3"]:

@@ -130,7 +130,7 @@ class TrainConfig(_Frozen):
     )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
-    trace: TraceSettings = TraceSettings(t_min=0.0)
+    trace: TraceSettings = TraceSettings()
     near: float = Field(0.01, ge=0, description="nearest distance at which a Gaussian is seen, of the extent")
     densify: McmcConfig | PaperConfig = Field(McmcConfig(), discriminator="kind")
     rebuild_every: int = Field(
@@ -176,11 +176,6 @@ def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
     A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
     """
     return config.rebuild_every * (1 + gaussians // 500_000)
-
-
-def near_distance(config: TrainConfig, extent: float) -> float:
-    """Where rays begin, world units."""
-    return config.near * extent
 
 
 def preset(name: str) -> TrainConfig:

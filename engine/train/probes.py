@@ -13,7 +13,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
-from engine.train.batches import PixelSampler, TrainingData, pixel_rays, still_background, view_sizes_px
+from engine.train.batches import PixelSampler, TrainingData, still_background, view_sizes_px
 from engine.train.checkpoint import load_best, save_best
 from engine.train.config import TrainConfig
 from engine.train.state import TrainState
@@ -39,10 +39,9 @@ def draw_probe(
 ) -> Probe:
     """``config.probe_rays`` pixels of the views ``indices``."""
     view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, config.probe_rays)
-    rays = pixel_rays(dataset, config, view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     background = still_background(config)
-    return Probe(rays, composited(rgb, alpha, background), weight, view, background)
+    return Probe(dataset.rays(view, y, x), composited(rgb, alpha, background), weight, view, background)
 
 
 def measure(probe: Probe, tracer: Tracer, shading: ShadingModel) -> tuple[float, float]:
