@@ -19,7 +19,7 @@ from engine.rays import RayBatch
 from engine.shading.exposure import Exposures
 from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
 from engine.trace.cpu import CpuTracer
-from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
+from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
 from engine.train.batches import Batch, BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import McmcConfig
@@ -98,6 +98,8 @@ def made(rng: np.random.Generator) -> tuple[FlatGaussians, Lamp, Batch]:
     world = FlatWorld()
     gaussians = world.start(opacity=0.6)
     gaussians.sh += rng.normal(0, 0.3, gaussians.sh.shape).astype(np.float32)
+    # Apart in depth, so that turning them a little changes no order.
+    gaussians.means_world[:, 2] = rng.permutation(np.linspace(-0.4, 0.4, len(gaussians)))
     model = Lamp(gaussians)
     model.albedo[:] = rng.uniform(0.1, 0.9, model.albedo.shape)
     model.lamp[:] = (0.9, 0.7, 1.1)
@@ -110,7 +112,9 @@ def test_gradients_of_several_traces_agree_with_finite_differences() -> None:
     # Exposures around it, so that models can be put into each other.
     model = Exposures(7, rate=0.01, inner=lamp)
     model.log_gains[:] = rng.normal(0, 0.2, (7, 3))
-    tracer, weights = CpuTracer(threads=1), small_config(loss={"l1": 0.0, "l2": 1.0}).loss
+    # Octagons so wide that Gaussians have faded at their edges, through which no gradient goes.
+    tracer = CpuTracer(TraceSettings(q=30.0, transmittance_min=1e-6), threads=1)
+    weights = small_config(loss={"l1": 0.0, "l2": 1.0}).loss
 
     def look() -> tuple[float, dict[str, np.ndarray]]:
         tracer.build(gaussians, model.features(gaussians))
@@ -127,22 +131,20 @@ def test_gradients_of_several_traces_agree_with_finite_differences() -> None:
         return found.loss.value, whole
 
     _, gradients = look()
-    # Rays that enter or leave an octagon give no gradient, as documented.
-    tolerances = {"lamp": 1e-3, "features": 1e-3, "sh": 1e-3, "opacity_logits": 0.05, "quats_wxyz": 0.05}
     for name, gradient in gradients.items():
         parameter = {"lamp": lamp.lamp, "features": lamp.albedo}.get(name)
         if parameter is None:
             parameter = getattr(gaussians, name)
         before = parameter.copy()
         direction = (gradient / np.linalg.norm(gradient)).astype(np.float32)
-        step = np.float32(0.02)
+        step = np.float32(0.001 if name == "quats_wxyz" else 0.02)  # so small that no order changes
         parameter[:] = before + step * direction
         above, _ = look()
         parameter[:] = before - step * direction
         below, _ = look()
         parameter[:] = before
         expected = float((gradient * direction).sum())
-        assert (above - below) / (2 * step) == pytest.approx(expected, rel=tolerances[name]), name
+        assert (above - below) / (2 * step) == pytest.approx(expected, rel=0.02), name
 
 
 def train(folder: Path, *, stop_after: int | None = None) -> tuple[Lamp, TrainState, list[float]]:

@@ -56,14 +56,14 @@ def test_its_first_steps_are_those_of_the_cpu_tracer(tmp_path: Path) -> None:
 def test_the_slow_twin_learns_a_generated_scene(tmp_path: Path) -> None:
     root = tmp_path / "scene"
     write_generated_scene(
-        root, GeneratedSceneConfig(views=6, width_px=32, height_px=24, samples_per_side=2, points=150)
+        root, GeneratedSceneConfig(views=6, width_px=32, height_px=24, samples_per_side=2, points=100)
     )
     dataset = Dataset.open(root, tmp_path / "cache", test_every=6)
     ends = {}
     for tracer in ("reference", "cpu"):
         config = small_config(
-            iterations=80, rays=64, probe_rays=256, trace={"tracer": tracer}, max_gaussians=150,
-            checkpoint_every=40, initial_points=150,
+            iterations=50, rays=64, probe_rays=256, trace={"tracer": tracer}, max_gaussians=100,
+            checkpoint_every=50, initial_points=100, lift_pixels=False,
         )  # fmt: skip
         events: list[Event] = []
         state = fresh_state(initial_gaussians(dataset, config), config.seed)
@@ -72,7 +72,7 @@ def test_the_slow_twin_learns_a_generated_scene(tmp_path: Path) -> None:
             listener=events.append, threads=1,
         ).run()  # fmt: skip
         psnr = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
-        assert psnr[-1] > psnr[0] + 2, tracer
+        assert psnr[-1] > psnr[0] + 0.5, tracer
         ends[tracer] = psnr[-1]
     assert ends["reference"] == pytest.approx(ends["cpu"], abs=0.5)
     prints = {
