@@ -165,14 +165,14 @@ class Tracer(Protocol):
     settings: TraceSettings
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
-        """Take over ``gaussians`` and build the acceleration structure around them.
+        """Take over ``gaussians`` and ``features`` and build the acceleration structure around them.
 
         Earlier recordings can no longer be differentiated.
         """
         ...
 
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
-        """Read the changed parameters of the Gaussians ``ids`` (None: all) without rebuilding.
+        """Read the changed parameters and features of the Gaussians ``ids`` (None: all) without rebuilding.
 
         What is seen afterwards is what would be after :meth:`build`, however far Gaussians have moved; only
         the time that it takes may grow.

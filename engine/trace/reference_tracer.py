@@ -41,14 +41,12 @@ class ReferenceTracer:
     def __init__(self, settings: TraceSettings | None = None) -> None:
         self.settings = settings or TraceSettings(tracer="reference")
         self._gaussians: FlatGaussians | None = None
-        self._features = np.empty((0, 1), np.float32)
+        self._features = np.empty((0, 0), np.float32)
         self._build = object()
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
         """Take over ``gaussians``; there is nothing to build."""
-        ones = np.ones((len(gaussians), 1), np.float32)
-        # One channel more than asked for, whose sum along a ray is the sum of the weights.
-        self._features = ones if features is None else np.concatenate([features, ones], axis=1)
+        self._features = np.empty((len(gaussians), 0), np.float32) if features is None else features
         self._gaussians = gaussians
         self._build = object()
 
@@ -61,7 +59,7 @@ class ReferenceTracer:
         with torch.no_grad():
             parts = [trace_reference(parameters, rays[piece], self.settings) for piece in self._pieces(rays)]
         hit_ids = [ids for part in parts for ids in part.hit_ids]
-        shapes = {"rgb_srgb": (3,), "normal_world": (3,), "features": (self._features.shape[1],)}
+        shapes = {"rgb_srgb": (3,), "normal_world": (3,), "features": (self._features.shape[1] + 1,)}
         found = {
             name: np.concatenate(
                 [np.empty((0, *shapes.get(name, ()))), *(getattr(part, name).numpy() for part in parts)]
@@ -116,7 +114,11 @@ class ReferenceTracer:
 
     def _parameters(self) -> ReferenceParameters:
         assert self._gaussians is not None, "build first"
-        return ReferenceParameters.of(self._gaussians, self._features)
+        # One channel more than asked for, whose sum along a ray is the sum of the weights.
+        ones = np.ones((len(self._gaussians), 1), np.float32)
+        return ReferenceParameters.of(
+            self._gaussians, np.concatenate([self._features, ones], axis=1, dtype=np.float32)
+        )
 
     def _pieces(self, rays: RayBatch) -> list[slice]:
         size = max(1, PAIRS_AT_ONCE // max(1, len(self._features)))

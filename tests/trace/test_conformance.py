@@ -177,12 +177,13 @@ def test_errors_are_shared_out_by_weight(tracer: Tracer) -> None:
 
 
 def test_changed_parameters_are_read_when_told(tracer: Tracer, rng: np.random.Generator) -> None:
-    cloud = make_cloud(rng, 150, size=0.15)
-    tracer.build(cloud)
+    cloud, features = make_cloud(rng, 150, size=0.15), f32(rng.random((150, 2)))
+    tracer.build(cloud, features)
     cloud.sh += f32(0.1 * rng.normal(size=cloud.sh.shape))
     cloud.opacity_logits -= f32(0.5)
+    features *= f32(0.5)
     tracer.refresh(np.arange(150, dtype=np.int32))
-    assert_like_the_twin(tracer, cloud, rays_inwards(rng, 40))
+    assert_like_the_twin(tracer, cloud, rays_inwards(rng, 40), features)
 
 
 def test_a_recording_of_another_build_is_refused(tracer: Tracer, rng: np.random.Generator) -> None:
