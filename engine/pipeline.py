@@ -61,10 +61,10 @@ from engine.threads import use_threads
 from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from engine.train.config import TrainConfig, iteration_count, trace_settings
+from engine.train.config import TrainConfig, iteration_count
 from engine.train.fingerprint import run_fingerprint
 from engine.train.initialise import initial_gaussians
-from engine.train.parts import make_shading
+from engine.train.shading import make_shading
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 from engine.versions import versions
@@ -310,6 +310,7 @@ def _open_dataset(
         masks=config.masks,
         model_folder=model_folder,
         accept=accept,
+        near=config.train.near,
         threads=threads,
         progress=lambda done, total: tell(StageProgress("load", done, total)),
     )
@@ -373,7 +374,7 @@ def _evaluate(
         dataset,
         gaussians,
         output,
-        settings=trace_settings(config.train, dataset.extent),
+        settings=config.train.trace,
         shading=make_shading(config.train, len(dataset.views)),
         background=config.evaluate_background,
         run={

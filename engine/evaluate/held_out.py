@@ -18,7 +18,7 @@ from engine.render.names import render_names
 from engine.render.renderer import background_colour, render_rays
 from engine.scene import Dataset
 from engine.shading.protocol import ShadingModel
-from engine.trace.cpu import CpuTracer
+from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer, TraceSettings
 from engine.writing import write_json
 
@@ -52,7 +52,7 @@ def evaluate_held_out(
         threads: for rendering and measuring; 0 means all cores.
         tell: hears the progress.
     """
-    tracer = CpuTracer(settings, threads=threads)
+    tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
     rows: list[ViewMetrics] = []
     images = WorstAndBest()
@@ -86,9 +86,8 @@ def _rendered(
 ) -> Iterator[RenderedView]:
     colour = background_colour(background)
     for index in dataset.test_indices:
-        origin, directions = dataset.view_rays(int(index))
         rgb, alpha, weight = dataset.view_image(int(index))
-        image = render_rays(tracer, origin, directions, colour, shading)
+        image = render_rays(tracer, dataset.view_rays(int(index)), colour, shading)
         reference = composited(rgb, alpha, colour)
         yield RenderedView(
             dataset.views[index].name, image.rgb_srgb, reference, weight, alpha if dataset.has_alpha else None

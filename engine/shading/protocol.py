@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from engine.gaussians.model import FlatGaussians
-from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, Tracer, TraceResult
+from engine.rays import RayBatch
+from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 
 @dataclass(frozen=True)
@@ -23,16 +24,14 @@ class Sight:
     """What is to be shaded.
 
     Attributes:
-        origins_world: where the rays begin.
-        directions_world: unit directions.
+        rays: the rays.
         seen: what the tracer saw along them.
         tracer: for further rays, mirrored ones say, through the same Gaussians.
         view: number of each ray's training view; None for views that were not trained on.
         progress: share of the training that is done; 1 for a finished scene.
     """
 
-    origins_world: Float32[np.ndarray, "r 3"]
-    directions_world: Float32[np.ndarray, "r 3"]
+    rays: RayBatch
     seen: TraceResult
     tracer: Tracer
     view: Int64[np.ndarray, " r"] | None = None
@@ -70,7 +69,7 @@ class Reversed:
     """
 
     seen: TraceGradients
-    further: tuple[tuple[HitLists, TraceGradients], ...] = ()
+    further: tuple[tuple[Recording, TraceGradients], ...] = ()
     parameters: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 

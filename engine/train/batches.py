@@ -9,6 +9,7 @@ from jaxtyping import Float32, Int64
 
 from engine.colour import composited
 from engine.errors import ConfigError
+from engine.rays import RayBatch
 from engine.scene import View
 from engine.train.config import TrainConfig, window_side_px
 
@@ -19,8 +20,8 @@ class Pixels(Protocol):
 
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
-    ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, "r 3"]]:
-        """Origins and unit directions, world frame, of pixels."""
+    ) -> RayBatch:
+        """Unit rays of pixels, world frame."""
         ...
 
     def pixels(
@@ -49,8 +50,7 @@ class Batch:
     behind both the Gaussians and photographs with alpha.
     """
 
-    origins_world: Float32[np.ndarray, "r 3"]
-    directions_world: Float32[np.ndarray, "r 3"]
+    rays: RayBatch
     rgb_srgb: Float32[np.ndarray, "r 3"]
     alpha: Float32[np.ndarray, " r"]
     weight: Float32[np.ndarray, " r"]
@@ -179,10 +179,10 @@ class BatchSource:
         if self._patches:
             drawn.append(sampler.patches(rng, self._patches, side))
         view, y, x = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-        origins, directions = self._dataset.rays(view, y, x)
+        rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
         background = self._background(rng)
-        return Batch(origins, directions, rgb, alpha, weight, view, self._patches, side, background)
+        return Batch(rays, rgb, alpha, weight, view, self._patches, side, background)
 
     def _patch_count(self) -> int:
         config, side = self._config, self._config.patch_side

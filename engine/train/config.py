@@ -133,7 +133,7 @@ class TrainConfig(_Frozen):
     )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
-    trace: TraceSettings = TraceSettings(t_min=0.0)
+    trace: TraceSettings = TraceSettings()
     near: float = Field(0.01, ge=0, description="nearest distance at which a Gaussian is seen, of the extent")
     densify: McmcConfig | PaperConfig = Field(McmcConfig(), discriminator="kind")
     rebuild_every: int = Field(
@@ -185,11 +185,6 @@ def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
     A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
     """
     return config.rebuild_every * (1 + gaussians // 500_000)
-
-
-def trace_settings(config: TrainConfig, extent: float) -> TraceSettings:
-    """The run's trace settings with the near distance in world units."""
-    return config.trace.model_copy(update={"t_min": config.near * extent})
 
 
 def preset(name: str) -> TrainConfig:

@@ -47,12 +47,12 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1
             rng=rng,
         )
     view, y, x = dataset.sample_pixels(rng, limit)
-    origins, directions = dataset.rays(view, y, x)
+    rays = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     seen = (weight > 0) & (alpha > 0)
     return from_rays(
-        origins[seen],
-        directions[seen],
+        rays.origins_world[seen],
+        rays.directions_world[seen],
         rgb[seen],
         extent=dataset.extent,
         opacity=config.initial_opacity,

@@ -67,9 +67,9 @@ def differentiate(
         progress: share of the training that is done.
         with_errors: share the rays' errors out to their Gaussians.
     """
-    seen = tracer.trace(batch.origins_world, batch.directions_world, record=True)
+    seen = tracer.trace(batch.rays, record=True)
     assert seen.hits is not None
-    sight = Sight(batch.origins_world, batch.directions_world, seen, tracer, batch.view, progress)
+    sight = Sight(batch.rays, seen, tracer, batch.view, progress)
     developed = shading.develop(sight)
     render = developed.over(batch.background_srgb)
     loss = batch_loss(render, batch, weights)
@@ -80,7 +80,7 @@ def differentiate(
     recorded = [(seen.hits, by_seen), *back.further]
     return Differentiated(
         loss=loss,
-        gaussians=add_gradients([tracer.backward(hits, by) for hits, by in recorded]),
+        gaussians=add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded]),
         shading=back.parameters,
         hits_per_ray=float(seen.hit_counts.mean()),
     )

@@ -10,6 +10,7 @@ from engine.colour import composited
 from engine.errors import TrainingFailure
 from engine.events import HeldOutMeasured, Listener, Warned
 from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
 from engine.train.batches import PixelSampler, TrainingData, still_background, view_sizes_px
@@ -26,8 +27,7 @@ EMPTY_ALPHA = 0.01
 class Probe:
     """Random pixels of some views, over a background."""
 
-    origins_world: Float32[np.ndarray, "r 3"]
-    directions_world: Float32[np.ndarray, "r 3"]
+    rays: RayBatch
     rgb_srgb: Float32[np.ndarray, "r 3"]
     weight: Float32[np.ndarray, " r"]
     view: Int64[np.ndarray, " r"]
@@ -39,16 +39,15 @@ def draw_probe(
 ) -> Probe:
     """``config.probe_rays`` pixels of the views ``indices``."""
     view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, config.probe_rays)
-    origins, directions = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     background = still_background(config)
-    return Probe(origins, directions, composited(rgb, alpha, background), weight, view, background)
+    return Probe(dataset.rays(view, y, x), composited(rgb, alpha, background), weight, view, background)
 
 
 def measure(probe: Probe, tracer: Tracer, shading: ShadingModel) -> tuple[float, float]:
     """PSNR averaged over the views, dB, and the mean accumulated alpha, all seen as new views are."""
-    seen = tracer.trace(probe.origins_world, probe.directions_world)
-    developed = shading.develop(Sight(probe.origins_world, probe.directions_world, seen, tracer))
+    seen = tracer.trace(probe.rays)
+    developed = shading.develop(Sight(probe.rays, seen, tracer))
     render = np.clip(developed.over(probe.background_srgb), 0, 1)
     error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
     views, inverse = np.unique(probe.view, return_inverse=True)

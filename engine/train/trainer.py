@@ -8,15 +8,16 @@ from engine.events import CheckpointWritten, Listener, TrainingProgress
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
 from engine.shading.protocol import ShadingModel
+from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource, TrainingData
 from engine.train.checkpoint import save_checkpoint
 from engine.train.config import TrainConfig, most_gaussians
 from engine.train.densify import make_densifier
 from engine.train.iteration import Differentiated, Machinery, iterate
-from engine.train.parts import make_shading, make_tracer
 from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
+from engine.train.shading import make_shading
 from engine.train.state import TrainState
 
 
@@ -82,9 +83,9 @@ class Trainer:
             densifier.restore(state.densifier)
         if state.shading:
             self.shading.restore(state.shading)
-        self._machinery = Machinery(
-            tracer or make_tracer(config, dataset.extent, threads=threads), self.shading, densifier
-        )
+        if tracer is None:  # boxes leave room for what moves between rebuilds
+            tracer = make_tracer(config.trace, threads=threads, box_padding=config.box_padding)
+        self._machinery = Machinery(tracer, self.shading, densifier)
         self._judge = Judge(dataset, config, folder, listener)
 
     def run(self) -> FlatGaussians:

@@ -86,9 +86,9 @@ def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, window_rays
         rays=rays, window_rays=window_rays, window_side=24, patch_fraction=fraction, loss={"ssim": ssim}
     )
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
-    assert len(batch.rgb_srgb) == len(batch.origins_world) == len(batch.alpha) == len(batch.weight) == rays
+    assert len(batch.rgb_srgb) == len(batch.rays) == len(batch.alpha) == len(batch.weight) == rays
     assert abs(batch.patches * 256 - (fraction * rays if ssim else 0)) <= 256
-    np.testing.assert_allclose(np.linalg.norm(batch.directions_world, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(batch.rays.directions_world, axis=1), 1, atol=1e-6)
 
 
 def test_ssim_is_refused_where_it_would_be_ignored() -> None:

@@ -9,6 +9,7 @@ from flat_world import FlatWorld, small_config
 
 from engine.errors import Cancelled
 from engine.events import Event, HeldOutMeasured
+from engine.rays import RayBatch
 from engine.shading.exposure import Exposures
 from engine.shading.protocol import Sight
 from engine.trace.cpu import CpuTracer
@@ -74,7 +75,7 @@ def sight(view: np.ndarray, rgb: np.ndarray, alpha: np.ndarray) -> Sight:
         rgb_srgb=rgb, transmittance=np.float32(1) - alpha, depth_sum=zeros, depth_median=zeros,
         normal_world=three, features=three[:, :0], hit_counts=np.zeros(len(view), np.int32),
     )  # fmt: skip
-    return Sight(three, three, seen, CpuTracer(), view)
+    return Sight(RayBatch(three, three), seen, CpuTracer(), view)
 
 
 def made_exposures(views: int, rng: np.random.Generator) -> Exposures:

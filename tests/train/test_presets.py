@@ -16,7 +16,7 @@ from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.shading.plain import PLAIN
 from engine.trace.cpu import CpuTracer
 from engine.train.batches import BatchSource
-from engine.train.config import LossWeights, TrainConfig, preset, trace_settings
+from engine.train.config import LossWeights, TrainConfig, preset
 from engine.train.iteration import differentiate
 from engine.train.state import fresh_state
 from engine.train.trainer import Trainer
@@ -52,7 +52,7 @@ def test_the_gradient_of_ssim_reaches_the_gaussians() -> None:
     gaussians = world.start(opacity=0.6)
     rng = np.random.default_rng(2)
     gaussians.sh += rng.normal(0, 0.4, gaussians.sh.shape).astype(np.float32)
-    tracer = CpuTracer(trace_settings(config, world.extent), threads=1)
+    tracer = CpuTracer(config.trace, threads=1)
 
     def loss_and_gradients() -> tuple[float, dict[str, np.ndarray]]:
         tracer.build(gaussians)

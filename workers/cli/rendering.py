@@ -1,6 +1,6 @@
 """What ``octasplat render`` does once its options are understood."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +31,8 @@ from engine.render.renderer import background_colour
 from engine.run_folder import CONFIG, SCENE, run_viewpoints
 from engine.scene.views_file import SplitViewpoints
 from engine.stages import counted_stage
-from engine.trace.cpu import CpuTracer
+from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
-from engine.train.config import trace_settings
 from workers.cli.options import is_run
 from workers.cli.progress import show_progress
 from workers.cli.scene_files import open_scene
@@ -48,6 +47,7 @@ class _Source:
 
     gaussians: FlatGaussians
     settings: TraceSettings
+    near_world: float = 0.0
     background: str = "black"
     viewpoints: SplitViewpoints | None = None
 
@@ -82,7 +82,9 @@ def render_files(mode: str, options: dict[str, Any], listener: Listener) -> tupl
     source = _read_run(options) if is_run(options["source"]) else _read_file(options)
     if mode == "turntable":
         cameras = _turntable(source, options, fps)
-    tracer = CpuTracer(source.settings, threads=options["threads"], build_quality=2)
+    if cameras is not None:
+        cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
+    tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
     background = background_colour(options["background"] or source.background)
     with counted_stage("render", listener) as progress:
@@ -114,7 +116,8 @@ def _read_run(options: dict[str, Any]) -> _Source:
     viewpoints = run_viewpoints(run, scene=options["scene"], max_side=options["max_side"])
     return _Source(
         read_gaussian_ply(run / SCENE)[0],
-        trace_settings(config.train, viewpoints.extent),
+        config.train.trace,
+        config.train.near * viewpoints.extent,
         config.evaluate_background,
         viewpoints,
     )
@@ -151,4 +154,4 @@ def _views(source: _Source, which: str | None) -> tuple[Shot, ...]:
     indices = chosen.get(which or "held-out", viewpoints.test_indices)
     if len(indices) == 0:
         raise OutputError("The run held out no views; ask for --views train or all.")
-    return view_shots(viewpoints, indices)
+    return view_shots(viewpoints, indices, source.near_world)

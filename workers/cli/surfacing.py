@@ -18,9 +18,8 @@ from engine.scene import load_scene
 from engine.surface.cameras import cameras_around, photograph_cameras
 from engine.surface.extract import ExtractedSurface, extract_surface
 from engine.surface.options import SurfaceOptions
-from engine.trace.cpu import CpuTracer
+from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
-from engine.train.config import trace_settings
 from workers.cli.options import is_run
 from workers.cli.progress import show_progress
 from workers.cli.scene_files import open_scene
@@ -62,7 +61,7 @@ def run_surface(
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output.parent} cannot be made ({error.strerror or error}).") from None
-    tracer = CpuTracer(settings, threads=threads, build_quality=2)
+    tracer = make_tracer(settings, threads=threads, build_quality=2)
     tracer.build(gaussians)
     with show_progress(quiet=quiet, should_stop=should_stop) as listener:
         extracted = extract_surface(
@@ -89,8 +88,9 @@ def _cameras(
     """Where to render depth from, and with which settings of the tracer."""
     if is_run(source) and (source / CONFIG).exists():
         seen = run_viewpoints(source, scene=scene)
-        settings = trace_settings(read_config(source / CONFIG).train, seen.extent)
-        return photograph_cameras(seen, seen.train_indices, options.depth_side), settings
+        train = read_config(source / CONFIG).train
+        near_world = train.near * seen.extent
+        return photograph_cameras(seen, seen.train_indices, options.depth_side, near_world), train.trace
     if scene is not None:
         photographs = load_scene(scene)
         every = np.arange(len(photographs.views))

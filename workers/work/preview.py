@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float32
 
 from engine.events import Event, Listener
+from engine.rays import ImageRays
 from engine.render.images import write_png
 from engine.render.renderer import background_colour, render_rays
 from engine.scene import Dataset
@@ -61,8 +61,7 @@ class Previews:
         if began < self._due:
             return
         chosen = int((dataset.test_indices if len(dataset.test_indices) else dataset.train_indices)[0])
-        origin, directions = grid_rays(dataset, chosen, self._side_px)
-        image = render_rays(tracer, origin, directions, self._background)
+        image = render_rays(tracer, grid_rays(dataset, chosen, self._side_px), self._background)
         write_png(self._run / FILE, image.rgb_srgb)
         self._listener(PreviewWritten(FILE, iteration, dataset.views[chosen].name))
         spent = time.monotonic() - began
@@ -74,10 +73,8 @@ class Previews:
             self._side_px = int(min(SIDE_PX, max(LEAST_SIDE_PX, fitting_px)))
 
 
-def grid_rays(
-    dataset: Dataset, view: int, side_px: int
-) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]:
-    """Origin and directions, in world coordinates, through evenly spaced pixels of a view.
+def grid_rays(dataset: Dataset, view: int, side_px: int) -> ImageRays:
+    """Rays through evenly spaced pixels of a view.
 
     Args:
         dataset: the photographs.
@@ -90,5 +87,6 @@ def grid_rays(
     y = ((np.arange(rows) + 0.5) * height / rows).astype(np.int64)
     x = ((np.arange(columns) + 0.5) * width / columns).astype(np.int64)
     yy, xx = np.meshgrid(y, x, indexing="ij")
-    origins, directions = dataset.rays(np.full(yy.size, view), yy.ravel(), xx.ravel())
-    return origins[0], directions.reshape(rows, columns, 3)
+    directions = dataset.rays(np.full(yy.size, view), yy.ravel(), xx.ravel()).directions_world
+    origin_world = dataset.views[view].origin_world
+    return ImageRays.of(origin_world, directions.reshape(rows, columns, 3), dataset.near_world)

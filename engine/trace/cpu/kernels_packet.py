@@ -1,17 +1,43 @@
-"""Packets of rays with one origin: who shares one, which Gaussians may it meet, and their rows for SIMD.
+r"""Packets of rays that share an origin: which Gaussians may they meet, and these Gaussians' rows for SIMD.
 
-A packet's rays fill a pyramid. The hierarchy is walked once for the pyramid; the Gaussians whose ellipse
-reaches into it are the packet's candidates, ordered by the least distance at which a ray of it can meet
-them.
+    Seen from the side, with the packet's rays between d0 and d63:
+
+                                  . - '  d0             o         origin of all rays, wherever each begins
+                          . - '  /e2                    [A] [B]   boxes over eight Gaussians each
+                  . - '         /                       e1 e2     ellipses of candidates, seen edge on
+          . - '    [A]   |                              b         slope across the axis (a: out of the page)
+      o  - - - - - - - - | - - - - - -  axis            safe      no later chunk has a hit before this
+          ' - .       e1 |
+                  ' - .              [B]
+                          ' - .
+                                  ' - .  d63
+      |<----- safe ----->|
+
+1. One walk down the hierarchy finds the blocks of eight Gaussians whose box reaches into the pyramid (A, not
+   B), and of these Gaussians those whose ellipse does: the candidates, once for all 64 rays.
+2. The outline of an ellipse, seen from o, lies between two slopes a and two slopes b. Tables over 64 bins of
+   each give the rays in between as the bits of one word. A candidate without a bit lies between the rays.
+3. Candidates are sorted by their likely distance and cut into chunks of 128. Within a chunk those that the
+   same rays may meet come together, so that a block of eight has few bits.
+4. Each ray tests the blocks that have its bit, eight octagons at once, sorts what it has met, and composites
+   the hits before "safe". It ends where its transmittance says so; what lies behind is never tested.
+5. Backwards, the rays of a packet sum their shares of a Gaussian in one row of moments, which is enough as
+   all share o (:mod:`engine.trace.cpu.kernels_packet_backward`). Rows are sorted and summed by Gaussian.
+
+Steps 1 to 3 leave out only what no ray meets; a hit itself is computed in float64 from the record. So a ray
+has the same hits in any packet and alone, up to the last digits of float64.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 from numba import njit
 
-from engine.trace.cpu.kernels_footprint import CELLS, footprints, rays_between, write_bins
+from engine.trace.cpu.kernels_footprint import BINS, CELLS, FRAME_WORDS, footprints, rays_between, write_bins
 from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
+from engine.trace.cpu.kernels_rays import ray_origin
 from engine.trace.cpu.kernels_simd import (
     boxes_in_pyramid,
     ellipses_in_pyramid,
@@ -24,17 +50,123 @@ from engine.trace.cpu.kernels_simd import (
 from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
 
 STACK = 1024
+"""Words for the nodes that wait, two each; a walk goes down at once, so that seven wait on each level."""
 # --- rows of a block of eight candidates, float64; u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0 ---
 N_X, A_X, B_X, N_0, INNER, ALPHA_0, T_ROW, U_ROW, V_ROW = 0, 3, 6, 9, 10, 11, 12, 13, 14
 ROWS = 15
 ROW_BYTES, NODE_BYTES, BLOCK_BYTES = ROWS * WIDTH * 8, BOX_ROWS * WIDTH * 4, LEAF_ROWS * WIDTH * 4
 AHEAD = 8
-"""Candidates between asking for a record and reading it."""
+"""Candidates between asking for a record and reading it: about as long as memory takes to answer."""
 RECORD_BYTES = RECORD_WORDS * 4
 CHUNK = 128
-"""Candidates that a ray tests before it composites what lies safely in front of the rest."""
+"""Candidates that a ray tests before it composites what lies safely in front of the rest.
+
+Small enough that rays which end early leave most candidates untested, large enough that the sorting of a
+ray's hits, once a chunk, does not show; a chunk's rows (15 kB) stay in the first cache.
+"""
+FEW_KEYS = 48
+"""An insertion sort is faster than two passes over 256 buckets for so few."""
 SIDES = 5
 """Planes of a pyramid: four through its sides, one through its apex across the axis."""
+SLOPE_ROOM = 1e-9
+"""The pyramid is wider than its rays by this, which covers the rounding of slopes in float64."""
+START_ROOM = 512
+"""Candidates that a thread has room for at first; a packet that has more makes it grow."""
+
+
+class Tree(NamedTuple):
+    """The hierarchy; :mod:`engine.trace.cpu.kernels_tree` says how it is laid out."""
+
+    nodes: Float32[np.ndarray, "m 6 8"]
+    level_starts: Int64[np.ndarray, " l"]
+    blocks: Float32[np.ndarray, "b 9 8"]
+    order: Int32[np.ndarray, " k"]
+
+
+class Pyramid(NamedTuple):
+    """The pyramid around the rays of a packet.
+
+    ``planes`` are inward normals and, as int64, the rows of a box's farthest corner along them; ``frame`` the
+    axis, two directions across it, the range of slopes and bins per slope; ``below`` the bits of the rays in
+    the bins before each, along either slope.
+    """
+
+    planes: Float64[np.ndarray, "5 6"]
+    frame: Float64[np.ndarray, "15"]
+    below: UInt64[np.ndarray, "2 65"]
+
+
+class Walk(NamedTuple):
+    """Memory of a walk: waiting nodes, bins and distances of one block, and buckets for sorting."""
+
+    stack: Int64[np.ndarray, " s"]
+    bins: Int32[np.ndarray, "4 8"]
+    distances: Float64[np.ndarray, "2 8"]
+    histogram: Int32[np.ndarray, "256"]
+
+
+class Candidates(NamedTuple):
+    """The candidates of a packet, ``c`` at most.
+
+    As they are found: ``found``, the place on the curve; ``keys``, the likely distance in the upper half and
+    the number in the lower; ``bounds``, the least distance; ``cells``, where in the cross section; ``masks``,
+    the bits of the rays. In order: ``ids``; ``near``, where a chunk begins, the least distance of what
+    follows; ``block_rays``, the bits of the rays that may meet any of a block's eight; ``rows``, what is
+    tested; ``slot_of``, the number under which the packet met it, or -1. Of one ray: ``met``, ``pending``.
+    """
+
+    found: Int32[np.ndarray, " c"]
+    keys: UInt64[np.ndarray, " c"]
+    bounds: Float32[np.ndarray, " c"]
+    cells: Int32[np.ndarray, " c"]
+    masks: UInt64[np.ndarray, " c"]
+    ids: Int32[np.ndarray, " c"]
+    near: Float32[np.ndarray, " c1"]
+    block_rays: UInt64[np.ndarray, " b"]
+    rows: Float64[np.ndarray, "b 15 8"]
+    slot_of: Int32[np.ndarray, " c"]
+    met: Int32[np.ndarray, " c8"]
+    pending: UInt64[np.ndarray, " c8"]
+
+
+@njit(error_model="numpy")
+def new_pyramid():
+    """Room for a pyramid."""
+    return Pyramid(
+        np.empty((SIDES, 6), np.float64),
+        np.empty(FRAME_WORDS, np.float64),
+        np.empty((2, BINS + 1), np.uint64),
+    )
+
+
+@njit(error_model="numpy")
+def new_walk():
+    """Memory for walks, one after another."""
+    return Walk(
+        np.empty(STACK, np.int64),
+        np.empty((4, WIDTH), np.int32),
+        np.empty((2, WIDTH), np.float64),
+        np.empty(256, np.int32),
+    )
+
+
+@njit(error_model="numpy")
+def new_candidates(room):
+    """Room for so many candidates, a multiple of eight."""
+    return Candidates(
+        np.empty(room, np.int32),
+        np.empty(room, np.uint64),
+        np.empty(room, np.float32),
+        np.empty(room, np.int32),
+        np.empty(room, np.uint64),
+        np.empty(room, np.int32),
+        np.empty(room + 1, np.float32),
+        np.empty(room // WIDTH, np.uint64),
+        np.empty((room // WIDTH, ROWS, WIDTH), np.float64),
+        np.empty(room, np.int32),
+        np.empty(room + WIDTH, np.int32),
+        np.empty(room + WIDTH, np.uint64),
+    )
 
 
 @njit(cache=True)
@@ -45,14 +177,15 @@ def packet_starts(origins, directions, most, least_cosine, starts):
     """
     packets = 0
     first = 0
-    for r in range(len(origins)):
+    one_origin = len(origins) == 1
+    for r in range(len(directions)):
         if r > 0 and r - first < most:
             cosine = (
                 directions[r, 0] * directions[first, 0]
                 + directions[r, 1] * directions[first, 1]
                 + directions[r, 2] * directions[first, 2]
             )
-            same = (
+            same = one_origin or (
                 origins[r, 0] == origins[first, 0]
                 and origins[r, 1] == origins[first, 1]
                 and origins[r, 2] == origins[first, 2]
@@ -62,17 +195,14 @@ def packet_starts(origins, directions, most, least_cosine, starts):
         starts[packets] = r
         packets += 1
         first = r
-    starts[packets] = len(origins)
+    starts[packets] = len(directions)
     return packets
 
 
 @njit(error_model="numpy")
-def make_pyramid(directions, first, last, planes, frame, below):
-    """The pyramid around rays ``first`` to ``last``.
-
-    Writes its inward normals and its axis to the rows of ``planes``, its ``frame``, and the tables ``below``
-    of its rays (:mod:`engine.trace.cpu.kernels_footprint`).
-    """
+def write_pyramid(directions, first, last, pyramid):
+    """The pyramid around rays ``first`` to ``last``."""
+    planes, frame = pyramid.planes, pyramid.frame
     x = y = z = 0.0
     for r in range(first, last):
         x += directions[r, 0]
@@ -96,8 +226,8 @@ def make_pyramid(directions, first, last, planes, frame, below):
         a = (d0 * e0 + d1 * e1 + d2 * e2) * inverse
         b = (d0 * f0 + d1 * f1 + d2 * f2) * inverse
         a_low, a_high, b_low, b_high = min(a_low, a), max(a_high, a), min(b_low, b), max(b_high, b)
-    room = 1e-9
-    a_low, a_high, b_low, b_high = a_low - room, a_high + room, b_low - room, b_high + room
+    a_low, a_high = a_low - SLOPE_ROOM, a_high + SLOPE_ROOM
+    b_low, b_high = b_low - SLOPE_ROOM, b_high + SLOPE_ROOM
     planes[0, 0], planes[0, 1], planes[0, 2] = e0 - a_low * x, e1 - a_low * y, e2 - a_low * z
     planes[1, 0], planes[1, 1], planes[1, 2] = a_high * x - e0, a_high * y - e1, a_high * z - e2
     planes[2, 0], planes[2, 1], planes[2, 2] = f0 - b_low * x, f1 - b_low * y, f2 - b_low * z
@@ -111,27 +241,27 @@ def make_pyramid(directions, first, last, planes, frame, below):
     frame[3], frame[4], frame[5] = e0, e1, e2
     frame[6], frame[7], frame[8] = f0, f1, f2
     frame[9], frame[10], frame[11], frame[12] = a_low, a_high, b_low, b_high
-    write_bins(directions, first, last, frame, below)
+    write_bins(directions, first, last, frame, pyramid.below)
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
-def gather_candidates(
-    nodes, level_starts, blocks, count, planes, frame, below, ox, oy, oz, stack, bins, distances,
-    found, keys, bounds, cells, masks,
-):  # fmt: skip
-    """The Gaussians whose ellipse a ray of the pyramid may meet; returns how many there are.
+def gather_candidates(tree, pyramid, origin, farthest, walk, candidates):
+    """The Gaussians whose ellipse a ray of the pyramid may meet before ``farthest``; returns how many.
 
-    Of each: its place on the curve, a key with its likely distance in the upper half, the least distance, the
-    cell of its outline's middle, and the bits of the rays. Only as many as fit are written.
+    Only as many as there is room for are written.
     """
+    ox, oy, oz = origin
+    stack, bins, distances = walk.stack, walk.bins, walk.distances
+    level_starts = tree.level_starts
     n_found = 0
     top = len(level_starts) - 2
     stack[0] = level_starts[top]
     stack[1] = top
     depth = 1
-    room = len(found)
-    nodes_at, blocks_at, planes_at = nodes.ctypes.data, blocks.ctypes.data, planes.ctypes.data
-    frame_at, bins_at, distances_at = frame.ctypes.data, bins.ctypes.data, distances.ctypes.data
+    room = len(candidates.found)
+    nodes_at, blocks_at = tree.nodes.ctypes.data, tree.blocks.ctypes.data
+    planes_at, frame_at = pyramid.planes.ctypes.data, pyramid.frame.ctypes.data
+    bins_at, distances_at = bins.ctypes.data, distances.ctypes.data
     while depth > 0:
         depth -= 1
         node = stack[2 * depth]
@@ -153,32 +283,47 @@ def gather_candidates(
             while reached != 0:
                 lane = lowest_bit(reached)
                 reached &= reached - 1
-                rays, cell = rays_between(bins, lane, below)
+                if distances[0, lane] >= farthest:
+                    continue
+                rays, cell = rays_between(bins, lane, pyramid.below)
                 if rays == 0:
                     continue  # it lies between the rays
                 if n_found < room:
-                    found[n_found] = child * WIDTH + lane
+                    candidates.found[n_found] = child * WIDTH + lane
                     # non-negative floats sort like their bits
                     likely = np.uint64(float32_bits(np.float32(distances[1, lane])))
-                    keys[n_found] = (likely << np.uint64(32)) | np.uint64(n_found)
-                    bounds[n_found] = distances[0, lane]
-                    cells[n_found] = cell
-                    masks[n_found] = rays
+                    candidates.keys[n_found] = (likely << np.uint64(32)) | np.uint64(n_found)
+                    candidates.bounds[n_found] = distances[0, lane]
+                    candidates.cells[n_found] = cell
+                    candidates.masks[n_found] = rays
                 n_found += 1
     return n_found
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
-def sort_candidates(
-    found, count, order, keys, scratch, histogram, bounds, cells, masks, ids, near, block_rays
-):
-    """Ids of the candidates in chunks by distance; within a chunk those that the same rays may meet together.
+@njit(error_model="numpy")
+def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
+    """Candidates of the packet of rays ``first`` to ``last``, and how many; room grows as needed."""
+    write_pyramid(rays.directions, first, last, pyramid)
+    one_end = len(rays.t_max) == 1
+    farthest = rays.t_max[0 if one_end else first]
+    if not one_end:
+        for r in range(first + 1, last):
+            farthest = max(farthest, rays.t_max[r])
+    origin = ray_origin(rays, first)
+    count = gather_candidates(tree, pyramid, origin, farthest, walk, candidates)
+    if count > len(candidates.found):
+        candidates = new_candidates((count * 5 // 4 + WIDTH - 1) // WIDTH * WIDTH)
+        count = gather_candidates(tree, pyramid, origin, farthest, walk, candidates)
+    return candidates, count
 
-    ``near[k]``, where a chunk begins, is the least distance at which a ray can meet candidates k and after;
-    ``block_rays[b]`` has a bit for each ray that may meet one of the eight candidates of block b.
-    """
-    if count > 48:
-        sort_keys(keys, scratch, count, histogram)
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def sort_candidates(candidates, count, order, histogram):
+    """Order the candidates in chunks by distance, within a chunk by the rays that may meet them."""
+    keys, bounds, cells, near = candidates.keys, candidates.bounds, candidates.cells, candidates.near
+    block_rays = candidates.block_rays
+    if count > FEW_KEYS:
+        sort_keys(keys, candidates.pending, count, histogram)
     else:
         insertion_sort(keys, count)
     nearest = np.float32(np.inf)
@@ -200,8 +345,18 @@ def sort_candidates(
             cell = cells[which]
             place = start + histogram[cell]
             histogram[cell] += 1
-            ids[place] = order[found[which]]
-            block_rays[place // WIDTH] |= masks[which]
+            candidates.ids[place] = order[candidates.found[which]]
+            block_rays[place // WIDTH] |= candidates.masks[which]
+
+
+@njit(error_model="numpy")
+def keep_candidates(candidates, count, order):
+    """Leave the candidates in the order in which they were found, where none is needed."""
+    for b in range((count + WIDTH - 1) // WIDTH):
+        candidates.block_rays[b] = 0
+    for k in range(count):
+        candidates.ids[k] = order[candidates.found[k]]
+        candidates.block_rays[k // WIDTH] |= candidates.masks[k]
 
 
 @njit
@@ -252,14 +407,20 @@ def sort_keys(keys, scratch, count, histogram):
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
-def write_rows(rows, ids, count, records, sh, ox, oy, oz):
-    """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit."""
+def write_rows(candidates, count, scene, origin, coloured):
+    """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit.
+
+    Harmonics are asked for if hits will be ``coloured``.
+    """
+    ox, oy, oz = origin
+    rows, ids, records, sh = candidates.rows, candidates.ids, scene.records, scene.sh
     records_at, sh_at = records.ctypes.data, sh.ctypes.data
     sh_bytes = sh.shape[1] * 12
     for k in range((count + WIDTH - 1) // WIDTH * WIDTH):
         if k + AHEAD < count:
             prefetch(records_at + ids[k + AHEAD] * RECORD_BYTES)
-            prefetch(sh_at + ids[k + AHEAD] * sh_bytes)
+            if coloured:
+                prefetch(sh_at + ids[k + AHEAD] * sh_bytes)
         block, lane = rows[k // WIDTH], k % WIDTH
         if k >= count:
             for row in range(ROWS):
@@ -300,13 +461,15 @@ def write_rows(rows, ids, count, records, sh, ox, oy, oz):
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
-def meet_blocks(rows, block_rays, ray, first, last, dx, dy, dz, met):
+def meet_blocks(candidates, ray, first, last, direction):
     """Candidates of blocks ``first`` to ``last`` whose octagon the packet's ray ``ray`` meets; how many.
 
     Leaves t, u and v of each in the rows.
     """
     count = 0
-    rows_at = rows.ctypes.data
+    dx, dy, dz = direction
+    met, block_rays = candidates.met, candidates.block_rays
+    rows_at = candidates.rows.ctypes.data
     for b in range(first, last):
         if (block_rays[b] >> np.uint64(ray)) & np.uint64(1) == 0:
             continue

@@ -10,14 +10,18 @@ and the sums of tau, tau u and tau v over the rays follow from the moments of h 
 degree 3.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float32, Int32, Int64
 from numba import njit, prange
 
 from engine.trace.cpu.kernels_packet import AHEAD, exponential
+from engine.trace.cpu.kernels_rays import ray_direction, ray_origin
 from engine.trace.cpu.kernels_records import rotation_columns
 from engine.trace.cpu.kernels_sh import write_basis
 from engine.trace.cpu.kernels_simd import prefetch
-from engine.trace.cpu.kernels_single_backward import write_gradients
+from engine.trace.cpu.kernels_single_backward import Moments, write_gradients
 from engine.trace.kernels_native import next_from_counter
 
 # --- sums of a packet's rays for one of its Gaussians, float64 scratch ---
@@ -31,23 +35,28 @@ TAU, TAU_U, TAU_V = range(6, 9)
 ROW_WORDS = 16
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
-def replay_from_counter(
-    origins, directions, packets, means, quats, log_scales, features,
-    starts, counts, hit_alphas, hit_ts, hit_rgb, hit_us, hit_vs, hit_slots, slot_ids, slot_counts, first_rows,
-    max_hits, alpha_max, g_rgb, g_transmittance, g_depth, g_median, g_normal, g_feature, ray_errors,
-    with_geometry, counter, row_ids, row_sums, row_sh, row_features,
-):  # fmt: skip
-    """Rows of sums, one for each Gaussian of each packet, from row ``first_rows[p]`` on.
+class Rows(NamedTuple):
+    """A row for each Gaussian of each packet; packet p has those from ``firsts[p]`` on."""
 
-    dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> for every channel (``method`` section 3), the
+    firsts: Int64[np.ndarray, " p1"]
+    ids: Int32[np.ndarray, " e"]
+    sums: Float32[np.ndarray, "e 16"]
+    sh: Float32[np.ndarray, "e k 3"]
+    features: Float32[np.ndarray, "e f"]
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows):
+    """Write the rows of packets, each the rays ``packets[p, 0]`` to ``packets[p, 1]``, one by one.
+
+    dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> for every channel, the
     part behind summed from the back in float64: as a difference of sums it would drown behind opaque
     surfaces.
     """
-    packet_count = len(packets) - 1
-    basis_count = row_sh.shape[1]
+    basis_count = rows.sh.shape[1]
     feature_count = features.shape[1]
-    alpha_limit = np.float32(alpha_max)
+    max_hits, alpha_limit = limits.max_hits, np.float32(limits.alpha_max)
+    means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
     means_at, quats_at, log_scales_at = means.ctypes.data, quats.ctypes.data, log_scales.ctypes.data
     basis = np.empty(16, np.float64)
     g_basis = np.empty((16, 3), np.float32)
@@ -55,67 +64,63 @@ def replay_from_counter(
     sums = np.empty((256, MOMENTS), np.float64)
     while True:
         packet = next_from_counter(counter.ctypes.data)
-        if packet >= packet_count:
+        if packet >= len(packets):
             break
-        first, last = packets[packet], packets[packet + 1]
-        slots = slot_counts[packet]
+        first, last = packets[packet, 0], packets[packet, 1]
+        slots = kept.slot_counts[packet]
         if slots > len(sums):
             sums = np.empty((slots * 5 // 4, MOMENTS), np.float64)
-        base = first_rows[packet]
+        base = rows.firsts[packet]
         for slot in range(slots):
             for column in range(MOMENTS):
                 sums[slot, column] = 0.0
             for j in range(basis_count):
                 for channel in range(3):
-                    row_sh[base + slot, j, channel] = np.float32(0.0)
+                    rows.sh[base + slot, j, channel] = np.float32(0.0)
             for f in range(feature_count):
-                row_features[base + slot, f] = np.float32(0.0)
+                rows.features[base + slot, f] = np.float32(0.0)
         for r in range(first, last):
             count = counts[r]
-            start = starts[r]
+            start = hits.starts[r]
             t = 1.0
             median = -1
             for k in range(count):
                 through[k] = t
-                left = t * (1.0 - np.float64(hit_alphas[start + k]))
+                left = t * (1.0 - np.float64(hits.alphas[start + k]))
                 if t > 0.5 and left <= 0.5:
                     median = k
                 t = left
-            g0, g1, g2 = np.float64(g_rgb[r, 0]), np.float64(g_rgb[r, 1]), np.float64(g_rgb[r, 2])
+            g0, g1, g2 = np.float64(g.rgb[r, 0]), np.float64(g.rgb[r, 1]), np.float64(g.rgb[r, 2])
             gn0 = gn1 = gn2 = gd = gm = 0.0
-            d0, d1, d2 = (
-                np.float64(directions[r, 0]),
-                np.float64(directions[r, 1]),
-                np.float64(directions[r, 2]),
-            )
-            if with_geometry:
-                gd, gm = np.float64(g_depth[r]), np.float64(g_median[r])
+            d0, d1, d2 = ray_direction(rays, r)
+            if g.with_geometry:
+                gd, gm = np.float64(g.depth_sum[r]), np.float64(g.depth_median[r])
                 gn0, gn1, gn2 = (
-                    np.float64(g_normal[r, 0]),
-                    np.float64(g_normal[r, 1]),
-                    np.float64(g_normal[r, 2]),
+                    np.float64(g.normal[r, 0]),
+                    np.float64(g.normal[r, 1]),
+                    np.float64(g.normal[r, 2]),
                 )
-            error = np.float64(ray_errors[r])
+            error = np.float64(g.ray_errors[r])
             write_basis(basis, basis_count, d0, d1, d2)
             for j in range(basis_count):
                 b = np.float32(basis[j])
                 g_basis[j, 0], g_basis[j, 1], g_basis[j, 2] = (
-                    b * g_rgb[r, 0],
-                    b * g_rgb[r, 1],
-                    b * g_rgb[r, 2],
+                    b * g.rgb[r, 0],
+                    b * g.rgb[r, 1],
+                    b * g.rgb[r, 2],
                 )
-            behind = np.float64(g_transmittance[r]) * t
+            behind = np.float64(g.transmittance[r]) * t
             for k in range(count - 1, -1, -1):
                 e = start + k
-                slot = hit_slots[e]
+                slot = kept.slots[e]
                 row = base + slot
-                alpha = np.float64(hit_alphas[e])
+                alpha = np.float64(hits.alphas[e])
                 weight = alpha * through[k]
-                value = g0 * hit_rgb[e, 0] + g1 * hit_rgb[e, 1] + g2 * hit_rgb[e, 2]
-                u, v = np.float64(hit_us[e]), np.float64(hit_vs[e])
-                if with_geometry:
-                    i = slot_ids[first * max_hits + slot]
-                    value += gd * hit_ts[e]
+                value = g0 * hits.rgb[e, 0] + g1 * hits.rgb[e, 1] + g2 * hits.rgb[e, 2]
+                u, v = np.float64(kept.us[e]), np.float64(kept.vs[e])
+                if g.with_geometry:
+                    i = kept.slot_ids[first * max_hits + slot]
+                    value += gd * hits.distances[e]
                     r1, _r2, _r3 = rotation_columns(
                         np.float64(quats[i, 0]), np.float64(quats[i, 1]),
                         np.float64(quats[i, 2]), np.float64(quats[i, 3]),
@@ -125,7 +130,7 @@ def replay_from_counter(
                     side = -1.0 if d0 * r1[0] + d1 * r1[1] + d2 * r1[2] > 0.0 else 1.0
                     facing = side * weight
                     value += side * along
-                    gt = (gd * weight + (gm if k == median else 0.0)) * hit_ts[e]
+                    gt = (gd * weight + (gm if k == median else 0.0)) * hits.distances[e]
                     sums[slot, GT] += gt
                     sums[slot, GTU] += gt * u
                     sums[slot, GTV] += gt * v
@@ -133,12 +138,12 @@ def replay_from_counter(
                     sums[slot, N_1] += facing * gn1
                     sums[slot, N_2] += facing * gn2
                 for f in range(feature_count):
-                    i = slot_ids[first * max_hits + slot]
-                    value += np.float64(g_feature[r, f]) * features[i, f]
-                    row_features[row, f] += np.float32(weight * g_feature[r, f])
+                    i = kept.slot_ids[first * max_hits + slot]
+                    value += np.float64(g.features[r, f]) * features[i, f]
+                    rows.features[row, f] += np.float32(weight * g.features[r, f])
                 g_alpha = through[k] * value - behind / (1.0 - alpha)
                 behind += weight * value
-                h = 0.0 if hit_alphas[e] >= alpha_limit else g_alpha * alpha
+                h = 0.0 if hits.alphas[e] >= alpha_limit else g_alpha * alpha
                 hu, hv = h * u, h * v
                 sums[slot, H] += h
                 sums[slot, HU] += hu
@@ -156,27 +161,23 @@ def replay_from_counter(
                 sums[slot, COUNT] += 1.0
                 # a colour clamped at zero gets no gradient
                 w = np.float32(weight)
-                wr = w if hit_rgb[e, 0] > 0.0 else np.float32(0.0)
-                wg = w if hit_rgb[e, 1] > 0.0 else np.float32(0.0)
-                wb = w if hit_rgb[e, 2] > 0.0 else np.float32(0.0)
+                wr = w if hits.rgb[e, 0] > 0.0 else np.float32(0.0)
+                wg = w if hits.rgb[e, 1] > 0.0 else np.float32(0.0)
+                wb = w if hits.rgb[e, 2] > 0.0 else np.float32(0.0)
                 for j in range(basis_count):
-                    row_sh[row, j, 0] += wr * g_basis[j, 0]
-                    row_sh[row, j, 1] += wg * g_basis[j, 1]
-                    row_sh[row, j, 2] += wb * g_basis[j, 2]
-        ox, oy, oz = (
-            np.float64(origins[first, 0]),
-            np.float64(origins[first, 1]),
-            np.float64(origins[first, 2]),
-        )
+                    rows.sh[row, j, 0] += wr * g_basis[j, 0]
+                    rows.sh[row, j, 1] += wg * g_basis[j, 1]
+                    rows.sh[row, j, 2] += wb * g_basis[j, 2]
+        ox, oy, oz = ray_origin(rays, first)
         for slot in range(slots):
             if slot + AHEAD < slots:
-                ahead = slot_ids[first * max_hits + slot + AHEAD]
+                ahead = kept.slot_ids[first * max_hits + slot + AHEAD]
                 prefetch(means_at + ahead * 12)
                 prefetch(quats_at + ahead * 16)
                 prefetch(log_scales_at + ahead * 8)
-            i = slot_ids[first * max_hits + slot]
+            i = kept.slot_ids[first * max_hits + slot]
             row = base + slot
-            row_ids[row] = i
+            rows.ids[row] = i
             # The frame in float64 from the raw parameters: float32 axes would cost needles digits.
             r1, r2, r3 = rotation_columns(
                 np.float64(quats[i, 0]), np.float64(quats[i, 1]),
@@ -196,69 +197,63 @@ def replay_from_counter(
             tau_u = sums[slot, GTU] - sums[slot, HUUU] - xa * huu - sums[slot, HUVV] - xb * huv
             tau_v = sums[slot, GTV] - sums[slot, HUUV] - xa * huv - sums[slot, HVVV] - xb * hvv
             for column in range(ROW_WORDS):
-                row_sums[row, column] = sums[slot, column]
-            row_sums[row, TAU], row_sums[row, TAU_U] = tau * inverse, tau_u * inverse
-            row_sums[row, TAU_V] = tau_v * inverse
+                rows.sums[row, column] = sums[slot, column]
+            rows.sums[row, TAU], rows.sums[row, TAU_U] = tau * inverse, tau_u * inverse
+            rows.sums[row, TAU_V] = tau_v * inverse
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def replay_packets(
-    origins, directions, packets, means, quats, log_scales, features,
-    starts, counts, hit_alphas, hit_ts, hit_rgb, hit_us, hit_vs, hit_slots, slot_ids, slot_counts, first_rows,
-    max_hits, alpha_max, g_rgb, g_transmittance, g_depth, g_median, g_normal, g_feature, ray_errors,
-    with_geometry, workers, counter, row_ids, row_sums, row_sh, row_features,
-):  # fmt: skip
-    """:func:`replay_from_counter` on ``workers`` threads."""
+    rays, packets, hits, kept, counts, parameters, features, limits, g, workers, counter, rows
+):
+    """:func:`replay_from_counter` on ``workers`` threads; ``counter`` holds one zero."""
     for _worker in prange(workers):
-        replay_from_counter(
-            origins, directions, packets, means, quats, log_scales, features, starts, counts,
-            hit_alphas, hit_ts, hit_rgb, hit_us, hit_vs, hit_slots, slot_ids, slot_counts,
-            first_rows, max_hits, alpha_max, g_rgb, g_transmittance, g_depth, g_median,
-            g_normal, g_feature, ray_errors, with_geometry, counter, row_ids, row_sums, row_sh,
-            row_features,
-        )  # fmt: skip
+        replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows)
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"}, error_model="numpy")
-def sum_packets(
-    quats, log_scales, records, order, sorted_ids, starts, chunks, row_sums, row_sh, row_features,
-    out_ids, out_means, out_quats, out_log_scales, out_logits, out_sh, out_features,
-    out_weights, out_errors, out_counts,
-):  # fmt: skip
-    """Sum the rows of each Gaussian in packet order; the sums become gradients of its raw parameters."""
-    basis_count = out_sh.shape[1]
-    feature_count = out_features.shape[1]
-    segments = len(starts) - 1
-    per_chunk = (segments + chunks - 1) // chunks
-    for chunk in prange(chunks):
-        sums = np.empty(ROW_WORDS, np.float64)
-        for segment in range(chunk * per_chunk, min(segments, (chunk + 1) * per_chunk)):
-            i = sorted_ids[starts[segment]]
+@njit(fastmath={"contract"}, error_model="numpy")
+def sum_chunk(first, last, parameters, records, by_gaussian, rows, out):
+    """Sum the rows of the Gaussians ``first`` to ``last`` in packet order; the sums become gradients."""
+    order, starts = by_gaussian.order, by_gaussian.starts
+    basis_count = out.sh.shape[1]
+    feature_count = out.features.shape[1]
+    sums = np.empty(ROW_WORDS, np.float64)
+    for segment in range(first, last):
+        i = by_gaussian.ids[starts[segment]]
+        for column in range(ROW_WORDS):
+            sums[column] = 0.0
+        for j in range(basis_count):
+            for channel in range(3):
+                out.sh[segment, j, channel] = np.float32(0.0)
+        for f in range(feature_count):
+            out.features[segment, f] = np.float32(0.0)
+        for k in range(starts[segment], starts[segment + 1]):
+            if k + AHEAD < len(order):
+                prefetch(rows.sums.ctypes.data + order[k + AHEAD] * (ROW_WORDS * 4))
+            row = order[k]
             for column in range(ROW_WORDS):
-                sums[column] = 0.0
+                sums[column] += rows.sums[row, column]
             for j in range(basis_count):
                 for channel in range(3):
-                    out_sh[segment, j, channel] = np.float32(0.0)
+                    out.sh[segment, j, channel] += rows.sh[row, j, channel]
             for f in range(feature_count):
-                out_features[segment, f] = np.float32(0.0)
-            for k in range(starts[segment], starts[segment + 1]):
-                if k + AHEAD < len(order):
-                    prefetch(row_sums.ctypes.data + order[k + AHEAD] * (ROW_WORDS * 4))
-                row = order[k]
-                for column in range(ROW_WORDS):
-                    sums[column] += row_sums[row, column]
-                for j in range(basis_count):
-                    for channel in range(3):
-                        out_sh[segment, j, channel] += row_sh[row, j, channel]
-                for f in range(feature_count):
-                    out_features[segment, f] += row_features[row, f]
-            out_ids[segment] = i
-            write_gradients(
-                segment, i, quats, log_scales, records,
-                sums[H], sums[HU], sums[HV], sums[HUU], sums[HUV], sums[HVV],
-                sums[TAU], sums[TAU_U], sums[TAU_V], sums[N_0], sums[N_1], sums[N_2],
-                out_means, out_quats, out_log_scales, out_logits,
-            )  # fmt: skip
-            out_weights[segment] = sums[W]
-            out_errors[segment] = sums[ERROR]
-            out_counts[segment] = np.int32(sums[COUNT])
+                out.features[segment, f] += rows.features[row, f]
+        out.ids[segment] = i
+        moments = Moments(
+            sums[H], sums[HU], sums[HV], sums[HUU], sums[HUV], sums[HVV],
+            sums[TAU], sums[TAU_U], sums[TAU_V], sums[N_0], sums[N_1], sums[N_2],
+        )  # fmt: skip
+        write_gradients(segment, i, parameters, records, moments, out)
+        out.weights[segment] = sums[W]
+        out.errors[segment] = sums[ERROR]
+        out.counts[segment] = np.int32(sums[COUNT])
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def sum_packets(parameters, records, by_gaussian, rows, chunks, out):
+    """:func:`sum_chunk` on all Gaussians that were hit."""
+    segments = len(by_gaussian.starts) - 1
+    per_chunk = (segments + chunks - 1) // chunks
+    for chunk in prange(chunks):
+        first, last = chunk * per_chunk, min(segments, (chunk + 1) * per_chunk)
+        sum_chunk(first, last, parameters, records, by_gaussian, rows, out)

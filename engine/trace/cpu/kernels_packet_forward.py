@@ -1,31 +1,38 @@
-"""The forward pass for packets: candidates once a packet, then each ray sorts and composites its own hits."""
+"""Forward passes for packets: candidates once a packet, then each ray sorts and composites its own hits."""
 
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.cpu.kernels_footprint import BINS, FRAME_WORDS
+from engine.trace.cpu.bundles import Forward
+from engine.trace.cpu.kernels_composite import Hit, begin, composite, finish
 from engine.trace.cpu.kernels_packet import (
     ALPHA_0,
     CHUNK,
-    ROWS,
-    SIDES,
-    STACK,
+    N_X,
+    START_ROOM,
     T_ROW,
     U_ROW,
     V_ROW,
     exponential,
-    gather_candidates,
-    make_pyramid,
+    find_candidates,
+    keep_candidates,
     meet_blocks,
+    new_candidates,
+    new_pyramid,
+    new_walk,
     sort_candidates,
     write_rows,
 )
+from engine.trace.cpu.kernels_rays import ray_direction, ray_limits, ray_origin
 from engine.trace.cpu.kernels_sh import write_basis
 from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, write_ranks
 from engine.trace.cpu.kernels_tree import WIDTH
 from engine.trace.kernels_native import next_from_counter
 
 RANKED = 96
+"""Hits that are sorted by counting, for each, the smaller ones, eight at once: quadratic, but without a
+branch that the processor could guess wrongly. The few longer lists take an insertion sort.
+"""
 STRIDE = CHUNK // WIDTH
 
 
@@ -70,116 +77,57 @@ def order_ties(pending, head, tail, ids):
         pending[j] = key
 
 
-@njit(error_model="numpy")
-def candidate_arrays(room):
-    """Room for so many candidates, a multiple of eight: as they were found, in order, and of one ray."""
-    return (
-        np.empty(room, np.int32),  # found
-        np.empty(room, np.uint64),  # keys
-        np.empty(room, np.int32),  # ids
-        np.empty(room + 1, np.float32),  # near
-        np.empty(room, np.float32),  # bounds
-        np.empty(room, np.int32),  # cells
-        np.empty(room, np.uint64),  # masks
-        np.empty(room // WIDTH, np.uint64),  # block_rays
-        np.empty((room // WIDTH, ROWS, WIDTH), np.float64),  # rows
-        np.empty(room, np.int32),  # slot_of
-        np.empty(room + WIDTH, np.int32),  # met
-        np.empty(room + WIDTH, np.uint64),  # pending
-    )
+@njit(fastmath={"contract"}, error_model="numpy")
+def alpha_of(rows, block, lane, alpha_max):
+    """Alpha of a candidate where the ray last tested meets it, rounded to float32."""
+    u, v = rows[block, U_ROW, lane], rows[block, V_ROW, lane]
+    power = -0.5 * (u * u + v * v)
+    return np.float64(np.float32(min(rows[block, ALPHA_0, lane] * exponential(power), alpha_max)))
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
-def trace_from_counter(
-    origins, directions, packets, nodes, level_starts, blocks, order, records, sh, features, eps1, eps2,
-    t_min, alpha_max, max_hits, counter, rgb, transmittance, depth_sum, depth_median, normal_sum,
-    feature_sum, counts, record_hits, starts, hit_ids, hit_alphas, hit_ts, hit_rgb, hit_us, hit_vs,
-    hit_slots, slot_ids, slot_counts,
-):  # fmt: skip
-    """Trace packets of rays ``packets[p]`` to ``packets[p + 1]``.
+def trace_from_counter(forward, packets, tree, kept, counter):
+    """Trace packets of rays ``packets[p, 0]`` to ``packets[p, 1]`` until the ``counter`` has passed the last.
 
-    Packet p's hits are stored from packets[p] * max_hits on.
-
-    ``eps2`` > 1 means the single-threshold stop. A ray's result depends on its packet alone, so it is the
-    same for every number of threads. ``counter`` holds one zero.
+    Packet p's hits are stored from ``packets[p, 0] * max_hits`` on, and ``kept`` beside them. A ray's result
+    depends on its packet alone, so it is the same for every number of threads.
     """
-    packet_count = len(packets) - 1
-    basis_count = sh.shape[1]
-    feature_count = features.shape[1]
-    near_limit = np.float32(t_min)
+    rays, limits = forward.rays, forward.limits
+    basis_count = forward.scene.sh.shape[1]
     basis = np.empty(16, np.float64)
-    planes = np.empty((SIDES, 6), np.float64)
-    frame = np.empty(FRAME_WORDS, np.float64)
-    bins = np.empty((4, WIDTH), np.int32)
-    distances = np.empty((2, WIDTH), np.float64)
-    below = np.empty((2, BINS + 1), np.uint64)
-    stack = np.empty(STACK, np.int64)
-    histogram = np.empty(256, np.int32)
+    pyramid, walk = new_pyramid(), new_walk()
     ranked = np.empty(RANKED, np.uint64)
     ranks = np.empty(RANKED + WIDTH, np.int64)
-    room = 512
-    (
-        found, keys, ids, near, bounds, cells, masks, block_rays, rows, slot_of, met, pending,
-    ) = candidate_arrays(room)  # fmt: skip
+    candidates = new_candidates(START_ROOM)
     while True:
         packet = next_from_counter(counter.ctypes.data)
-        if packet >= packet_count:
+        if packet >= len(packets):
             break
-        first, last = packets[packet], packets[packet + 1]
-        ox, oy, oz = (
-            np.float64(origins[first, 0]),
-            np.float64(origins[first, 1]),
-            np.float64(origins[first, 2]),
-        )
-        make_pyramid(directions, first, last, planes, frame, below)
-        count = gather_candidates(
-            nodes, level_starts, blocks, len(order), planes, frame, below, ox, oy, oz, stack, bins, distances,
-            found, keys, bounds, cells, masks,
-        )  # fmt: skip
-        if count > room:
-            room = (count * 5 // 4 + WIDTH - 1) // WIDTH * WIDTH
-            (
-                found, keys, ids, near, bounds, cells, masks, block_rays, rows, slot_of, met, pending,
-            ) = candidate_arrays(room)  # fmt: skip
-            count = gather_candidates(
-                nodes, level_starts, blocks, len(order), planes, frame, below, ox, oy, oz, stack, bins,
-                distances, found, keys, bounds, cells, masks,
-            )  # fmt: skip
-        sort_candidates(
-            found, count, order, keys, pending, histogram, bounds, cells, masks, ids, near, block_rays
-        )
-        write_rows(rows, ids, count, records, sh, ox, oy, oz)
+        first, last = packets[packet, 0], packets[packet, 1]
+        candidates, count = find_candidates(rays, first, last, tree, pyramid, walk, candidates)
+        sort_candidates(candidates, count, tree.order, walk.histogram)
+        write_rows(candidates, count, forward.scene, ray_origin(rays, first), True)
+        rows, ids, pending, slot_of = candidates.rows, candidates.ids, candidates.pending, candidates.slot_of
         block_count = (count + WIDTH - 1) // WIDTH
         for k in range(count):
             slot_of[k] = -1
         slots = 0
-        position = slot_base = first * max_hits
+        place = slot_base = first * limits.max_hits
         for r in range(first, last):
-            dx, dy, dz = (
-                np.float64(directions[r, 0]),
-                np.float64(directions[r, 1]),
-                np.float64(directions[r, 2]),
-            )
-            write_basis(basis, basis_count, dx, dy, dz)
-            t1, t2 = 1.0, 1.0
-            second_phase = False
-            red = green = blue = depth = 0.0
-            normal_x = normal_y = normal_z = 0.0
-            median = np.float32(0.0)
-            for f in range(feature_count):
-                feature_sum[r, f] = 0.0
-            hits = 0
-            starts[r] = position
+            direction = ray_direction(rays, r)
+            t_min, t_max = ray_limits(rays, r)
+            write_basis(basis, basis_count, direction[0], direction[1], direction[2])
+            front = begin(forward, r, place)
             head = tail = 0
             stop = False
             b0 = 0
             while b0 < block_count and not stop:
                 b1 = min(b0 + STRIDE, block_count)
-                n_met = meet_blocks(rows, block_rays, r - first, b0, b1, dx, dy, dz, met)
+                n_met = meet_blocks(candidates, r - first, b0, b1, direction)
                 for m in range(n_met):
-                    k = met[m]
+                    k = candidates.met[m]
                     t = np.float32(rows[k // WIDTH, T_ROW, k % WIDTH])
-                    if t <= near_limit:
+                    if t <= t_min or t >= t_max:
                         continue
                     # distances are positive: their bits sort like their values
                     key = (np.uint64(float32_bits(t)) << np.uint64(32)) | np.uint64(k)
@@ -187,7 +135,8 @@ def trace_from_counter(
                     tail += 1
                 sort_pending(pending, ranked, ranks, head, tail)
                 # What follows lies no nearer than this.
-                safe = np.uint64(float32_bits(near[min(b1 * WIDTH, count)])) << np.uint64(32)
+                nearest = candidates.near[min(b1 * WIDTH, count)]
+                safe = np.uint64(float32_bits(nearest)) << np.uint64(32)
                 while head < tail and pending[head] < safe:
                     key = pending[head]
                     if head + 1 < tail and pending[head + 1] >> np.uint64(32) == key >> np.uint64(32):
@@ -197,82 +146,86 @@ def trace_from_counter(
                     k = np.int64(key & np.uint64(0xFFFFFFFF))
                     t = float32_from_bits(np.uint32(key >> np.uint64(32)))
                     block, lane = k // WIDTH, k % WIDTH
-                    u, v = rows[block, U_ROW, lane], rows[block, V_ROW, lane]
-                    power = -0.5 * (u * u + v * v)
-                    alpha = np.float64(
-                        np.float32(min(rows[block, ALPHA_0, lane] * exponential(power), alpha_max))
-                    )
+                    alpha = alpha_of(rows, block, lane, limits.alpha_max)
                     i = ids[k]
-                    weight = alpha * t1
-                    c_red = c_green = c_blue = 0.5
-                    for j in range(basis_count):
-                        c_red += sh[i, j, 0] * basis[j]
-                        c_green += sh[i, j, 1] * basis[j]
-                        c_blue += sh[i, j, 2] * basis[j]
-                    c_red, c_green, c_blue = max(c_red, 0.0), max(c_green, 0.0), max(c_blue, 0.0)
-                    red += weight * c_red
-                    green += weight * c_green
-                    blue += weight * c_blue
-                    depth += weight * t
-                    n_x, n_y, n_z = rows[block, 0, lane], rows[block, 1, lane], rows[block, 2, lane]
-                    facing = -weight if dx * n_x + dy * n_y + dz * n_z > 0.0 else weight
-                    normal_x += facing * n_x
-                    normal_y += facing * n_y
-                    normal_z += facing * n_z
-                    for f in range(feature_count):
-                        feature_sum[r, f] += np.float32(weight * features[i, f])
-                    if t1 > 0.5 and t1 * (1.0 - alpha) <= 0.5:
-                        median = t
-                    if record_hits:
+                    if forward.recording:
                         slot = slot_of[k]
                         if slot < 0:
                             slot = slots
                             slot_of[k] = slot
-                            slot_ids[slot_base + slot] = i
+                            kept.slot_ids[slot_base + slot] = i
                             slots += 1
-                        hit_slots[position] = slot
-                        hit_ids[position] = i
-                        hit_alphas[position] = np.float32(alpha)
-                        hit_ts[position] = t
-                        hit_us[position] = u
-                        hit_vs[position] = v
-                        hit_rgb[position, 0] = c_red
-                        hit_rgb[position, 1] = c_green
-                        hit_rgb[position, 2] = c_blue
-                        position += 1
-                    hits += 1
-                    t1 *= 1.0 - alpha
-                    if second_phase:
-                        t2 *= 1.0 - alpha
-                    elif t1 < eps1:
-                        second_phase = True
-                    if (second_phase and t2 < eps2) or hits >= max_hits:
-                        stop = True
+                        kept.slots[front.place] = slot
+                        kept.us[front.place] = rows[block, U_ROW, lane]
+                        kept.vs[front.place] = rows[block, V_ROW, lane]
+                    hit = Hit(
+                        i,
+                        t,
+                        alpha,
+                        rows[block, N_X, lane],
+                        rows[block, N_X + 1, lane],
+                        rows[block, N_X + 2, lane],
+                    )
+                    front, stop = composite(front, hit, forward, r, direction, basis)
+                    if stop:
                         break
                 b0 = b1
-            counts[r] = hits
-            rgb[r, 0], rgb[r, 1], rgb[r, 2] = red, green, blue
-            transmittance[r] = t1
-            depth_sum[r] = depth
-            depth_median[r] = median
-            normal_sum[r, 0], normal_sum[r, 1], normal_sum[r, 2] = normal_x, normal_y, normal_z
-        if record_hits:
-            slot_counts[packet] = slots
+                stop = stop or nearest >= t_max
+            finish(front, forward, r)
+            place = front.place
+        if forward.recording:
+            kept.slot_counts[packet] = slots
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def trace_packets(
-    origins, directions, packets, nodes, level_starts, blocks, order, records, sh, features, eps1, eps2,
-    t_min, alpha_max, max_hits, workers, counter, rgb, transmittance, depth_sum, depth_median, normal_sum,
-    feature_sum, counts, record_hits, starts, hit_ids, hit_alphas, hit_ts, hit_rgb, hit_us, hit_vs,
-    hit_slots, slot_ids, slot_counts,
-):  # fmt: skip
-    """:func:`trace_from_counter` on ``workers`` threads."""
+def trace_packets(rays, scene, limits, out, hits, recording, packets, tree, kept, workers, counter):
+    """:func:`trace_from_counter` on ``workers`` threads; ``counter`` holds one zero.
+
+    The first six are a :class:`Forward`, as a parallel loop takes no tuples of tuples.
+    """
     for _worker in prange(workers):
-        trace_from_counter(
-            origins, directions, packets, nodes, level_starts, blocks, order, records, sh,
-            features, eps1, eps2, t_min, alpha_max, max_hits, counter, rgb, transmittance,
-            depth_sum, depth_median, normal_sum, feature_sum, counts, record_hits, starts,
-            hit_ids, hit_alphas, hit_ts, hit_rgb, hit_us, hit_vs, hit_slots, slot_ids,
-            slot_counts,
-        )  # fmt: skip
+        forward = Forward(rays, scene, limits, out, hits, recording)
+        trace_from_counter(forward, packets, tree, kept, counter)
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def absorb_from_counter(rays, scene, limits, packets, tree, counter, transmittance):
+    """The transmittance of rays alone: nothing is sorted, no colour is read."""
+    pyramid, walk = new_pyramid(), new_walk()
+    candidates = new_candidates(START_ROOM)
+    while True:
+        packet = next_from_counter(counter.ctypes.data)
+        if packet >= len(packets):
+            break
+        first, last = packets[packet, 0], packets[packet, 1]
+        candidates, count = find_candidates(rays, first, last, tree, pyramid, walk, candidates)
+        keep_candidates(candidates, count, tree.order)
+        write_rows(candidates, count, scene, ray_origin(rays, first), False)
+        rows = candidates.rows
+        block_count = (count + WIDTH - 1) // WIDTH
+        for r in range(first, last):
+            direction = ray_direction(rays, r)
+            t_min, t_max = ray_limits(rays, r)
+            left = 1.0
+            b0 = 0
+            while b0 < block_count and left > 0.0:
+                b1 = min(b0 + STRIDE, block_count)
+                for m in range(meet_blocks(candidates, r - first, b0, b1, direction)):
+                    k = candidates.met[m]
+                    block, lane = k // WIDTH, k % WIDTH
+                    t = np.float32(rows[block, T_ROW, lane])
+                    if t <= t_min or t >= t_max:
+                        continue
+                    left *= 1.0 - alpha_of(rows, block, lane, limits.alpha_max)
+                    if left < limits.eps1:
+                        left = 0.0
+                        break
+                b0 = b1
+            transmittance[r] = left
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def absorb_packets(rays, scene, limits, packets, tree, workers, counter, transmittance):
+    """:func:`absorb_from_counter` on ``workers`` threads; ``counter`` holds one zero."""
+    for _worker in prange(workers):
+        absorb_from_counter(rays, scene, limits, packets, tree, counter, transmittance)

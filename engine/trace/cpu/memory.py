@@ -1,10 +1,13 @@
-"""Arrays that the tracer's kernels fill."""
+"""Memory that the tracer's kernels fill."""
+
+import weakref
 
 import numpy as np
 from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
-from engine.trace.protocol import GaussianGradients, TraceResult
+from engine.trace.cpu.bundles import OutputGradients, Outputs, RawGradients
+from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
 
 
 def aligned_empty(shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
@@ -15,19 +18,51 @@ def aligned_empty(shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
     return raw[offset : offset + size].view(np.float32).reshape(shape)
 
 
-class Scratch:
-    """Memory that is used again: fresh pages for large arrays would cost as much as the work done in them."""
+class Pool:
+    """Hands out arrays whose memory is used again once nobody holds any array over it.
+
+    Fresh pages for large arrays would cost as much as the work done in them. An array, its slices and views
+    keep their memory; when the last of them is gone, the memory returns here. So a recording owns what it
+    holds for as long as it lives, and many may live at once.
+    """
 
     def __init__(self) -> None:
-        self._kept: dict[str, np.ndarray] = {}
+        self._free: list[np.ndarray] = []
 
-    def take(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
-        """Uninitialised array, valid until the same name is taken again."""
-        size = int(np.prod(shape))
-        kept = self._kept.get(name)
-        if kept is None or kept.size < size or kept.dtype != np.dtype(dtype):
-            kept = self._kept[name] = np.empty(size + size // 4, dtype)
-        return kept[:size].reshape(shape)
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
+        """An uninitialised array; pages are only taken when they are written to."""
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        fitting = [block for block in self._free if size <= block.nbytes <= 4 * size]
+        if fitting:
+            block = min(fitting, key=lambda block: block.nbytes)
+            self._free = [other for other in self._free if other is not block]
+        else:
+            block = np.empty(size + size // 4, np.uint8)
+        lease = _Lease(block)
+        weakref.finalize(lease, _give_back, weakref.ref(self), block).atexit = False
+        return np.asarray(lease)[:size].view(dtype).reshape(shape)
+
+    def _take_back(self, block: np.ndarray) -> None:
+        self._free.append(block)
+        if len(self._free) > _MOST_FREE:
+            del self._free[0]
+
+
+_MOST_FREE = 32
+"""Blocks kept for later; the one that has waited longest goes first."""
+
+
+class _Lease:
+    """What arrays over a block refer to, so that the end of the last of them is the end of this."""
+
+    def __init__(self, block: np.ndarray) -> None:
+        self.__array_interface__ = block.__array_interface__
+
+
+def _give_back(pool: "weakref.ref[Pool]", block: np.ndarray) -> None:
+    owner = pool()
+    if owner is not None:
+        owner._take_back(block)
 
 
 def empty_result(rays: int, features: int) -> TraceResult:
@@ -56,6 +91,38 @@ def empty_gradients(gaussians: int, basis_count: int, features: int) -> Gaussian
         weight_sums=np.empty(gaussians, np.float32),
         error_sums=np.empty(gaussians, np.float32),
         hit_counts=np.empty(gaussians, np.int32),
+    )
+
+
+def raw_gradients(gradients: GaussianGradients) -> RawGradients:
+    """The arrays of ``gradients`` as kernels take them."""
+    g = gradients
+    return RawGradients(
+        g.ids, g.means_world, g.quats_wxyz, g.log_scales, g.opacity_logits, g.sh, g.features, g.weight_sums,
+        g.error_sums, g.hit_counts,
+    )  # fmt: skip
+
+
+def outputs(result: TraceResult) -> Outputs:
+    """The arrays of ``result`` as kernels take them."""
+    r = result
+    return Outputs(
+        r.rgb_srgb, r.transmittance, r.depth_sum, r.depth_median, r.normal_world, r.features, r.hit_counts
+    )
+
+
+def output_gradients(gradients: TraceGradients, rays: int, features: int) -> OutputGradients:
+    """``gradients`` as kernels take them, zero where there is none."""
+    g = gradients
+    return OutputGradients(
+        contiguous(g.rgb_srgb),
+        or_zeros(g.transmittance, (rays,)),
+        or_zeros(g.depth_sum, (rays,)),
+        or_zeros(g.depth_median, (rays,)),
+        or_zeros(g.normal_world, (rays, 3)),
+        or_zeros(g.features, (rays, features)),
+        or_zeros(g.ray_errors, (rays,)),
+        g.with_geometry,
     )
 
 

@@ -1,167 +1,147 @@
 """Rays that come in packets: neighbours with one origin, such as the pixels of a tile."""
 
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
+from engine.trace.cpu.bundles import (
+    ByGaussian,
+    Forward,
+    Limits,
+    OutputGradients,
+    PacketHits,
+    Parameters,
+    Rays,
+    Scene,
+)
 from engine.trace.cpu.kernels_packet import packet_starts
-from engine.trace.cpu.kernels_packet_backward import ROW_WORDS, replay_packets, sum_packets
-from engine.trace.cpu.kernels_packet_forward import trace_packets
+from engine.trace.cpu.kernels_packet_backward import ROW_WORDS, Rows, replay_packets, sum_packets
+from engine.trace.cpu.kernels_packet_forward import absorb_packets, trace_packets
 from engine.trace.cpu.kernels_sort import sort_by_gaussian
-from engine.trace.cpu.memory import Scratch, contiguous, empty_gradients, empty_result, or_zeros
+from engine.trace.cpu.memory import Pool, empty_gradients, raw_gradients
 from engine.trace.cpu.packet_tree import PacketTree
-from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, TraceResult, TraceSettings
+from engine.trace.cpu.recording import CpuRecording
+from engine.trace.protocol import GaussianGradients
 
 MAX_RAYS = 64
 """Rays of a packet: their set is the bits of one word."""
-SUM_CHUNKS = 16
 LEAST_COSINE = 0.98
-"""A packet's rays look this much the way its first ray looks, so that its pyramid is narrow."""
+"""A packet's rays look this much (11 degrees) the way its first ray looks, so that its pyramid is narrow."""
+WORTH_A_PACKET = 3
+"""Rays from which a packet is faster than following each alone."""
+WORTH_A_HIERARCHY = 8
+"""Rays in smaller groups are followed alone if they are one in so many or more; for fewer, building Embree's
+hierarchy would cost more than it saves."""
+SUM_CHUNKS = 16
+"""Chunks a thread when rows are summed: enough that no thread waits long for another."""
 
-
-@dataclass
-class PacketHits(HitLists):
-    """Hits of packets. ``slots`` numbers the Gaussians of each packet in the order in which it met them.
-
-    ``us`` and ``vs`` are the hits in standard deviations; the Gaussian in slot s of the packet that begins
-    with ray f is ``slot_ids[f * max_hits + s]``.
-    """
-
-    packets: Int64[np.ndarray, " p1"]
-    us: Float32[np.ndarray, " h"]
-    vs: Float32[np.ndarray, " h"]
-    slots: Int32[np.ndarray, " h"]
-    slot_ids: Int32[np.ndarray, " h"]
-    slot_counts: Int32[np.ndarray, " p"]
+Ways = Literal["auto", "always", "never"]
 
 
 def find_packets(
-    origins_world: Float32[np.ndarray, "r 3"], directions_world: Float32[np.ndarray, "r 3"]
-) -> Int64[np.ndarray, " p1"]:
-    """First ray of each packet, and the number of rays: neighbours in the arrays that share an origin."""
-    starts = np.empty(len(origins_world) + 1, np.int64)
-    count = packet_starts(origins_world, directions_world, MAX_RAYS, LEAST_COSINE, starts)
-    return starts[: count + 1]
+    rays: RayBatch, ways: Ways = "auto"
+) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
+    """Which rays go in packets, and which alone.
+
+    A group are neighbours in the batch that share an origin, to the bit, and look about one way. Each is
+    judged by its own size, but few small ones go as packets, too.
+
+    Args:
+        rays: any rays.
+        ways: ``auto`` by what is faster; ``always`` or ``never`` in packets.
+
+    Returns:
+        First ray of each packet and the one behind its last; and the rays that go alone.
+    """
+    count = len(rays)
+    if ways == "never" or count == 0:
+        return np.empty((0, 2), np.int64), np.arange(count)
+    starts = np.empty(count + 1, np.int64)
+    groups = packet_starts(rays.origins_world, rays.directions_world, MAX_RAYS, LEAST_COSINE, starts)
+    packets = np.stack([starts[:groups], starts[1 : groups + 1]], axis=1)
+    sizes = packets[:, 1] - packets[:, 0]
+    small = sizes < WORTH_A_PACKET
+    if ways == "always" or WORTH_A_HIERARCHY * int(sizes[small].sum()) < count:
+        return packets, np.empty(0, np.int64)
+    return packets[~small], np.flatnonzero(np.repeat(small, sizes))
 
 
 class PacketTracer:
     """Walks the hierarchy once a packet, then tests its candidates eight at a time against each ray.
 
     Args:
-        settings: where rays are cut off.
+        limits: where rays end.
         threads: threads for tracing.
+        pool: where memory comes from.
     """
 
-    def __init__(self, settings: TraceSettings, *, threads: int) -> None:
-        self._settings = settings
+    def __init__(self, limits: Limits, *, threads: int, pool: Pool) -> None:
+        self._limits = limits
         self._threads = threads
+        self._pool = pool
         self._tree: PacketTree | None = None
-        self._storage = _storage(0)
-        self._scratch = Scratch()
 
-    def build(self, records: Float32[np.ndarray, "n 16"], padding: float) -> None:
+    def build(self, records: Float32[np.ndarray, "n 16"]) -> None:
         """Build the hierarchy."""
-        self._tree = PacketTree(records, padding)
+        self._tree = PacketTree(records)
 
     def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
-        """Take changed records over."""
+        """Take changed records over, and refit the hierarchy."""
         assert self._tree is not None, "build first"
         self._tree.refresh(records, ids)
 
-    def trace(
+    def room(self, packets: Int64[np.ndarray, "p 2"], rays: int, *, recording: bool) -> PacketHits:
+        """Memory for what packets keep of their hits."""
+        places = rays * self._limits.max_hits if recording and len(packets) else 0
+        return PacketHits(
+            us=self._pool.empty((places,), np.float32),
+            vs=self._pool.empty((places,), np.float32),
+            slots=self._pool.empty((places,), np.int32),
+            slot_ids=self._pool.empty((places,), np.int32),
+            slot_counts=np.zeros(len(packets), np.int32),
+        )
+
+    def trace(self, forward: Forward, packets: Int64[np.ndarray, "p 2"], kept: PacketHits) -> None:
+        """Follow the rays of the packets."""
+        assert self._tree is not None, "build first"
+        trace_packets(*forward, packets, self._tree.arrays, kept, self._threads, np.zeros(1, np.int64))
+
+    def absorb(
         self,
-        origins: Float32[np.ndarray, "r 3"],
-        directions: Float32[np.ndarray, "r 3"],
-        packets: Int64[np.ndarray, " p1"],
-        records: Float32[np.ndarray, "n 16"],
-        gaussians: FlatGaussians,
-        features: Float32[np.ndarray, "n f"],
-        *,
-        record: bool,
-    ) -> TraceResult:
-        """Follow contiguous rays in packets; the arguments as in :class:`engine.trace.protocol.Tracer`."""
-        tree = self._tree
-        assert tree is not None, "build first"
-        count = len(origins)
-        settings = self._settings
-        capacity = count * settings.max_hits if record else 0
-        if len(self._storage[0]) < capacity:
-            self._storage = _storage(capacity)
-        ids, alphas, distances, rgb, us, vs, slots, slot_ids = self._storage
-        result = empty_result(count, features.shape[1])
-        starts = np.empty(count, np.int64)
-        slot_counts = np.zeros(len(packets) - 1, np.int32)
-        eps2 = settings.second_phase_min
-        trace_packets(
-            origins, directions, packets, tree.nodes, tree.level_starts, tree.blocks, tree.order,
-            records, gaussians.sh, features,
-            settings.transmittance_min, 2.0 if eps2 is None else eps2, settings.t_min, settings.alpha_max,
-            settings.max_hits, self._threads, np.zeros(1, np.int64),
-            result.rgb_srgb, result.transmittance, result.depth_sum, result.depth_median,
-            result.normal_world, result.features, result.hit_counts,
-            record, starts, ids, alphas, distances, rgb, us, vs, slots, slot_ids, slot_counts,
+        rays: Rays,
+        scene: Scene,
+        packets: Int64[np.ndarray, "p 2"],
+        transmittance: Float32[np.ndarray, " r"],
+    ) -> None:
+        """Write the transmittance of the rays of the packets."""
+        assert self._tree is not None, "build first"
+        absorb_packets(
+            rays, scene, self._limits, packets, self._tree.arrays, self._threads, np.zeros(1, np.int64),
+            transmittance,
         )  # fmt: skip
-        if record:
-            result.hits = PacketHits(
-                origins, directions, starts, result.hit_counts, ids, alphas, distances, rgb,
-                packets, us, vs, slots, slot_ids, slot_counts,
-            )  # fmt: skip
-        return result
 
     def backward(
-        self,
-        hits: PacketHits,
-        gradients: TraceGradients,
-        records: Float32[np.ndarray, "n 16"],
-        gaussians: FlatGaussians,
-        features: Float32[np.ndarray, "n f"],
+        self, recording: CpuRecording, gradients: OutputGradients, scene: Scene, parameters: Parameters
     ) -> GaussianGradients:
         """Gradients of the raw parameters: summed within each packet, then over packets in their order."""
-        g, rays = gradients, len(hits.counts)
-        basis_count, feature_count = gaussians.sh.shape[1], features.shape[1]
-        first_rows = np.concatenate([[0], np.cumsum(hits.slot_counts, dtype=np.int64)])
-        rows = int(first_rows[-1])
-        row_ids = self._scratch.take("ids", (rows,), np.int32)
-        row_sums = self._scratch.take("sums", (rows, ROW_WORDS), np.float32)
-        row_sh = self._scratch.take("sh", (rows, basis_count, 3), np.float32)
-        row_features = np.empty((rows, feature_count), np.float32)
+        firsts = np.concatenate([[0], np.cumsum(recording.kept.slot_counts, dtype=np.int64)])
+        count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
+        rows = Rows(
+            firsts=firsts,
+            ids=self._pool.empty((count,), np.int32),
+            sums=self._pool.empty((count, ROW_WORDS), np.float32),
+            sh=self._pool.empty((count, basis_count, 3), np.float32),
+            features=np.empty((count, feature_count), np.float32),
+        )
         replay_packets(
-            hits.origins_world, hits.directions_world, hits.packets,
-            gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales, features,
-            hits.starts, hits.counts, hits.alphas, hits.distances, hits.rgb_srgb, hits.us, hits.vs,
-            hits.slots, hits.slot_ids, hits.slot_counts, first_rows,
-            self._settings.max_hits, self._settings.alpha_max,
-            contiguous(g.rgb_srgb), or_zeros(g.transmittance, (rays,)), or_zeros(g.depth_sum, (rays,)),
-            or_zeros(g.depth_median, (rays,)), or_zeros(g.normal_world, (rays, 3)),
-            or_zeros(g.features, (rays, feature_count)), or_zeros(g.ray_errors, (rays,)),
-            g.with_geometry, self._threads, np.zeros(1, np.int64),
-            row_ids, row_sums, row_sh, row_features,
+            Rays.of(recording.rays), recording.packets, recording.hits, recording.kept, recording.counts,
+            parameters, scene.features, self._limits, gradients, self._threads, np.zeros(1, np.int64), rows,
         )  # fmt: skip
-        order, sorted_ids, starts = sort_by_gaussian(row_ids, len(gaussians), self._threads)
-        out = empty_gradients(len(starts) - 1, basis_count, feature_count)
+        by_gaussian = ByGaussian(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
+        out = empty_gradients(len(by_gaussian.starts) - 1, basis_count, feature_count)
         sum_packets(
-            gaussians.quats_wxyz, gaussians.log_scales, records,
-            order, sorted_ids, starts, SUM_CHUNKS * self._threads, row_sums, row_sh, row_features,
-            out.ids, out.means_world, out.quats_wxyz, out.log_scales, out.opacity_logits, out.sh,
-            out.features, out.weight_sums, out.error_sums, out.hit_counts,
-        )  # fmt: skip
+            parameters, scene.records, by_gaussian, rows, SUM_CHUNKS * self._threads, raw_gradients(out)
+        )
         return out
-
-
-def _storage(capacity: int) -> tuple[np.ndarray, ...]:
-    """Of each hit: id, alpha, distance, colour, u, v, slot; and the slots' ids.
-
-    The pages are only taken when a hit is written to them.
-    """
-    return (
-        np.empty(capacity, np.int32),
-        np.empty(capacity, np.float32),
-        np.empty(capacity, np.float32),
-        np.empty((capacity, 3), np.float32),
-        np.empty(capacity, np.float32),
-        np.empty(capacity, np.float32),
-        np.empty(capacity, np.int32),
-        np.empty(capacity, np.int32),
-    )

@@ -1,0 +1,81 @@
+"""Any tracer can train: the slow twin runs through the real trainer by its name in the settings alone."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flat_world import FlatWorld, small_config
+
+from engine.events import Event, HeldOutMeasured, TrainingProgress
+from engine.scene import Dataset
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.train.fingerprint import run_fingerprint
+from engine.train.initialise import initial_gaussians
+from engine.train.state import TrainState, fresh_state
+from engine.train.trainer import Trainer
+
+
+def train(folder: Path, tracer: str, iterations: int) -> tuple[TrainState, list[Event]]:
+    world, events = FlatWorld(), list[Event]()
+    config = small_config(
+        iterations=iterations, rays=64, probe_rays=256, trace={"tracer": tracer}, sh_every=20,
+        densify={"kind": "mcmc", "start": 20, "interval": 20, "growth": 0.1},
+    )  # fmt: skip
+    trainer = Trainer(
+        world, config, fresh_state(world.start(120), 0), folder=folder, fingerprint="test",
+        listener=events.append, threads=1,
+    )  # fmt: skip
+    trainer.run()
+    return trainer.state, events
+
+
+def test_the_slow_twin_learns_the_plane(tmp_path: Path) -> None:
+    state, events = train(tmp_path, "reference", 60)
+    held_out = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
+    losses = [event.loss for event in events if isinstance(event, TrainingProgress)]
+    assert held_out[-1] > held_out[0] + 4
+    assert losses[-1] < losses[0] / 2
+    assert state.gaussians.sh_degree == 1 and len(state.gaussians) > 120
+
+
+def test_its_first_steps_are_those_of_the_cpu_tracer(tmp_path: Path) -> None:
+    slow, _ = train(tmp_path / "slow", "reference", 5)
+    fast, _ = train(tmp_path / "fast", "cpu", 5)
+    assert slow.running_mse == pytest.approx(fast.running_mse, rel=1e-4)
+    start = FlatWorld().start(120)
+    for name in ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh"):
+        before, one, other = (getattr(state, name) for state in (start, slow.gaussians, fast.gaussians))
+        moved = np.abs(one - before)
+        assert moved.max() > 1e-3, name
+        # The first steps of Adam follow signs, which rounding decides where a gradient is next to nothing.
+        far = np.abs(one - other) > 1e-2 * moved.max()
+        assert far.mean() < 0.02, name
+
+
+@pytest.mark.heavy
+def test_the_slow_twin_learns_a_generated_scene(tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    write_generated_scene(
+        root, GeneratedSceneConfig(views=6, width_px=32, height_px=24, samples_per_side=2, points=100)
+    )
+    dataset = Dataset.open(root, tmp_path / "cache", test_every=6)
+    ends = {}
+    for tracer in ("reference", "cpu"):
+        config = small_config(
+            iterations=50, rays=64, probe_rays=256, trace={"tracer": tracer}, max_gaussians=100,
+            checkpoint_every=50, initial_points=100, lift_pixels=False,
+        )  # fmt: skip
+        events: list[Event] = []
+        state = fresh_state(initial_gaussians(dataset, config), config.seed)
+        Trainer(
+            dataset, config, state, folder=tmp_path / tracer, fingerprint=run_fingerprint(dataset, config),
+            listener=events.append, threads=1,
+        ).run()  # fmt: skip
+        psnr = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
+        assert psnr[-1] > psnr[0] + 0.5, tracer
+        ends[tracer] = psnr[-1]
+    assert ends["reference"] == pytest.approx(ends["cpu"], abs=0.5)
+    prints = {
+        run_fingerprint(dataset, small_config(trace={"tracer": tracer})) for tracer in ("reference", "cpu")
+    }
+    assert len(prints) == 2
