@@ -59,8 +59,10 @@ def test_a_folder_of_photographs_is_enough(machine: Machine, octasplat: Octaspla
     )  # fmt: skip
     assert done.returncode == 0, done.stderr + done.stdout
     assert (result / "mesh.glb").exists() and (result / "poses" / "images.bin").exists()
-    assert json.loads((result / "metrics.json").read_text())["gaussians"] > 0
-    for line in ("Found features 8 photographs", "Matched 28 pairs", "Found the poses 8 photographs"):
+    metrics = json.loads((result / "metrics.json").read_text())
+    assert metrics["gaussians"] > 0 and metrics["poses"] == {"placed": 8, "photographs": 8}
+    assert "Poses found for 8 of 8 photographs" in done.stdout
+    for line in ("Found features 8 photographs", "Matched 28 pairs", "Found the poses of 8 of 8 photographs"):
         assert line in done.stdout
     with Api(machine.address) as api:
         (job,) = api.get("/v1/jobs")["jobs"]
