@@ -34,7 +34,7 @@ _PAPER_GAUSSIANS = 60_000
 _START_BYTES = 300 << 20
 _RAY_BYTES = 21_000
 _PIXEL_BYTES = 290
-"""For a pixel of the largest photograph, when a view is measured; what the training needed is free by then."""
+"""For a pixel of the largest photograph, when a view is measured; what training needed is free by then."""
 _CORE_POWER = 0.79
 """Two cores train 1.73 times as fast as one."""
 _TYPICAL_RENDER_GAUSSIANS = 100_000
