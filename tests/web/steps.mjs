@@ -91,7 +91,7 @@ const steps = {
         const estimate = (words) => page.waitForFunction((words) => document.getElementById("estimate").textContent.includes(words), words).then((shown) => page.textContent("#estimate"));
         found.estimate = await estimate("of memory");
         await page.fill("[data-path='train.iterations']", "1000000000");
-        found.tooMuch = await estimate("at most");
+        found.tooMuch = await estimate("100000");
         for (const [path, value] of Object.entries(job.options)) await page.fill(`[data-path='${path}']`, String(value));
         found.estimateAnew = await estimate("of memory");
         await shot(page, "new_settings");

@@ -12,6 +12,8 @@ export function showEstimates(form, place, chosen) {
     let timer = 0, latest = 0;
     const ask = async () => {
         const number = ++latest;
+        const wrong = form.querySelector("input:invalid, select:invalid");
+        if (wrong) return show(number, `${wrong.labels?.[0]?.textContent ?? wrong.id}: ${wrong.validationMessage}`);
         const { scene, dataset, queue } = chosen();
         const body = { kind: form.dataset.kind, options: readOptions(form), queue };
         if (scene) body.photographs = await sizesOf(scene);
