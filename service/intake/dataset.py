@@ -9,6 +9,7 @@ from service.intake.images import ImageHeader, ImageLimits, read_image_header
 from service.intake.layout import Part, model_files, part_of
 from service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
 from service.intake.model_child import ModelAnswer
+from service.intake.whole import check_whole
 from workers.store.names import NameRefused, NameSet, check_name, shown_name
 from workers.store.protocol import Storage
 from workers.store.trees import TreeFile
@@ -109,13 +110,15 @@ def check_file_content(
     """Check a stored file before it is entered into a dataset; the header of an image, else None.
 
     Raises:
-        IntakeRefused: the name or the header is refused.
+        IntakeRefused: the name or the header is refused, or the file was cut off.
         StorageError: the content cannot be had.
     """
     if check_file_name(name) is Part.MODEL:
         return None
     with storage.open(sha256) as file:
-        return read_image_header(file, name, limits)
+        header = read_image_header(file, name, limits)
+        check_whole(file, name, header.kind)
+        return header
 
 
 def check_dataset(

@@ -185,7 +185,8 @@ def _with_pillow(reader: Callable[[Any], ImageFile.ImageFile]) -> Callable[[Any]
     return read
 
 
-def _exactly(file: Any, layout: str) -> tuple[Any, ...]:
+def read_exactly(file: Any, layout: str) -> tuple[Any, ...]:
+    """The next values of a file, by their layout as of :mod:`struct`."""
     return struct.unpack(layout, file.read(struct.calcsize(layout)))
 
 
@@ -209,20 +210,20 @@ def _webp(file: Any) -> tuple[int, int, int]:
 def _tiff(file: Any) -> tuple[int, int, int]:
     """Size of the first page, the only one that counts."""
     order = "<" if file.read(2) == b"II" else ">"
-    (version,) = _exactly(file, f"{order}H")
+    (version,) = read_exactly(file, f"{order}H")
     if version == 43:
         file.seek(8)
-        (start,) = _exactly(file, f"{order}Q")
+        (start,) = read_exactly(file, f"{order}Q")
         file.seek(start)
-        (count,) = _exactly(file, f"{order}Q")
+        (count,) = read_exactly(file, f"{order}Q")
     else:
-        (start,) = _exactly(file, f"{order}I")
+        (start,) = read_exactly(file, f"{order}I")
         file.seek(start)
-        (count,) = _exactly(file, f"{order}H")
+        (count,) = read_exactly(file, f"{order}H")
     sizes: dict[int, int] = {}
     for _ in range(min(count, 65_535)):
-        tag, kind = _exactly(file, f"{order}2H")
-        values, field = _exactly(file, f"{order}Q8s" if version == 43 else f"{order}I4s")
+        tag, kind = read_exactly(file, f"{order}2H")
+        values, field = read_exactly(file, f"{order}Q8s" if version == 43 else f"{order}I4s")
         if tag in (256, 257):
             if values != 1:
                 raise ValueError("several sizes")
@@ -234,22 +235,22 @@ def _tiff(file: Any) -> tuple[int, int, int]:
 
 
 def _exr(file: Any) -> tuple[int, int, int]:
-    _, flags = _exactly(file, "<2I")
+    _, flags = read_exactly(file, "<2I")
     if flags & 0x800:
         raise ValueError("deep data")
-    while name := _text(file):
-        _text(file)
-        (length,) = _exactly(file, "<i")
+    while name := read_text(file):
+        read_text(file)
+        (length,) = read_exactly(file, "<i")
         if length < 0:
             raise ValueError("negative length")
         if name == b"dataWindow":
-            left, top, right, bottom = _exactly(file, "<4i")
+            left, top, right, bottom = read_exactly(file, "<4i")
             return right - left + 1, bottom - top + 1, 1
         file.seek(length, io.SEEK_CUR)
     raise ValueError("no data window")
 
 
-def _text(file: Any) -> bytes:
+def read_text(file: Any) -> bytes:
     """A text that ends with a zero, of at most 255 bytes."""
     text = bytearray()
     while (letter := file.read(1)) != b"\0":

@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import hashlib
+import io
 import json
 import os
 import signal
@@ -18,6 +19,7 @@ from typing import Any
 
 import httpx
 import pytest
+from PIL import Image
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))  # the builders of archives and models
 from model_builder import Model, photograph, photographs
@@ -275,6 +277,27 @@ def test_jobs_have_a_quota(talk: Talk) -> None:
         assert (await http.post("/v1/jobs", json=body)).status_code == 202
 
     talk(conversation, quota_jobs=2)
+
+
+def test_a_photograph_that_was_cut_off_is_named(talk: Talk) -> None:
+    picture = io.BytesIO()
+    Image.effect_noise((160, 120), 80).convert("RGB").save(picture, "JPEG")
+    cut = picture.getvalue()[: len(picture.getvalue()) * 3 // 4]
+    archive = build(*(Member(name, data) for name, data in {**photographs(), "images/v0.jpg": cut}.items()))
+
+    async def conversation(http: httpx.AsyncClient) -> None:
+        dataset = await new_dataset(http)
+        for path, content in (("files/images/v0.jpg", cut), ("archive", archive)):
+            problem = assert_problem(
+                await http.put(f"{dataset}/{path}", content=content), 422, "image-cut-off"
+            )
+            (fault,) = problem["errors"]
+            assert fault["file"] == "images/v0.jpg" and "'images/v0.jpg' is cut off" in fault["detail"]
+        assert (await http.get(f"{dataset}/files")).json()["files"] == []
+        whole = await http.put(f"{dataset}/files/images/v0.jpg", content=picture.getvalue())
+        assert whole.status_code == 201
+
+    talk(conversation)
 
 
 def test_a_disk_below_its_floor(talk: Talk) -> None:

@@ -140,8 +140,10 @@ const steps = {
         await page.waitForSelector("#viewer[data-ready=yes]");
         await page.waitForTimeout(700);
         await shot(page, "result");
+        const view = await brightness(page);
         await page.locator("#log-fold summary").click();
         await page.waitForFunction(() => document.getElementById("log").textContent.includes("Succeeded"));
+        await shot(page, "log");
         const noted = (page) => page.evaluate(() => JSON.parse(sessionStorage.getItem("noted")));
         const { states, stages, curves: live, preview } = await noted(page);
         return {
@@ -149,7 +151,7 @@ const steps = {
             curves: await page.locator(".chart canvas").count(),
             figures: await page.locator(".chart output").allInnerTexts(),
             log: await page.locator("#log").innerText(),
-            view: await brightness(page),
+            view,
             nameless: [...await nameless(page), ...await nameless(list)],
             overflow: await overflow(page),
         };

@@ -80,7 +80,7 @@ export class Charts {
         this.plots = CHARTS.map((chart) => {
             const card = document.createElement("div"), title = document.createElement("h3"), output = document.createElement("output");
             card.className = "card chart";
-            title.append(chart.unit ? `${chart.title}, ${chart.unit}` : chart.title, output);
+            title.append(Object.assign(document.createElement("span"), { textContent: chart.unit ? `${chart.title}, ${chart.unit}` : chart.title }), output);
             card.append(title);
             this.box.append(card);
             const axis = { stroke: colour("--soft"), grid: { stroke: colour("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif" };
