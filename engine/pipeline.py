@@ -163,7 +163,7 @@ def reconstruct(
         if not (output / SCENE).exists():
             with stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)) as clock:
                 gaussians = _train(dataset, output, config.train, threads, tell, should_stop, clock, watch)
-                write_gaussian_ply(gaussians, output / SCENE)
+                write_gaussian_ply(gaussians, output / SCENE, near_world=dataset.near_world)
         unmeasured: Exception | None = None
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
             try:

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from engine.config import read_config
 from engine.errors import ConfigError, OutputError
 from engine.files import check_surface_path, write_surface
+from engine.files.gaussian_ply import read_near_world
 from engine.gaussians.model import FlatGaussians
 from engine.render.cameras import RenderCamera
 from engine.run_folder import CONFIG, SCENE, run_viewpoints
@@ -94,7 +95,8 @@ def _cameras(
     if scene is not None:
         photographs = load_scene(scene)
         every = np.arange(len(photographs.views))
-        return photograph_cameras(photographs, every, options.depth_side), TraceSettings()
+        near_world = read_near_world(source)
+        return photograph_cameras(photographs, every, options.depth_side, near_world), TraceSettings()
     return cameras_around(gaussians, options.depth_side), TraceSettings()
 
 
