@@ -1,11 +1,11 @@
-"""What can be seen past a mesh, by Embree."""
+"""What can be seen past a mesh."""
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh as EmbreeMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float
 
+from engine.rays import RayBatch
 from engine.surface.mesh import TriangleMesh
+from engine.trace.meshes import TriangleScene
 
 NEAR_SHARE = 1e-3
 """The last thousandth of the way to a point is not tested, lest the point's own triangle hide it."""
@@ -15,8 +15,7 @@ class Occluder:
     """A mesh that hides what is behind it."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        self._scene = EmbreeScene()
-        self._mesh = EmbreeMesh(self._scene, mesh.vertices_world, mesh.faces)
+        self._scene = TriangleScene(mesh.vertices_world, mesh.faces)
 
     def sees(
         self,
@@ -35,10 +34,4 @@ class Occluder:
         length = np.linalg.norm(way, axis=1)
         reach = np.maximum(length * (1 - NEAR_SHARE) - tolerance, 0.0)
         directions = way / np.maximum(length, 1e-30)[:, None]
-        blocked = self._scene.run(
-            np.ascontiguousarray(viewers_world, np.float32),
-            np.ascontiguousarray(directions, np.float32),
-            query="OCCLUDED",
-            dists=reach.astype(np.float32),
-        )
-        return np.asarray(blocked < 0)
+        return ~self._scene.occluded(RayBatch(viewers_world, directions, t_max=reach))

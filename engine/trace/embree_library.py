@@ -1,4 +1,4 @@
-"""The few functions of Embree that the tracer needs, taken from the library inside the embreex wheel.
+"""The few functions of Embree that the tracers need, taken from the library inside the embreex wheel.
 
 Nothing is compiled at install: the wheel's extension module links Embree, so that its symbols resolve
 through the loaded module.
@@ -7,9 +7,15 @@ through the loaded module.
 import ctypes
 from functools import cache
 
+import numpy as np
+from jaxtyping import Float, Int
+
 from engine.errors import OctasplatError
 
-_GEOMETRY_TYPE_USER = 120
+_GEOMETRY_TYPE_TRIANGLE, _GEOMETRY_TYPE_USER = 0, 120
+_SCENE_ROBUST = 4
+_BUFFER_INDEX, _BUFFER_VERTEX = 0, 1
+_FORMAT_UINT3, _FORMAT_FLOAT3 = 0x5003, 0x9003
 _ERROR_NAMES = {1: "unknown error", 2: "invalid argument", 3: "invalid operation", 4: "out of memory",
                 5: "unsupported CPU", 6: "cancelled"}  # fmt: skip
 
@@ -21,6 +27,7 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "rtcGetDeviceError": (ctypes.c_int, [Handle]),
     "rtcNewScene": (Handle, [Handle]),
     "rtcReleaseScene": (None, [Handle]),
+    "rtcSetSceneFlags": (None, [Handle, ctypes.c_int]),
     "rtcSetSceneBuildQuality": (None, [Handle, ctypes.c_int]),
     "rtcCommitScene": (None, [Handle]),
     "rtcAttachGeometry": (ctypes.c_uint, [Handle, Handle]),
@@ -28,6 +35,10 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "rtcReleaseGeometry": (None, [Handle]),
     "rtcCommitGeometry": (None, [Handle]),
     "rtcSetGeometryBuildQuality": (None, [Handle, ctypes.c_int]),
+    "rtcSetSharedGeometryBuffer": (
+        None,
+        [Handle, ctypes.c_int, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, *[ctypes.c_size_t] * 3],
+    ),
     "rtcSetGeometryUserPrimitiveCount": (None, [Handle, ctypes.c_uint]),
     "rtcSetGeometryUserData": (None, [Handle, ctypes.c_void_p]),
     "rtcSetGeometryBoundsFunction": (None, [Handle, ctypes.c_void_p, ctypes.c_void_p]),
@@ -63,7 +74,17 @@ def library() -> ctypes.CDLL:
 @cache
 def intersect1_address() -> int:
     """Address of rtcIntersect1, passed to kernels at run time so that they can be cached on disk."""
-    address = ctypes.cast(library().rtcIntersect1, ctypes.c_void_p).value
+    return _address("rtcIntersect1")
+
+
+@cache
+def occluded1_address() -> int:
+    """Address of rtcOccluded1, which stops at the first hit that it comes across."""
+    return _address("rtcOccluded1")
+
+
+def _address(name: str) -> int:
+    address = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
     assert address is not None
     return address
 
@@ -94,8 +115,36 @@ class Device:
             self._lib.rtcReleaseDevice(self.handle)
 
 
-class BoxScene:
-    """A bounding-volume hierarchy over boxes whose content a callback intersects.
+class _Scene:
+    """A bounding-volume hierarchy over one geometry; ``handle`` is what rays are sent through."""
+
+    def __init__(self, device: Device, quality: int) -> None:
+        self._device, self._quality = device, quality
+        self._lib = device._lib
+        self.handle = self._lib.rtcNewScene(device.handle)
+        self._lib.rtcSetSceneBuildQuality(self.handle, quality)
+
+    def _build(self, geometry: int, count: int, what: str) -> None:
+        """Build over the finished geometry.
+
+        Raises:
+            EmbreeError: memory ran out.
+        """
+        lib = self._lib
+        lib.rtcSetGeometryBuildQuality(geometry, self._quality)
+        lib.rtcCommitGeometry(geometry)
+        lib.rtcAttachGeometry(self.handle, geometry)
+        lib.rtcReleaseGeometry(geometry)
+        lib.rtcCommitScene(self.handle)
+        self._device.check(f"building the hierarchy over {count} {what}")
+
+    def __del__(self) -> None:
+        if getattr(self, "handle", None):
+            self._lib.rtcReleaseScene(self.handle)
+
+
+class BoxScene(_Scene):
+    """A hierarchy over boxes whose content a callback intersects.
 
     The callbacks' addresses and ``boxes_address`` (n rows of lower and upper corner, six float32) must
     stay valid for the life of the scene.
@@ -104,22 +153,39 @@ class BoxScene:
     def __init__(
         self, device: Device, count: int, boxes_address: int, bounds: int, intersect: int, *, quality: int = 1
     ) -> None:
-        lib = self._lib = device._lib
-        self._device = device
-        self.handle = lib.rtcNewScene(device.handle)
-        lib.rtcSetSceneBuildQuality(self.handle, quality)
+        super().__init__(device, quality)
+        lib = self._lib
         geometry = lib.rtcNewGeometry(device.handle, _GEOMETRY_TYPE_USER)
-        lib.rtcSetGeometryBuildQuality(geometry, quality)
         lib.rtcSetGeometryUserPrimitiveCount(geometry, count)
         lib.rtcSetGeometryUserData(geometry, boxes_address)
         lib.rtcSetGeometryBoundsFunction(geometry, bounds, None)
         lib.rtcSetGeometryIntersectFunction(geometry, intersect)
-        lib.rtcCommitGeometry(geometry)
-        lib.rtcAttachGeometry(self.handle, geometry)
-        lib.rtcReleaseGeometry(geometry)
-        lib.rtcCommitScene(self.handle)
-        device.check(f"building the hierarchy over {count} Gaussians")
+        self._build(geometry, count, "Gaussians")
 
-    def __del__(self) -> None:
-        if getattr(self, "handle", None):
-            self._lib.rtcReleaseScene(self.handle)
+
+class MeshScene(_Scene):
+    """A hierarchy over triangles, which Embree itself intersects; the arrays are copied."""
+
+    def __init__(
+        self,
+        device: Device,
+        vertices_world: Float[np.ndarray, "v 3"],
+        faces: Int[np.ndarray, "f 3"],
+        *,
+        quality: int = 1,
+    ) -> None:
+        super().__init__(device, quality)
+        self._lib.rtcSetSceneFlags(self.handle, _SCENE_ROBUST)  # no ray slips through between triangles
+        # Embree reads 16 bytes at each vertex, past the end of the last one.
+        self._vertices = np.zeros((len(vertices_world) + 1, 3), np.float32)
+        self._vertices[:-1] = vertices_world
+        self._faces = np.array(faces, np.uint32, order="C")
+        geometry = self._lib.rtcNewGeometry(device.handle, _GEOMETRY_TYPE_TRIANGLE)
+        for kind, item_format, array, count in (
+            (_BUFFER_VERTEX, _FORMAT_FLOAT3, self._vertices, len(vertices_world)),
+            (_BUFFER_INDEX, _FORMAT_UINT3, self._faces, len(faces)),
+        ):
+            self._lib.rtcSetSharedGeometryBuffer(
+                geometry, kind, 0, item_format, array.ctypes.data, 0, 12, count
+            )
+        self._build(geometry, len(faces), "triangles")

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from engine.scene.generated.cameras import View, directions_cam
 from engine.scene.generated.config import GeneratedSceneConfig
-from engine.scene.generated.tracing import Hits, LitScene
+from engine.scene.generated.tracing import LitScene
+from engine.trace.meshes import TriangleHits
 
 # Rays traced and shaded at a time: arrays of this many colours stay in the processor's cache.
 _CHUNK_RAYS = 1 << 15
@@ -57,16 +58,16 @@ class Photographer:
         life = self._scene.still_life
         origins, directions = rays_world(view, self._centres_cam)
         hits = self._scene.trace(origins, directions)
-        hit = hits.face >= 0
-        depth = np.where(hit, hits.distance, np.float32(0))
-        normals = np.where(hit[:, None], life.face_normals[hits.face], np.float32(0))
+        hit = hits.hit
+        depth = np.where(hit, hits.distances, np.float32(0))
+        normals = np.where(hit[:, None], life.face_normals[hits.faces], np.float32(0))
         away = np.sum(normals * directions, axis=1) > 0
         normals[away] *= -1
         return Photograph(
             np.round(self._pixels(view) * 255).astype(np.uint8).reshape(height, width, -1),
             depth.reshape(height, width),
             normals.reshape(height, width, 3),
-            (hit & life.face_is_object[hits.face]).reshape(height, width),
+            (hit & life.face_is_object[hits.faces]).reshape(height, width),
         )
 
     def _pixels(self, view: View) -> Float32[np.ndarray, "n channels"]:
@@ -87,8 +88,8 @@ class Photographer:
                 parts.append(colours.mean(axis=1, dtype=np.float32))
         return np.concatenate(parts)
 
-    def _shows_object(self, hits: Hits) -> Bool[np.ndarray, " n"]:
-        return (hits.face >= 0) & self._scene.still_life.face_is_object[hits.face]
+    def _shows_object(self, hits: TriangleHits) -> Bool[np.ndarray, " n"]:
+        return hits.hit & self._scene.still_life.face_is_object[hits.faces]
 
 
 def rays_world(

@@ -85,11 +85,11 @@ def _looked_up(
     hits = scene.trace(origins, along)
     colours = scene.colours(hits, origins, along).reshape(-1, 9, 3).mean(axis=1)
     middle = slice(4, None, 9)
-    face = hits.face[middle]
+    face = hits.faces[middle]
     wanted: Bool[np.ndarray, " n"] = face >= 0
     if objects_only:
         wanted &= scene.still_life.face_is_object[face]
-    distance = np.where(wanted, hits.distance[middle], 0).astype(np.float64)
+    distance = np.where(wanted, hits.distances[middle], 0).astype(np.float64)
     xyz = origins[middle] + distance[:, None] * along[middle]
     return xyz[wanted], np.round(colours[wanted] * 255).astype(np.uint8)
 
@@ -102,6 +102,6 @@ def _observed(
     inside = np.flatnonzero(np.isfinite(pixels[:, 0]))
     ways = (xyz[inside] - view.centre_world).astype(np.float32)
     origins = np.broadcast_to(view.centre_world.astype(np.float32), ways.shape).copy()
-    hidden = scene.trace(origins, ways).distance < _REACHED
+    hidden = scene.trace(origins, ways).distances < _REACHED
     pixels[inside[hidden]] = np.nan
     return pixels

@@ -2,15 +2,14 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32
 
+from engine.rays import RayBatch
 from engine.scene.generated import kernels_scene
 from engine.scene.generated.arrangement import StillLife
+from engine.trace.meshes import TriangleHits, TriangleScene
 
 # Fixed, so that equal sums are summed alike on every machine.
 _PIECES = 16
@@ -28,29 +27,12 @@ _LIFT = 1.5e-3
 _UV, _XYZ, _NORMAL, _LIGHT, _LAMP_SEEN = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, 11), 11
 
 
-@dataclass(frozen=True)
-class Hits:
-    """First hits of n rays; ``face`` is -1 and ``distance`` infinite where a ray leaves the room.
-
-    ``distance`` counts in lengths of the ray's direction, which need not be 1; ``u`` and ``v`` weigh the
-    second and third corner of the face.
-    """
-
-    face: Int32[np.ndarray, " n"]
-    distance: Float32[np.ndarray, " n"]
-    u: Float32[np.ndarray, " n"]
-    v: Float32[np.ndarray, " n"]
-
-
 class LitScene:
     """The still life ready to be photographed; its methods may be called from several threads."""
 
     def __init__(self, still_life: StillLife) -> None:
         self.still_life = still_life
-        self._embree = EmbreeScene()
-        self._mesh = TriangleMesh(self._embree, still_life.vertices, still_life.faces)
-        # The first run builds Embree's tree, which must not happen in two threads at once.
-        self.trace(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+        self._mesh = TriangleScene(still_life.vertices, still_life.faces, threads=1)
         light, lamp_seen = self._light_on_vertices()
         self._attributes = np.ascontiguousarray(
             np.concatenate(
@@ -60,19 +42,15 @@ class LitScene:
             dtype=np.float32,
         )
 
-    def trace(self, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]) -> Hits:
-        """First hits along rays in the world frame."""
-        found = self._embree.run(origins, directions, query="INTERSECT", output=True)
-        missed = found["primID"] < 0
-        return Hits(
-            found["primID"], np.where(missed, np.float32(np.inf), found["tfar"]), found["u"], found["v"]
-        )
+    def trace(
+        self, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
+    ) -> TriangleHits:
+        """First hits along rays in the world frame; directions need not have unit length."""
+        return self._mesh.closest(RayBatch(origins, directions))
 
     def _free(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> np.ndarray:
         """1.0 where nothing lies between an origin and the origin plus its direction, else 0.0."""
-        rays = origins.astype(np.float32), np.ascontiguousarray(directions, np.float32)
-        occluded = self._embree.run(*rays, query="OCCLUDED", dists=np.ones(len(origins), np.float32))
-        return (occluded < 0).astype(np.float64)
+        return 1.0 - self._mesh.occluded(RayBatch(origins, directions, t_max=1.0))
 
     def _light_on_vertices(self) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
         """Irradiance on each vertex (lamp, sky, a constant for bounces) and the share of the lamp seen."""
@@ -106,18 +84,17 @@ class LitScene:
         return light.astype(np.float32), seen.astype(np.float32)
 
     def colours(
-        self, hits: Hits, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
+        self, hits: TriangleHits, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]
     ) -> Float32[np.ndarray, "n 3"]:
         """Display colours in [0, 1] that rays bring back from their hits."""
         radiance = np.empty_like(directions)
-        missed = hits.face < 0
+        missed = ~hits.hit
         radiance[missed] = _sky(directions[missed])
-        hit = np.flatnonzero(hits.face >= 0)
-        faces = hits.face[hit]
+        hit = np.flatnonzero(hits.hit)
+        faces = hits.faces[hit]
         at = np.empty((len(hit), self._attributes.shape[1]), np.float32)
-        kernels_scene.interpolate(
-            self._attributes, self.still_life.faces, faces, hits.u[hit], hits.v[hit], at
-        )
+        u, v = np.ascontiguousarray(hits.barycentrics[hit].T)
+        kernels_scene.interpolate(self._attributes, self.still_life.faces, faces, u, v, at)
         kinds = self.still_life.face_thing[faces]
         for kind in np.unique(kinds):
             thing = self.still_life.things[kind]
@@ -127,7 +104,7 @@ class LitScene:
             bright = albedo * here[:, _LIGHT]
             if thing.gloss:
                 rays = hit[mine]
-                places = origins[rays] + hits.distance[rays, None] * directions[rays]
+                places = origins[rays] + hits.distances[rays, None] * directions[rays]
                 bright += (
                     np.float32(thing.gloss)
                     * _highlight(places, directions[rays], here[:, _NORMAL])[:, None]

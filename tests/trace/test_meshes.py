@@ -1,0 +1,58 @@
+"""Rays through triangles with known answers."""
+
+import numpy as np
+import pytest
+from trace_scenes import f32
+
+from engine.rays import RayBatch
+from engine.trace.meshes import TriangleScene
+
+CUBE_CORNERS = f32([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+CUBE_FACES = np.array([face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))])
+
+
+@pytest.fixture(params=[1, 2])
+def cube(request: pytest.FixtureRequest) -> TriangleScene:
+    return TriangleScene(CUBE_CORNERS, CUBE_FACES, threads=request.param)
+
+
+def test_rays_from_the_middle_of_a_cube(cube: TriangleScene, rng: np.random.Generator) -> None:
+    directions = f32(rng.normal(size=(500, 3)))  # of any length
+    hits = cube.closest(RayBatch(np.zeros((1, 3)), directions))
+    np.testing.assert_allclose(hits.distances, 1 / np.abs(directions).max(axis=1), rtol=1e-6)
+    a, b, c = (CUBE_CORNERS[CUBE_FACES[hits.faces, k]] for k in range(3))
+    u, v = hits.barycentrics[:, :1], hits.barycentrics[:, 1:]
+    np.testing.assert_allclose(a + u * (b - a) + v * (c - a), hits.distances[:, None] * directions, atol=1e-6)
+
+
+def test_limits_choose_what_is_met(cube: TriangleScene) -> None:
+    origins, along = np.array([[0.2, 0.1, -3.0]]), np.tile([[0.0, 0.0, 1.0]], (5, 1))
+    t_min = f32([0.0, 2.5, 4.5, 0.0, 2.5])
+    t_max = f32([np.inf, np.inf, np.inf, 1.5, 3.5])
+    rays = RayBatch(origins, along, t_min, t_max)
+    assert cube.closest(rays).distances.tolist() == [2.0, 4.0, np.inf, np.inf, np.inf]
+    assert cube.closest(rays).hit.tolist() == [True, True, False, False, False]
+    assert cube.occluded(rays).tolist() == [True, True, False, False, False]
+    assert cube.closest(rays).faces[2] == -1
+
+
+def test_a_ray_of_no_length_meets_nothing(cube: TriangleScene) -> None:
+    rays = RayBatch(np.array([[0.0, 0.0, -3.0]]), np.array([[0.0, 0.0, 1.0]]), t_min=1.0, t_max=0.5)
+    assert not cube.closest(rays).hit[0] and not cube.occluded(rays)[0]
+
+
+def test_a_mesh_without_triangles_is_never_hit() -> None:
+    empty = TriangleScene(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    rays = RayBatch(np.zeros((3, 3)), np.eye(3))
+    assert not empty.closest(rays).hit.any() and not empty.occluded(rays).any()
+
+
+def test_no_rays(cube: TriangleScene) -> None:
+    rays = RayBatch(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert len(cube.closest(rays).faces) == 0 and len(cube.occluded(rays)) == 0
+
+
+def test_faces_that_name_no_vertex_are_refused() -> None:
+    with pytest.raises(ValueError, match="not among the 8"):
+        TriangleScene(CUBE_CORNERS, np.array([[0, 1, 8]]))
