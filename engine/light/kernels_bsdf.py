@@ -157,7 +157,7 @@ def opaque_value(
 
 @njit(error_model="numpy")
 def opaque_sample(o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, choice, u, v):
-    """A direction to the light, as dense as :func:`opaque_value` says; below the surface it counts nothing."""
+    """A direction to the light, as dense as :func:`opaque_value` says; worth 0 below the surface."""
     share = specular_share(o_z, red, green, blue, metallic, roughness, coat)
     if choice >= share:
         return sample_cosine(u, v)

@@ -72,7 +72,7 @@ def pixel_key(seed, pixel):
 
 @njit(error_model="numpy")
 def uniform_pair(key, sample, pair):
-    """Two numbers in [0, 1) for sample number ``sample`` (below 65,536) in the pair of dimensions ``pair``."""
+    """Two numbers in [0, 1) for number ``sample`` (below 65,536) in the pair of dimensions ``pair``."""
     seed = hashed(np.uint32(key + np.uint32(0x85EBCA6B) * np.uint32(pair + 1)))
     # The order is scrambled within its 16 bits, so that the first 2^k samples stay a whole block.
     place = np.uint32(sample) << np.uint32(16)

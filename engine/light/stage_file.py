@@ -84,7 +84,7 @@ class StageFacts:
 
 
 def write_first_stage(path: Path, facts: StageFacts) -> None:
-    """Write a commented stage for a scene: a ball on the floor and a light; the rest is there to be uncommented.
+    """Write a commented stage for a scene: a ball on the floor, a light, and more to uncomment.
 
     Raises:
         OSError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Materials against closed forms: Fresnel, Snell, energy, densities that integrate to one, samples that match."""
+"""Materials against closed forms: Fresnel, Snell, energy, densities and the samples that follow them."""
 
 import numpy as np
 import pytest
