@@ -15,7 +15,7 @@ from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
 from engine.light.layers import GaussianLayers
 from engine.light.stage import Integrator
 from engine.light.staging import LitMeshes
-from engine.rays import RayBatch
+from engine.rays import ImageRays, RayBatch
 from engine.render.renderer import tile_order
 from engine.threads import use_threads
 
@@ -71,53 +71,47 @@ class PathTracer:
 
     def render(
         self,
-        origin_world: Float32[np.ndarray, "3"],
-        directions_world: Float32[np.ndarray, "h w 3"],
+        image: ImageRays,
         progress: Progress = lambda _done, _total: None,
     ) -> Film:
-        """All samples of a picture whose rays begin in one point.
+        """All samples of a picture.
 
         Args:
-            origin_world: where the camera stands.
-            directions_world: unit vectors through the centres of the pixels.
+            image: rays through the centres of its pixels.
             progress: told (batches done, batches in all).
         """
-        film = Film(*directions_world.shape[:2])
-        self.add_samples(film, origin_world, directions_world, 0, self._settings.samples, progress)
+        film = Film(image.height_px, image.width_px)
+        self.add_samples(film, image, 0, self._settings.samples, progress)
         return film
 
-    def refine(
-        self, origin_world: Float32[np.ndarray, "3"], directions_world: Float32[np.ndarray, "h w 3"]
-    ) -> Iterator[Film]:
+    def refine(self, image: ImageRays) -> Iterator[Film]:
         """The same film again and again, each time with about twice as many samples, until it has all."""
-        film = Film(*directions_world.shape[:2])
+        film = Film(image.height_px, image.width_px)
         done = 0
         while done < self._settings.samples:
             more = min(max(1, done), self._settings.samples - done)
-            self.add_samples(film, origin_world, directions_world, done, more)
+            self.add_samples(film, image, done, more)
             done += more
             yield film
 
     def add_samples(
         self,
         film: Film,
-        origin_world: Float32[np.ndarray, "3"],
-        directions_world: Float32[np.ndarray, "h w 3"],
+        image: ImageRays,
         first: int,
         count: int,
         progress: Progress = lambda _done, _total: None,
     ) -> None:
         """Add the samples ``first`` to ``first + count`` of every pixel to a film."""
         use_threads(self._threads)
-        height, width = directions_world.shape[:2]
         view = View(
-            origin_world.astype(np.float64),
-            np.ascontiguousarray(directions_world),
-            _axis(directions_world),
+            image.origin_world.astype(np.float64),
+            image.directions_world,
+            _axis(image.directions_world),
             self._settings.aperture,
             self._settings.focus_distance or 1.0,
         )
-        order = tile_order(height, width)
+        order = tile_order(image.height_px, image.width_px)
         # Always the same cut, as what is traced together may differ in the last digit.
         at_once = min(count, PATHS_AT_ONCE // LEAST_TILE)
         pixels = PATHS_AT_ONCE // at_once // LEAST_TILE * LEAST_TILE
@@ -130,12 +124,12 @@ class PathTracer:
             progress(number, len(cuts))
             paths = new_paths(many * each)
             self._share(start_paths, many * each, view, self._rules, top, each, first + sample, order, paths)
-            self._follow(paths)
+            self._follow(paths, image.rays.t_min[:1])
             film.add(paths, order[top : top + many])
         progress(len(cuts), len(cuts))
 
-    def _follow(self, paths: Paths) -> None:
-        """Follow paths to their ends."""
+    def _follow(self, paths: Paths, near: Float32[np.ndarray, "1"]) -> None:
+        """Follow paths to their ends; the camera sees nothing nearer than ``near``."""
         meshes, layers = self._scene.meshes, self._scene.layers
         environment = meshes.lights.environment_number
         active = np.arange(len(paths.keys), dtype=np.int32)
@@ -143,6 +137,7 @@ class PathTracer:
             rays = RayBatch(
                 paths.origins_world if depth == 0 else paths.origins_world[active],
                 paths.directions_world if depth == 0 else paths.directions_world[active],
+                near if depth == 0 else 0.0,
             )
             hits = meshes.triangles.closest(rays)
             shadows = new_shadow_rays(len(active))

@@ -70,8 +70,8 @@ def stage_meshes(stage: Stage, folder: Path, *, threads: int = 0) -> LitMeshes:
     table = _MaterialTable(folder)
     corners, normals, uvs, rows = [], [], [], []
     for number, mesh in enumerate(stage.meshes):
-        shape = _shape(mesh, number, folder)
-        points = placed(shape.vertices @ turn_to(_up_axis(mesh), up).T, mesh)
+        shape = stage_shape(mesh, number, folder)
+        points = placed(shape.vertices @ turn_to(up_axis(mesh), up).T, mesh)
         at = points[shape.faces].astype(np.float32)
         corners.append(at)
         normals.append(corner_normals(at, mesh.smooth_degrees))
@@ -138,13 +138,20 @@ def refuse_inside_glass(meshes: LitMeshes, origin_world: Float32[np.ndarray, "3"
         raise ConfigError(f"{camera}: the camera stands inside a mesh of glass; move one of the two.")
 
 
-def _up_axis(mesh: StageMesh) -> str:
+def up_axis(mesh: StageMesh) -> str:
+    """The axis of a mesh's own frame that is turned to the stage's up."""
     if mesh.up_axis is not None:
         return mesh.up_axis
     return "y" if mesh.shape is not None or (mesh.file or "").lower().endswith(".glb") else "world"
 
 
-def _shape(mesh: StageMesh, number: int, folder: Path) -> Shape:
+def stage_shape(mesh: StageMesh, number: int, folder: Path) -> Shape:
+    """The triangles of mesh ``number`` before it is placed.
+
+    Raises:
+        ConfigError: it is of glass and not closed.
+        SceneFileError: its file cannot be read.
+    """
     if mesh.shape is not None:
         shape, name = simple_shape(mesh.shape), mesh.shape
     else:

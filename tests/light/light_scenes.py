@@ -37,7 +37,7 @@ def film_of(
 ) -> Film:
     """Render a stage without Gaussians."""
     scene = LitScene(stage_meshes(stage, folder, threads=threads), None, np.full(3, background))
-    return PathTracer(scene, stage.integrator, threads=threads).render(*view.rays())
+    return PathTracer(scene, stage.integrator, threads=threads).render(view.rays())
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:

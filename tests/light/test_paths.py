@@ -1,4 +1,4 @@
-"""Whole paths against closed forms: furnace, Beer, slabs, mirrors; the same bytes on any number of threads."""
+"""Whole paths against closed forms: furnace, Beer, slabs, mirrors; threads do not change a byte."""
 
 from pathlib import Path
 
@@ -143,7 +143,7 @@ def test_a_mirror_shows_what_a_camera_behind_it_sees(tmp_path: Path) -> None:
         tmp_path,
     )
     a, b = through.image().rgb_srgb, direct.image().rgb_srgb[:, ::-1]
-    assert a.max() > 0.3
+    assert a.max() > 0.2
     assert psnr(a, b) > 50
 
 
