@@ -26,13 +26,13 @@ from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_radii
 from engine.gaussians.order import morton_order
 from engine.importers import read_scene
-from engine.trace.arrays import aligned_empty
+from engine.trace.cpu.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon
+from engine.trace.cpu.kernels_records import write_boxes, write_records
+from engine.trace.cpu.memory import aligned_empty
+from engine.trace.cpu.packets import PacketTracer, find_packets
+from engine.trace.cpu.single_rays import SingleRayTracer
 from engine.trace.embree_library import Handle
-from engine.trace.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon
 from engine.trace.kernels_native import int32_pointer
-from engine.trace.kernels_records import write_boxes, write_records
-from engine.trace.packets import PacketTracer, find_packets
-from engine.trace.single_rays import SingleRayTracer
 
 THREADS, REPEATS = 2, 7
 INSTANCE, REFIT, FLOAT3X4_COLUMN_MAJOR = 121, 3, 0x9234

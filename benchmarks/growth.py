@@ -20,6 +20,7 @@ from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
+from engine.rays import RayBatch
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceGradients
 from engine.train.config import McmcConfig, TrainConfig
@@ -43,7 +44,7 @@ def microseconds_a_ray(gaussians: FlatGaussians, zoom: float, repeats: int = 5) 
     forward, backward = [], []
     for _ in range(repeats + 1):
         start = time.perf_counter()
-        seen = tracer.trace(origins, directions, record=True)
+        seen = tracer.trace(RayBatch(origins, directions), record=True)
         middle = time.perf_counter()
         assert seen.hits is not None
         tracer.backward(seen.hits, gradient)
@@ -73,7 +74,7 @@ class CloudPhotographs:
         angle = 2 * np.pi * np.arange(count) / count
         self._origins = 2.5 * np.stack([np.cos(angle), np.sin(angle), 0.3 * np.sin(3 * angle)], axis=1)
 
-    def rays(self, view: np.ndarray, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rays(self, view: np.ndarray, y: np.ndarray, x: np.ndarray) -> RayBatch:
         """Rays towards the middle of the cloud."""
         origins = self._origins[view]
         forward = -origins / np.linalg.norm(origins, axis=1, keepdims=True)
@@ -83,7 +84,7 @@ class CloudPhotographs:
         a, b = ((np.stack([x, y]) + 0.5) / self._side - 0.5) * 0.8
         directions = forward + a[:, None] * right + b[:, None] * down
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        return origins.astype(np.float32), directions.astype(np.float32)
+        return RayBatch(origins, directions)
 
     def pixels(
         self, view: np.ndarray, y: np.ndarray, x: np.ndarray

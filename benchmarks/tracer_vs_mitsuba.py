@@ -18,6 +18,7 @@ import numpy as np
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import CHI2_3_99, octagon_radii
 from engine.importers import read_scene
+from engine.rays import RayBatch
 from engine.render.renderer import tile_order
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
@@ -154,10 +155,10 @@ def compare(name: str, gaussians: FlatGaussians, repeats: int) -> None:
     gradient = np.random.default_rng(1).normal(size=(len(origins), 3)).astype(np.float32)
 
     def forward() -> TraceResult:
-        return ours.trace(origins, directions)
+        return ours.trace(RayBatch(origins, directions))
 
     def forward_backward() -> GaussianGradients:
-        hits = ours.trace(origins, directions, record=True).hits
+        hits = ours.trace(RayBatch(origins, directions), record=True).hits
         assert hits is not None
         return ours.backward(hits, TraceGradients(rgb_srgb=gradient))
 

@@ -41,7 +41,7 @@ from engine.train.checkpoint import TrainState, latest_checkpoint, load_checkpoi
 from engine.train.config import TrainConfig, iteration_count, most_gaussians
 from engine.train.dense_points import dense_points
 from engine.train.initialise import from_points, from_rays
-from engine.train.trainer import Trainer, fresh_state, trace_settings
+from engine.train.trainer import Trainer, fresh_state
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json",
@@ -229,6 +229,7 @@ def _open_dataset(
         test_every=config.test_every,
         held_out=config.held_out,
         masks=config.masks,
+        near=config.train.near,
         threads=threads,
         progress=lambda done, total: tell(StageProgress("load", done, total)),
     )
@@ -305,12 +306,12 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1
             rng=rng,
         )
     view, y, x = dataset.sample_pixels(rng, limit)
-    origins, directions = dataset.rays(view, y, x)
+    rays = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     seen = (weight > 0) & (alpha > 0)
     return from_rays(
-        origins[seen],
-        directions[seen],
+        rays.origins_world[seen],
+        rays.directions_world[seen],
         rgb[seen],
         extent=dataset.extent,
         opacity=config.initial_opacity,
@@ -327,7 +328,7 @@ def _evaluate(
         dataset,
         gaussians,
         output,
-        settings=trace_settings(config.train, dataset.extent),
+        settings=config.train.trace,
         background=config.evaluate_background,
         run={
             "gaussians": len(gaussians),

@@ -6,9 +6,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-_FROM_START = np.zeros(1, np.float32)
-_TO_INFINITY = np.full(1, np.inf, np.float32)
-
 
 @dataclass(frozen=True, init=False, eq=False)
 class RayBatch:
@@ -20,14 +17,14 @@ class RayBatch:
     begin at the mirror (:meth:`mirrored`), and the ways between a point light and many points are rays from
     the light that end at the points (:meth:`between`). Tracers follow neighbours with one origin together.
 
-    ``t_min`` and ``t_max`` have one value a ray, or a single one that stands for all.
+    Origins and limits have one row a ray, or a single one that stands for all.
 
-    >>> rays = RayBatch(np.zeros((2, 3), np.float32), np.eye(3, dtype=np.float32)[:2], t_min=0.5)
+    >>> rays = RayBatch(np.zeros((1, 3), np.float32), np.eye(3, dtype=np.float32)[:2], t_min=0.5)
     >>> len(rays), rays.t_min.tolist(), rays.t_max.tolist()
     (2, [0.5], [inf])
     """
 
-    origins_world: Float32[np.ndarray, "r 3"]
+    origins_world: Float32[np.ndarray, "#r 3"]
     directions_world: Float32[np.ndarray, "r 3"]
     t_min: Float32[np.ndarray, "#r"]
     t_max: Float32[np.ndarray, "#r"]
@@ -36,19 +33,14 @@ class RayBatch:
         self,
         origins_world: Float[np.ndarray, "#r 3"],
         directions_world: Float[np.ndarray, "r 3"],
-        t_min: Float[np.ndarray, "#r"] | float | None = None,
-        t_max: Float[np.ndarray, "#r"] | float | None = None,
+        t_min: Float[np.ndarray, "#r"] | float = 0.0,
+        t_max: Float[np.ndarray, "#r"] | float = np.inf,
     ) -> None:
-        """Rays through ``directions_world``; a single origin stands for all, and so does a single limit.
-
-        ``t_min`` is 0 and ``t_max`` infinite where nothing is given.
-        """
-        directions = np.ascontiguousarray(directions_world, np.float32)
-        origins = np.ascontiguousarray(np.broadcast_to(origins_world, directions.shape), np.float32)
-        object.__setattr__(self, "origins_world", origins)
-        object.__setattr__(self, "directions_world", directions)
-        object.__setattr__(self, "t_min", _limits(t_min, _FROM_START))
-        object.__setattr__(self, "t_max", _limits(t_max, _TO_INFINITY))
+        """Rays through ``directions_world``; a ``t_min`` below 0 counts as 0."""
+        object.__setattr__(self, "origins_world", _for_kernels(origins_world))
+        object.__setattr__(self, "directions_world", _for_kernels(directions_world))
+        object.__setattr__(self, "t_min", _for_kernels(np.maximum(np.atleast_1d(t_min), 0)))
+        object.__setattr__(self, "t_max", _for_kernels(np.atleast_1d(t_max)))
 
     @classmethod
     def between(
@@ -59,13 +51,12 @@ class RayBatch:
     ) -> "RayBatch":
         """Unit rays from each start to each end that stop ``gap`` (world units) before the end.
 
-        A ray between two equal points has the direction z and no length.
+        A ray between two equal points looks along z and has no length.
         """
-        ways = np.asarray(ends_world, np.float64) - starts_world
+        ways = np.asarray(ends_world, np.float64) - np.asarray(starts_world, np.float32)
         lengths = np.linalg.norm(ways, axis=1)
         ways[lengths == 0] = (0.0, 0.0, 1.0)
-        directions = (ways / np.maximum(lengths, 1e-300)[:, None]) if len(ways) else ways
-        directions[lengths == 0] = (0.0, 0.0, 1.0)
+        directions = ways / np.where(lengths == 0, 1.0, lengths)[:, None]
         return cls(starts_world, directions, 0.0, np.maximum(lengths - gap, 0.0))
 
     def __len__(self) -> int:
@@ -74,10 +65,10 @@ class RayBatch:
     def __getitem__(self, which: slice | Int[np.ndarray, " k"] | np.ndarray) -> "RayBatch":
         """The rays of a slice, of numbers or of a mask."""
         return RayBatch(
-            self.origins_world[which],
-            self.directions_world[which],
-            self.t_min if len(self.t_min) == 1 else self.t_min[which],
-            self.t_max if len(self.t_max) == 1 else self.t_max[which],
+            *(
+                rows if len(rows) == 1 and len(self) != 1 else rows[which]
+                for rows in (self.origins_world, self.directions_world, self.t_min, self.t_max)
+            )
         )
 
     @cached_property
@@ -109,7 +100,37 @@ class RayBatch:
         return RayBatch(origins, directions, np.maximum(t_mirror, self.t_min), self.t_max)
 
 
-def _limits(
-    given: Float[np.ndarray, "#r"] | float | None, default: Float32[np.ndarray, "1"]
-) -> Float32[np.ndarray, "#r"]:
-    return default if given is None else np.ascontiguousarray(given, np.float32).reshape(-1)
+@dataclass(frozen=True)
+class ImageRays:
+    """The rays through the pixels of an image, row by row; all have one origin."""
+
+    rays: RayBatch
+    height_px: int
+    width_px: int
+
+    @classmethod
+    def of(
+        cls,
+        origin_world: Float[np.ndarray, "3"],
+        directions_world: Float[np.ndarray, "h w 3"],
+        near_world: float = 0.0,
+    ) -> "ImageRays":
+        """Rays along unit directions that see nothing nearer than ``near_world``."""
+        height, width = directions_world.shape[:2]
+        rays = RayBatch(origin_world[None], directions_world.reshape(-1, 3), near_world)
+        return cls(rays, height, width)
+
+    @property
+    def origin_world(self) -> Float32[np.ndarray, "3"]:
+        """Where the camera stands."""
+        return self.rays.origins_world[0]
+
+    @property
+    def directions_world(self) -> Float32[np.ndarray, "h w 3"]:
+        """The direction of each pixel."""
+        return self.rays.directions_world.reshape(self.height_px, self.width_px, 3)
+
+
+def _for_kernels(values: Float[np.ndarray, "..."]) -> Float32[np.ndarray, "..."]:
+    """``values`` as the one kind of array that kernels are compiled for, not copied where they are that."""
+    return np.require(values, np.float32, ["C", "W"])

@@ -1,6 +1,6 @@
 """What ``octasplat render`` does once its options are understood."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +30,8 @@ from engine.render.jobs import (
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
 from engine.scene import SceneModel, load_scene, scene_extent, split_views
-from engine.trace.cpu import CpuTracer
+from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
-from engine.train.trainer import trace_settings
 from workers.options import is_run
 from workers.progress import show_progress, staged
 from workers.scene_files import open_scene
@@ -47,6 +46,7 @@ class _Source:
 
     gaussians: FlatGaussians
     settings: TraceSettings
+    near_world: float = 0.0
     background: str = "black"
     photographs: SceneModel | None = None
     train_indices: np.ndarray | None = None
@@ -83,7 +83,9 @@ def render_files(mode: str, options: dict[str, Any], listener: Listener) -> tupl
     source = _read_run(options) if is_run(options["source"]) else _read_file(options)
     if mode == "turntable":
         cameras = _turntable(source, options, fps)
-    tracer = CpuTracer(source.settings, threads=options["threads"], build_quality=2)
+    if cameras is not None:
+        cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
+    tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
     background = background_colour(options["background"] or source.background)
     with staged("render", listener) as progress:
@@ -120,7 +122,8 @@ def _read_run(options: dict[str, Any]) -> _Source:
     extent = scene_extent(origins, photographs.points)
     return _Source(
         read_gaussian_ply(run / SCENE)[0],
-        trace_settings(config.train, extent),
+        config.train.trace,
+        config.train.near * extent,
         config.evaluate_background,
         photographs,
         train,
@@ -158,4 +161,4 @@ def _views(source: _Source, which: str | None) -> tuple[Shot, ...]:
     indices = {"train": source.train_indices, "all": every}.get(which or "held-out", source.test_indices)
     if len(indices) == 0:
         raise OutputError("The run held out no views; ask for --views train or all.")
-    return view_shots(source.photographs, indices)
+    return view_shots(source.photographs, indices, source.near_world)

@@ -18,9 +18,8 @@ from engine.surface.cameras import cameras_around, photograph_cameras
 from engine.surface.extract import ExtractedSurface, extract_surface
 from engine.surface.files import check_surface_path, write_surface
 from engine.surface.options import SurfaceOptions
-from engine.trace.cpu import CpuTracer
+from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
-from engine.train.trainer import trace_settings
 from workers.options import is_run
 from workers.progress import show_progress
 from workers.scene_files import open_scene
@@ -62,7 +61,7 @@ def run_surface(
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output.parent} cannot be made ({error.strerror or error}).") from None
-    tracer = CpuTracer(settings, threads=threads, build_quality=2)
+    tracer = make_tracer(settings, threads=threads, build_quality=2)
     tracer.build(gaussians)
     with show_progress(quiet=quiet, should_stop=should_stop) as listener:
         extracted = extract_surface(
@@ -93,15 +92,16 @@ def _cameras(
         names = [view.name for view in photographs.views]
         indices, _ = split_views(names, config.test_every, config.held_out)
         origins = np.stack([photographs.views[index].origin_world for index in indices])
-        settings = trace_settings(config.train, scene_extent(origins, photographs.points))
+        near_world = config.train.near * scene_extent(origins, photographs.points)
+        settings = config.train.trace
     elif scene is not None:
         photographs = load_scene(scene)
-        indices, settings = np.arange(len(photographs.views)), TraceSettings()
+        indices, settings, near_world = np.arange(len(photographs.views)), TraceSettings(), 0.0
     else:
         return cameras_around(gaussians, options.depth_side), TraceSettings()
     if len(indices) == 0:
         raise DatasetError(f"{photographs.root} has no photographs to look from.")
-    return photograph_cameras(photographs, indices, options.depth_side), settings
+    return photograph_cameras(photographs, indices, options.depth_side, near_world), settings
 
 
 def _summary(extracted: ExtractedSurface) -> str:

@@ -18,8 +18,8 @@ from engine.render.images import write_png
 from engine.render.names import render_names
 from engine.render.renderer import background_colour, render_rays
 from engine.scene import Dataset
-from engine.trace.cpu import CpuTracer
-from engine.trace.protocol import TraceSettings
+from engine.trace.make import make_tracer
+from engine.trace.protocol import Tracer, TraceSettings
 
 RENDERS, METRICS, REPORT = "renders", "metrics.json", "report.html"
 
@@ -49,7 +49,7 @@ def evaluate_held_out(
         threads: for rendering and measuring; 0 means all cores.
         tell: hears the progress.
     """
-    tracer = CpuTracer(settings, threads=threads)
+    tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians)
     rows: list[ViewMetrics] = []
     images = WorstAndBest()
@@ -78,12 +78,11 @@ def evaluate_held_out(
     )
 
 
-def _rendered(dataset: Dataset, tracer: CpuTracer, background: str) -> Iterator[RenderedView]:
+def _rendered(dataset: Dataset, tracer: Tracer, background: str) -> Iterator[RenderedView]:
     colour = background_colour(background)
     for index in dataset.test_indices:
-        origin, directions = dataset.view_rays(int(index))
         rgb, alpha, weight = dataset.view_image(int(index))
-        image = render_rays(tracer, origin, directions, colour)
+        image = render_rays(tracer, dataset.view_rays(int(index)), colour)
         reference = rgb * alpha[..., None] + colour * (np.float32(1) - alpha[..., None])
         yield RenderedView(
             dataset.views[index].name, image.rgb_srgb, reference, weight, alpha if dataset.has_alpha else None

@@ -4,7 +4,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float64
+
+from engine.rays import ImageRays
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,7 @@ class RenderCamera:
         cy_px: Principal point from the top edge.
         rotation_cam_from_world: Takes world directions to camera directions.
         translation_cam_from_world: The world origin in the camera frame.
+        near_world: Distance from which on anything is seen.
     """
 
     width_px: int
@@ -30,6 +33,7 @@ class RenderCamera:
     cy_px: float
     rotation_cam_from_world: Float64[np.ndarray, "3 3"]
     translation_cam_from_world: Float64[np.ndarray, "3"]
+    near_world: float = 0.0
 
     @classmethod
     def from_pose(
@@ -69,8 +73,8 @@ class RenderCamera:
         pose[:3, 3] = self.centre_world
         return pose
 
-    def rays(self) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]:
-        """The common origin of all rays and the unit world direction through each pixel's centre."""
+    def rays(self) -> ImageRays:
+        """The unit rays through the pixels' centres."""
         x = (np.arange(self.width_px) + 0.5 - self.cx_px) / self.fx_px
         y = (np.arange(self.height_px) + 0.5 - self.cy_px) / self.fy_px
         directions_cam = np.empty((self.height_px, self.width_px, 3))
@@ -79,7 +83,7 @@ class RenderCamera:
         directions_cam[..., 2] = 1.0
         directions_cam /= np.linalg.norm(directions_cam, axis=-1, keepdims=True)
         directions_world = directions_cam @ self.rotation_cam_from_world
-        return self.centre_world.astype(np.float32), directions_world.astype(np.float32)
+        return ImageRays.of(self.centre_world, directions_world, self.near_world)
 
     def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:
         """Pixel coordinates of points; not-a-number for those not in front of the camera."""

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from engine.gaussians.model import FlatGaussians
+from engine.rays import ImageRays
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.images import exr_layers, write_exr, write_png
 from engine.render.names import render_names
@@ -18,7 +19,6 @@ from engine.render.video import VideoWriter
 from engine.scene import Camera, SceneModel, View
 from engine.trace.protocol import Tracer
 
-Rays = tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]
 Progress = Callable[[int, int], None]
 
 DEFAULT_FOV_Y_DEGREES = 50.0
@@ -34,19 +34,22 @@ class Shot:
 
     Attributes:
         name: relative path of its file, without a suffix.
-        rays: makes the common origin and the unit directions of its pixels, in world coordinates.
+        rays: makes the rays through its pixels.
     """
 
     name: str
-    rays: Callable[[], Rays]
+    rays: Callable[[], ImageRays]
 
 
-def view_shots(scene: SceneModel, indices: Int64[np.ndarray, " n"]) -> tuple[Shot, ...]:
-    """The views of photographs, with their lenses, named like them."""
+def view_shots(
+    scene: SceneModel, indices: Int64[np.ndarray, " n"], near_world: float = 0.0
+) -> tuple[Shot, ...]:
+    """The views of photographs, with their lenses, named like them; nothing nearer than ``near_world``."""
     names = render_names([view.name for view in scene.views])
     views = [(names[index], scene.views[index]) for index in indices]
     return tuple(
-        Shot(name, partial(_view_rays, view, scene.cameras[view.camera_index])) for name, view in views
+        Shot(name, partial(_view_rays, view, scene.cameras[view.camera_index], near_world))
+        for name, view in views
     )
 
 
@@ -56,7 +59,11 @@ def camera_shots(cameras: Sequence[RenderCamera]) -> tuple[Shot, ...]:
 
 
 def turntable_cameras(
-    table: Turntable, frames: int, width_px: int, height_px: int, fov_y_degrees: float = DEFAULT_FOV_Y_DEGREES
+    table: Turntable,
+    frames: int,
+    width_px: int,
+    height_px: int,
+    fov_y_degrees: float = DEFAULT_FOV_Y_DEGREES,
 ) -> tuple[RenderCamera, ...]:
     """One turn of a turntable as cameras.
 
@@ -182,11 +189,11 @@ def _rendered(
 ) -> Iterator[tuple[int, Shot, RenderedImage]]:
     progress(0, len(shots))
     for number, shot in enumerate(shots):
-        yield number, shot, render_rays(tracer, *shot.rays(), background)
+        yield number, shot, render_rays(tracer, shot.rays(), background)
         progress(number + 1, len(shots))
 
 
-def _view_rays(view: View, camera: Camera) -> Rays:
+def _view_rays(view: View, camera: Camera, near_world: float) -> ImageRays:
     """All rays of a view; pixels that the camera cannot un-project look along its axis."""
     width, height = view.width_px, view.height_px
     directions_world = np.empty((height, width, 3), np.float32)
@@ -197,7 +204,7 @@ def _view_rays(view: View, camera: Camera) -> Rays:
         directions[np.isnan(directions).any(axis=1)] = (0.0, 0.0, 1.0)
         world = directions @ view.rotation_cam_from_world
         directions_world[top : top + rows] = world.reshape(-1, width, 3)
-    return view.origin_world.astype(np.float32), directions_world
+    return ImageRays.of(view.origin_world, directions_world, near_world)
 
 
 def _weighted_quantile(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from engine.rays import ImageRays
 from engine.trace.protocol import Tracer
 
 RAYS_AT_ONCE = 1 << 18
@@ -33,12 +34,11 @@ class RenderedImage:
 
 def render_rays(
     tracer: Tracer,
-    origin_world: Float32[np.ndarray, "3"],
-    directions_world: Float32[np.ndarray, "h w 3"],
+    image: ImageRays,
     background: Float32[np.ndarray, "3"],
 ) -> RenderedImage:
-    """Trace an image whose rays share one origin; directions have unit length."""
-    height, width = directions_world.shape[:2]
+    """Trace an image; directions have unit length."""
+    height, width = image.height_px, image.width_px
     out = RenderedImage(
         np.empty((height, width, 3), np.float32),
         np.empty((height, width), np.float32),
@@ -49,20 +49,18 @@ def render_rays(
     rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
     for top in range(0, height, rows):
         band = slice(top, min(top + rows, height))
-        directions = directions_world[band].reshape(-1, 3)
         order = tile_order(min(rows, height - top), width)
-        directions = directions[order]
-        seen = tracer.trace(np.broadcast_to(origin_world, directions.shape), directions)
+        seen = tracer.trace(image.rays[top * width + order])
         rgb = seen.rgb_srgb + seen.transmittance[:, None] * background
         length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
-        for image, values in (
+        for part, values in (
             (out.rgb_srgb, np.clip(rgb, 0, 1)),
             (out.alpha, seen.alpha),
             (out.depth, seen.expected_depth),
             (out.depth_median, seen.depth_median),
             (out.normal_world, seen.normal_world / np.maximum(length, 1e-12)),
         ):
-            image[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
+            part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
     return out
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
+from engine.rays import ImageRays, RayBatch
 from engine.scene import kernels
 from engine.scene.cache import PixelCache, open_pixel_cache
 from engine.scene.cameras import Camera
@@ -42,6 +43,7 @@ class Dataset:
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
         extent: radius of the training cameras, see :func:`engine.scene.model.scene_extent`.
+        near_world: distance from the cameras at which anything is seen.
     """
 
     def __init__(
@@ -53,6 +55,7 @@ class Dataset:
         test_every: int = 8,
         held_out: Sequence[str] | None = None,
         masks: MaskUse = "ignore",
+        near: float = 0.0,
     ) -> None:
         self.root: Path = scene.root
         self.views: tuple[View, ...] = scene.views
@@ -93,6 +96,7 @@ class Dataset:
                 "images; these pixels do not count."
             )
         self.extent: float = scene_extent(origins[self.train_indices], scene.points)
+        self.near_world: float = near * self.extent
         self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
             self._sizes[self.train_indices].prod(axis=1)
         )
@@ -107,6 +111,7 @@ class Dataset:
         test_every: int = 8,
         held_out: Sequence[str] | None = None,
         masks: MaskUse = "ignore",
+        near: float = 0.0,
         threads: int = 0,
         progress: Callable[[int, int], None] | None = None,
         max_table_bytes: int = MAX_TABLE_BYTES,
@@ -122,6 +127,7 @@ class Dataset:
             held_out: names of the views to hold out instead.
             masks: ``ignore`` gives pixels outside the mask the weight 0; ``alpha`` multiplies the mask into
                 alpha, for an object on a transparent background.
+            near: distance at which anything is seen, of the extent.
             threads: decoding threads; 0 takes one a processor.
             progress: told (photographs done, photographs in all) while decoding.
             max_table_bytes: limit on the ray tables of cameras that are not pinholes.
@@ -137,7 +143,7 @@ class Dataset:
         )  # complain before the long work
         cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
-        return cls(scene, cache, tables, test_every=test_every, held_out=held_out, masks=masks)
+        return cls(scene, cache, tables, test_every=test_every, held_out=held_out, masks=masks, near=near)
 
     @property
     def train_pixel_count(self) -> int:
@@ -146,8 +152,8 @@ class Dataset:
 
     def rays(
         self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
-    ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-        """Origins and unit directions, in world coordinates, of the rays through pixel centres.
+    ) -> RayBatch:
+        """The unit rays through pixel centres.
 
         A pixel that its camera model cannot un-project looks along the axis of the camera; :meth:`pixels`
         gives it the weight 0.
@@ -165,7 +171,7 @@ class Dataset:
         self._refuse(bad, view, y, x)
         if self._is_direct.any():
             self._direct_rays(view, y, x, directions)
-        return origins, directions
+        return RayBatch(origins, directions, self.near_world)
 
     def pixels(
         self, view: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
@@ -192,13 +198,15 @@ class Dataset:
                 weight[chosen[np.isnan(found).any(axis=1)]] = 0.0
         return rgb, alpha, weight
 
-    def view_rays(self, view_index: int) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "h w 3"]]:
-        """Origin and directions of all rays of one view."""
+    def view_rays(self, view_index: int) -> ImageRays:
+        """All rays of one view."""
         width, height = self._size(view_index)
         directions = np.empty((height * width, 3), dtype=np.float32)
         for pixels, view, y, x in _row_blocks(view_index, width, height):
-            directions[pixels] = self.rays(view, y, x)[1]
-        return self._origins_world[view_index].copy(), directions.reshape(height, width, 3)
+            directions[pixels] = self.rays(view, y, x).directions_world
+        return ImageRays(
+            RayBatch(self._origins_world[[view_index]], directions, self.near_world), height, width
+        )
 
     def view_image(
         self, view_index: int

@@ -16,15 +16,17 @@ AROUND_FOV_DEGREES = 50.0
 
 
 def photograph_cameras(
-    scene: SceneModel, indices: Int64[np.ndarray, " n"], max_side: int
+    scene: SceneModel, indices: Int64[np.ndarray, " n"], max_side: int, near_world: float = 0.0
 ) -> tuple[RenderCamera, ...]:
     """Pinhole cameras in place of those of photographs, their images no larger than ``max_side``.
+
+    They see nothing nearer than ``near_world``.
 
     A pinhole camera stays as it is but for its size; of a distorted image, the pinhole shows what lies
     between the middles of its sides.
     """
     views = [scene.views[index] for index in indices]
-    return tuple(_pinhole(view, scene.cameras[view.camera_index], max_side) for view in views)
+    return tuple(_pinhole(view, scene.cameras[view.camera_index], max_side, near_world) for view in views)
 
 
 def cameras_around(
@@ -58,7 +60,7 @@ def _across(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
     return np.eye(3)[int(np.argmin(np.abs(direction)))]
 
 
-def _pinhole(view: View, camera: Camera, max_side: int) -> RenderCamera:
+def _pinhole(view: View, camera: Camera, max_side: int, near_world: float) -> RenderCamera:
     width, height = view.width_px, view.height_px
     scale = min(1.0, max_side / max(width, height))
     width_px, height_px = max(1, round(width * scale)), max(1, round(height * scale))
@@ -83,4 +85,5 @@ def _pinhole(view: View, camera: Camera, max_side: int) -> RenderCamera:
         cy_px=float(-top * fy_px),
         rotation_cam_from_world=view.rotation_cam_from_world,
         translation_cam_from_world=view.translation_cam_from_world,
+        near_world=near_world,
     )

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from engine.rays import RayBatch
 from engine.render.cameras import RenderCamera
 from engine.surface.mesh import TriangleMesh
 from engine.surface.occlusion import Occluder
@@ -99,6 +100,7 @@ def _mean_colours(
     tracer: Tracer,
 ) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     centres = np.stack([camera.centre_world for camera in cameras]).astype(np.float32)
+    near_world = np.array([camera.near_world for camera in cameras], np.float32)
     total = np.zeros((len(points), 3))
     sums = np.zeros(len(points))
     for k in range(choice.shape[1]):
@@ -110,7 +112,7 @@ def _mean_colours(
         origins = centres[choice[used, k]]
         way = points[used] - origins
         directions = way / np.linalg.norm(way, axis=1, keepdims=True)
-        traced = tracer.trace(origins, directions.astype(np.float32))
+        traced = tracer.trace(RayBatch(origins, directions, near_world[choice[used, k]]))
         solid = traced.alpha >= MIN_ALPHA
         # What shows through the scene is not its colour.
         rgb = traced.rgb_srgb[solid] / traced.alpha[solid, None]

@@ -59,11 +59,11 @@ def render_depth_maps(
         distances.append(stored[start : start + size].reshape(shape))
         cosines.append(stored[start + size : start + 2 * size].reshape(shape))
         start += 2 * size
-        origin_world, directions_world = camera.rays()
-        image = render_rays(tracer, origin_world, directions_world, black)
+        rays = camera.rays()
+        image = render_rays(tracer, rays, black)
         distances[-1][...] = _distances(image, options)
         # The tracer turns normals to the viewer, so the dot product is negative.
-        cosines[-1][...] = np.clip(-np.sum(image.normal_world * directions_world, axis=-1), 0.0, 1.0)
+        cosines[-1][...] = np.clip(-np.sum(image.normal_world * rays.directions_world, axis=-1), 0.0, 1.0)
         progress(number + 1, len(cameras))
     return DepthMaps(tuple(cameras), tuple(distances), tuple(cosines))
 

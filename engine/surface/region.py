@@ -111,10 +111,10 @@ def _seen_box(
     found = []
     for camera, distances in zip(maps.cameras, maps.distances, strict=True):
         step = max(1, max(distances.shape) // SAMPLES_PER_SIDE)
-        origin, directions = camera.rays()
+        rays = camera.rays()
         some = np.asarray(distances[::step, ::step])
         known = (some > 0) & np.isfinite(some)
-        points = origin + some[known][:, None] * directions[::step, ::step][known]
+        points = rays.origin_world + some[known][:, None] * rays.directions_world[::step, ::step][known]
         found.append(points[((points > low) & (points < high)).all(axis=1)])
     points = np.concatenate(found)
     if len(points) == 0:

@@ -1,1 +1,1 @@
-"""Rays through flat Gaussians: the protocol, the Embree tracer, its slow twin and the autograd bridge."""
+"""Rays through flat Gaussians: the protocol, the tracer for CPUs, its slow twin; and rays through meshes."""

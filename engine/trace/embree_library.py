@@ -43,6 +43,7 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "rtcSetGeometryUserData": (None, [Handle, ctypes.c_void_p]),
     "rtcSetGeometryBoundsFunction": (None, [Handle, ctypes.c_void_p, ctypes.c_void_p]),
     "rtcSetGeometryIntersectFunction": (None, [Handle, ctypes.c_void_p]),
+    "rtcSetGeometryOccludedFunction": (None, [Handle, ctypes.c_void_p]),
 }
 
 
@@ -151,7 +152,15 @@ class BoxScene(_Scene):
     """
 
     def __init__(
-        self, device: Device, count: int, boxes_address: int, bounds: int, intersect: int, *, quality: int = 1
+        self,
+        device: Device,
+        count: int,
+        boxes_address: int,
+        bounds: int,
+        intersect: int,
+        occluded: int,
+        *,
+        quality: int = 1,
     ) -> None:
         super().__init__(device, quality)
         lib = self._lib
@@ -160,6 +169,7 @@ class BoxScene(_Scene):
         lib.rtcSetGeometryUserData(geometry, boxes_address)
         lib.rtcSetGeometryBoundsFunction(geometry, bounds, None)
         lib.rtcSetGeometryIntersectFunction(geometry, intersect)
+        lib.rtcSetGeometryOccludedFunction(geometry, occluded)
         self._build(geometry, count, "Gaussians")
 
 

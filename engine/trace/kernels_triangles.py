@@ -14,10 +14,11 @@ NO_HIT = -1
 
 @njit(error_model="numpy")
 def _write_ray(words, origins, directions, t_min, t_max, r):
-    """Fill in the query of ray ``r``; a single limit stands for all rays."""
+    """Fill in the query of ray ``r``; a single origin or limit stands for all rays."""
     whole = words.view(np.int32)
+    o = r if len(origins) > 1 else 0
     for axis in range(3):
-        words[axis] = origins[r, axis]
+        words[axis] = origins[o, axis]
         words[4 + axis] = directions[r, axis]
     words[7] = np.float32(0.0)
     words[T_NEAR] = t_min[r if len(t_min) > 1 else 0]

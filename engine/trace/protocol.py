@@ -1,38 +1,47 @@
 """What a tracer is: settings, what it returns, and the small protocol that every tracer follows."""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
-from pydantic import BaseModel, ConfigDict, Field
+from jaxtyping import Float32, Int32
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import CHI2_2_99
+from engine.rays import RayBatch
 
 
 class TraceSettings(BaseModel):
-    """How rays are cut off. All distances are along unit ray directions, in world units.
+    """Which tracer, and how it cuts rays off. Where a ray begins is a matter of the ray.
 
     Attributes:
-        q: squared radius of an opaque octagon in standard deviations; Q of paper Eq. 6.
+        tracer: ``cpu``, or ``reference``: its slow twin, for a few hundred rays and Gaussians.
+        q: squared radius of an opaque octagon in standard deviations; Q of RaySplats, Eq. 6.
         transmittance_min: a ray ends behind the Gaussian that takes its transmittance below this (eps1).
         second_phase_min: None for that single threshold. Otherwise Algorithm 1's eps2: behind eps1 a second
             transmittance starts at 1 and the ray goes on until it falls below this, so that the Gaussians
             just behind the visible ones still receive a gradient.
-        t_min: nearest distance at which a Gaussian is seen.
         max_hits: most Gaussians on a ray.
         alpha_max: alpha is clamped to this, with zero gradient above it, so that 1/(1 - alpha) stays finite.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    tracer: Literal["cpu", "reference"] = "cpu"
     q: float = Field(CHI2_2_99, gt=0, le=30)
     transmittance_min: float = Field(1e-3, gt=0, lt=1)
     second_phase_min: float | None = Field(None, gt=0, lt=1)
-    t_min: float = Field(0.0, ge=0)
     max_hits: int = Field(512, ge=1, le=4096)
     alpha_max: float = Field(0.999, gt=0, le=0.9999)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_near_distance(cls, given: Any) -> Any:
+        """Runs of earlier versions list a ``t_min`` that was always overwritten; 0 is what they all say."""
+        if isinstance(given, dict) and given.get("t_min") == 0:
+            given = {name: value for name, value in given.items() if name != "t_min"}
+        return given
 
 
 @dataclass
@@ -48,7 +57,7 @@ class TraceResult:
         normal_world: sum of weight times the normal turned towards the viewer.
         features: sum of weight times the Gaussians' extra channels.
         hit_counts: Gaussians on each ray.
-        hits: what :meth:`Tracer.backward` needs; None unless the trace was asked to record.
+        hits: the recording, which :meth:`Tracer.backward` needs; None unless the trace was asked for it.
     """
 
     rgb_srgb: Float32[np.ndarray, "r 3"]
@@ -58,7 +67,7 @@ class TraceResult:
     normal_world: Float32[np.ndarray, "r 3"]
     features: Float32[np.ndarray, "r f"]
     hit_counts: Int32[np.ndarray, " r"]
-    hits: "HitLists | None" = None
+    hits: "Recording | None" = None
 
     @property
     def alpha(self) -> Float32[np.ndarray, " r"]:
@@ -72,25 +81,17 @@ class TraceResult:
         return np.divide(self.depth_sum, alpha, out=np.zeros_like(alpha), where=alpha > 1e-8)
 
 
-@dataclass
-class HitLists:
-    """The Gaussians of each ray, front to back: hits ``starts[r]`` to ``starts[r] + counts[r]``.
+@runtime_checkable
+class Recording(Protocol):
+    """The Gaussians of each ray, front to back, as its tracer keeps them.
 
-    The arrays are scratch memory of the tracer: the next recording trace overwrites them.
+    A recording owns its memory: any number may live at once, and each may be differentiated in any order, as
+    long as the parameters are those it was made with.
     """
-
-    origins_world: Float32[np.ndarray, "r 3"]
-    directions_world: Float32[np.ndarray, "r 3"]
-    starts: Int64[np.ndarray, " r"]
-    counts: Int32[np.ndarray, " r"]
-    ids: Int32[np.ndarray, " h"]
-    alphas: Float32[np.ndarray, " h"]
-    distances: Float32[np.ndarray, " h"]
-    rgb_srgb: Float32[np.ndarray, "h 3"]
 
     def of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
         """Ids of the Gaussians of one ray, front to back."""
-        return self.ids[self.starts[ray] : self.starts[ray] + self.counts[ray]]
+        ...
 
 
 @dataclass
@@ -133,13 +134,41 @@ class GaussianGradients:
     error_sums: Float32[np.ndarray, " u"]
     hit_counts: Int32[np.ndarray, " u"]
 
+    def numpy(self) -> "GaussianGradients":
+        """These themselves, as :class:`Gradients` asks for."""
+        return self
+
+
+@runtime_checkable
+class Gradients(Protocol):
+    """Gradients of the parameters, wherever their tracer keeps them."""
+
+    def numpy(self) -> GaussianGradients:
+        """The gradients as arrays of this process; a copy if they live elsewhere."""
+        ...
+
 
 @runtime_checkable
 class Tracer(Protocol):
-    """Traces rays through a set of flat Gaussians and differentiates what they see."""
+    """Traces rays through a set of flat Gaussians and differentiates what they see.
+
+    Rays and outputs are numpy arrays: an iteration has about a megabyte of them, and losses and shading work
+    on them here. What has the size of the Gaussians or of their hits is opaque: recordings are only handed
+    back, and gradients are read through :meth:`Gradients.numpy`. So a tracer may keep the parameters on a
+    device: it uploads them in :meth:`build` and the changed rows in :meth:`refresh`, and leaves its gradients
+    where they are, for an optimiser beside them or until somebody asks. (Not chosen: one learner with trace,
+    step and download, which would take optimiser, densification and checkpoints into every tracer.)
+
+    A tracer is used by one thread at a time.
+    """
+
+    settings: TraceSettings
 
     def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
-        """Take over ``gaussians`` and build the acceleration structure around them."""
+        """Take over ``gaussians`` and build the acceleration structure around them.
+
+        Earlier recordings can no longer be differentiated.
+        """
         ...
 
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
@@ -150,16 +179,24 @@ class Tracer(Protocol):
         """
         ...
 
-    def trace(
-        self,
-        origins_world: Float32[np.ndarray, "r 3"],
-        directions_world: Float32[np.ndarray, "r 3"],
-        *,
-        record: bool = False,
-    ) -> TraceResult:
-        """Follow rays with unit directions; ``record`` keeps what :meth:`backward` needs."""
+    def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
+        """Follow rays with unit directions; ``record`` keeps what :meth:`backward` needs.
+
+        A Gaussian is seen where ``t_min < t < t_max``.
+        """
         ...
 
-    def backward(self, hits: HitLists, gradients: TraceGradients) -> GaussianGradients:
-        """Gradients of the parameters for the rays of the last recording trace."""
+    def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
+        """What light is left along each ray between its limits, for shadows: no order, no colour.
+
+        It is 0 where less than ``transmittance_min`` is left, whatever ``max_hits`` and the second phase say.
+        """
+        ...
+
+    def backward(self, hits: Recording, gradients: TraceGradients) -> Gradients:
+        """Gradients of the parameters for the rays of a recording of this tracer since its last build.
+
+        Raises:
+            ValueError: the recording is another tracer's, or older than the last build.
+        """
         ...

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import APOTHEM
+from engine.rays import RayBatch
 from engine.trace.protocol import TraceSettings
 
 GRAZING_COSINE = 1e-6
@@ -100,22 +101,20 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
 
 
 def trace_reference(
-    parameters: ReferenceParameters,
-    origins_world: np.ndarray,
-    directions_world: np.ndarray,
-    settings: TraceSettings,
+    parameters: ReferenceParameters, rays: RayBatch, settings: TraceSettings
 ) -> ReferenceResult:
     """Every ray against every Gaussian; see :class:`TraceSettings` for where rays end."""
     p = parameters
-    o = torch.tensor(origins_world, dtype=torch.float64)
-    d = torch.tensor(directions_world, dtype=torch.float64)
+    d = torch.tensor(rays.directions_world, dtype=torch.float64)
+    o = torch.tensor(rays.origins_world, dtype=torch.float64).expand_as(d)
+    t_min, t_max = (torch.tensor(limit).expand(len(d))[:, None] for limit in (rays.t_min, rays.t_max))
     frames = rotation_matrices(p.quats_wxyz)
     r1, r2, r3 = frames.unbind(-1)
     s2, s3 = p.log_scales.exp().unbind(-1)
     a = torch.sigmoid(p.opacity_logits)
     inner_radius = APOTHEM * torch.sqrt(torch.clamp(settings.q + 2 * torch.log(a.detach()), min=0))
 
-    # --- plane hit (method section 2): t = <m - o, r1> / <d, r1>, all (rays, Gaussians) pairs ---
+    # --- plane hit: t = <m - o, r1> / <d, r1>, all (rays, Gaussians) pairs ---
     to_mean = p.means_world[None] - o[:, None]
     cosine = torch.einsum("rj,nj->rn", d, r1)
     grazing = cosine.abs() < GRAZING_COSINE
@@ -130,12 +129,12 @@ def trace_reference(
     au, av = u.detach().abs(), v.detach().abs()
     inside = torch.maximum(au * cos + av * sin, au * sin + av * cos) <= inner_radius
     t32 = t.detach().float()
-    hit = inside & ~grazing & (t32 > settings.t_min) & (inner_radius > 0)
+    hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0)
 
     basis = sh_basis(d, p.sh.shape[1])
     out: list[list[Tensor]] = []
     hit_ids = []
-    for ray in range(len(o)):
+    for ray in range(len(d)):
         ids = torch.nonzero(hit[ray]).squeeze(-1)
         # Front to back; equal float32 distances are ordered by id (the sort is stable, ids ascend).
         ids = ids[torch.sort(t32[ray, ids], stable=True).indices]

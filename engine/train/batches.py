@@ -7,6 +7,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from engine.rays import RayBatch
+
 
 @runtime_checkable
 class Pixels(Protocol):
@@ -14,8 +16,8 @@ class Pixels(Protocol):
 
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
-    ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, "r 3"]]:
-        """Origins and unit directions, world frame, of pixels."""
+    ) -> RayBatch:
+        """Unit rays of pixels."""
         ...
 
     def pixels(
@@ -32,8 +34,7 @@ class Batch:
     The last ``patches * side * side`` rays are patches, row-major one after another.
     """
 
-    origins_world: Float32[np.ndarray, "r 3"]
-    directions_world: Float32[np.ndarray, "r 3"]
+    rays: RayBatch
     rgb_srgb: Float32[np.ndarray, "r 3"]
     alpha: Float32[np.ndarray, " r"]
     weight: Float32[np.ndarray, " r"]
@@ -151,6 +152,5 @@ def draw_batch(
     if patches:
         extra = sampler.patches(rng, patches, side)
         view, y, x = (np.concatenate(pair) for pair in zip((view, y, x), extra, strict=True))
-    origins, directions = dataset.rays(view, y, x)
     rgb, alpha, weight = dataset.pixels(view, y, x)
-    return Batch(origins, directions, rgb, alpha, weight, view, patches, side)
+    return Batch(dataset.rays(view, y, x), rgb, alpha, weight, view, patches, side)

@@ -124,7 +124,7 @@ class TrainConfig(_Frozen):
     )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
-    trace: TraceSettings = TraceSettings(t_min=0.0)
+    trace: TraceSettings = TraceSettings()
     near: float = Field(0.01, ge=0, description="nearest distance at which a Gaussian is seen, of the extent")
     densify: McmcConfig | PaperConfig = Field(McmcConfig(), discriminator="kind")
     rebuild_every: int = Field(

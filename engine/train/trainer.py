@@ -13,9 +13,10 @@ from engine.errors import Cancelled, TrainingFailure
 from engine.events import CheckpointWritten, HeldOutMeasured, Listener, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
+from engine.rays import RayBatch
 from engine.scene import View
-from engine.trace.cpu import CpuTracer
-from engine.trace.protocol import TraceGradients, Tracer, TraceSettings
+from engine.trace.make import make_tracer
+from engine.trace.protocol import TraceGradients, Tracer
 from engine.train.batches import Batch, Pixels, PixelSampler, draw_batch
 from engine.train.checkpoint import TrainState, load_best, save_best, save_checkpoint
 from engine.train.config import (
@@ -52,17 +53,11 @@ class TrainingData(Pixels, Protocol):
 class Probe:
     """Fixed rays on which the state is measured between iterations."""
 
-    origins_world: Float32[np.ndarray, "r 3"]
-    directions_world: Float32[np.ndarray, "r 3"]
+    rays: RayBatch
     rgb_srgb: Float32[np.ndarray, "r 3"]
     weight: Float32[np.ndarray, " r"]
     view: Int64[np.ndarray, " r"]
     background: Float32[np.ndarray, "3"]
-
-
-def trace_settings(config: TrainConfig, extent: float) -> TraceSettings:
-    """The run's trace settings with the near distance in world units."""
-    return config.trace.model_copy(update={"t_min": config.near * extent})
 
 
 class Trainer:
@@ -77,7 +72,7 @@ class Trainer:
         listener: hears the progress.
         threads: for everything; 0 means all cores.
         should_stop: asked after each iteration; True ends the run at the next safe iteration.
-        tracer: anything that follows the protocol; by default Embree.
+        tracer: anything that follows the protocol; by default the one that the settings name.
 
     Attributes:
         state: where the training stands.
@@ -105,8 +100,8 @@ class Trainer:
         self._tell = listener
         self._should_stop = should_stop
         self._extent = dataset.extent
-        self._tracer: Tracer = tracer or CpuTracer(
-            trace_settings(config, self._extent), threads=threads, box_padding=config.box_padding
+        self._tracer: Tracer = tracer or make_tracer(
+            config.trace, threads=threads, box_padding=config.box_padding
         )
         sizes_px = np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)
         self._sampler = PixelSampler(dataset.train_indices, sizes_px)
@@ -209,7 +204,7 @@ class Trainer:
             side=config.patch_side,
         )
         background = self._draw_background()
-        seen = self._tracer.trace(batch.origins_world, batch.directions_world, record=True)
+        seen = self._tracer.trace(batch.rays, record=True)
         assert seen.hits is not None
         self._hits_per_ray = float(seen.hit_counts.mean())
         rgb, exposures = seen.rgb_srgb, state.exposures
@@ -238,7 +233,7 @@ class Trainer:
         gradients = self._tracer.backward(
             seen.hits,
             TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance, ray_errors=pixel.ray_errors),
-        )
+        ).numpy()
         moved = state.adam.step(
             state.gaussians, gradients, config.rates, config.loss, progress=progress, extent=self._extent
         )
@@ -268,15 +263,14 @@ class Trainer:
 
     def _make_probe(self, sampler: PixelSampler, rng: np.random.Generator) -> Probe:
         view, y, x = sampler.pixels(rng, self._config.probe_rays)
-        origins, directions = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
         background = np.full(3, 1.0 if self._config.background == "white" else 0.0, np.float32)
         target = rgb * alpha[:, None] + background * (1 - alpha[:, None])
-        return Probe(origins, directions, target, weight, view, background)
+        return Probe(self._dataset.rays(view, y, x), target, weight, view, background)
 
     def _measure(self, probe: Probe) -> tuple[float, float]:
         """PSNR averaged over the views, and the mean accumulated alpha, on a probe's rays."""
-        seen = self._tracer.trace(probe.origins_world, probe.directions_world)
+        seen = self._tracer.trace(probe.rays)
         render = np.clip(seen.rgb_srgb + seen.transmittance[:, None] * probe.background, 0, 1)
         error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
         views, inverse = np.unique(probe.view, return_inverse=True)

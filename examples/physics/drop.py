@@ -43,10 +43,10 @@ def film(
     tracer: Tracer,
 ) -> Iterator[np.ndarray]:
     """Images of the scene with the moved thing in it, display values (h, w, 3)."""
-    origin, directions = camera.rays()
+    rays = camera.rays()
     for nodes in frames:
         tracer.build(concatenate([still, rider.at(nodes)]))
-        yield render_rays(tracer, origin, directions, np.zeros(3, np.float32)).rgb_srgb
+        yield render_rays(tracer, rays, np.zeros(3, np.float32)).rgb_srgb
 
 
 def write_film(options: argparse.Namespace, still: FlatGaussians, rider: Rides, frames: np.ndarray) -> None:

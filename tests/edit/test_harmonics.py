@@ -5,7 +5,7 @@ import pytest
 from edit_scenes import random_turn
 
 from engine.edit.harmonics import rotate_sh, sh_basis, sh_rotations
-from engine.trace.kernels_sh import write_basis
+from engine.trace.cpu.kernels_sh import write_basis
 
 
 def directions(count: int, seed: int = 0) -> np.ndarray:

@@ -46,7 +46,8 @@ def test_sparse_points_have_the_colours_of_the_photographs(root, tmp_path):
         rgb, _, weight = data.pixels(np.full(len(x), index), y, x)
         differences.append(np.abs(rgb - colour[inside])[weight == 1].mean(axis=1))
         # The ray through that pixel must pass within half a pixel's diagonal of the point.
-        origins, directions = data.rays(np.full(len(x), index), y, x)
+        rays = data.rays(np.full(len(x), index), y, x)
+        origins, directions = rays.origins_world, rays.directions_world
         offsets = xyz[inside] - origins
         along = (offsets * directions).sum(axis=1, keepdims=True)
         across = np.linalg.norm(offsets - along * directions, axis=1)

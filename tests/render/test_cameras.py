@@ -14,7 +14,7 @@ def camera(**changes):
 
 def test_a_ray_projects_back_to_the_centre_of_its_pixel():
     one = camera(fx_px=7.0, cx_px=3.2, cy_px=2.9)
-    origin, directions = one.rays()
+    origin, directions = one.rays().origin_world, one.rays().directions_world
     assert directions.shape == (6, 8, 3)
     assert np.linalg.norm(directions, axis=-1) == pytest.approx(1, abs=1e-6)
     points = origin + directions.reshape(-1, 3) * 4.5
@@ -24,7 +24,7 @@ def test_a_ray_projects_back_to_the_centre_of_its_pixel():
 
 def test_an_unturned_camera_looks_along_z_with_y_down():
     one = RenderCamera.from_pose(np.eye(4), 2, 2, fy_px=1.0)
-    _, directions = one.rays()
+    directions = one.rays().directions_world
     assert np.allclose(directions[0, 1] * np.sqrt(1.5), [0.5, -0.5, 1])
     assert np.allclose(one.project(np.array([[0.0, 0, 1]])), [[1, 1]])
     assert np.isnan(one.project(np.array([[0.0, 0, -1]]))).all()

@@ -65,11 +65,11 @@ def test_other_settings_and_masks_are_read_anew(tmp_path, make_scene, save_image
 
 def test_another_camera_gets_other_rays(tmp_path, make_scene):
     root = make_scene(tmp_path / "scene", cameras=[opaque_fisheye()])
-    before = Dataset.open(root, tmp_path / "cache").view_rays(0)[1]
+    before = Dataset.open(root, tmp_path / "cache").view_rays(0).directions_world
     other = opaque_fisheye()
     other.params = [25, 25, 16, 12, 0, 0, 0, 0]
     make_scene(root, cameras=[other])
-    assert np.abs(Dataset.open(root, tmp_path / "cache").view_rays(0)[1] - before).max() > 0.01
+    assert np.abs(Dataset.open(root, tmp_path / "cache").view_rays(0).directions_world - before).max() > 0.01
 
 
 @pytest.mark.parametrize("name", ["rgb.bin", "mask.bin", "pixels.json", "directions.bin", "directions.json"])
@@ -84,7 +84,7 @@ def test_a_damaged_cache_is_made_anew(tmp_path, make_scene, save_image, name):
     path.write_bytes(content[: len(content) // 2])
     after = Dataset.open(root, tmp_path / "cache")
     np.testing.assert_array_equal(after.view_image(2)[0], expected[0][0])
-    np.testing.assert_array_equal(after.view_rays(2)[1], expected[1][1])
+    np.testing.assert_array_equal(after.view_rays(2).directions_world, expected[1].directions_world)
 
 
 def test_a_photograph_cut_short_leaves_no_cache(tmp_path, make_scene, capfd):

@@ -35,7 +35,8 @@ def test_rays_and_pixels_of_a_mixed_scene(tmp_path, make_scene, coded, max_table
     view = rng.integers(0, 8, 2000)
     sizes = np.array([[v.width_px, v.height_px] for v in data.views])[view]
     x, y = (rng.random(2000) * sizes[:, 0]).astype(int), (rng.random(2000) * sizes[:, 1]).astype(int)
-    origins, directions = data.rays(view, y, x)
+    rays = data.rays(view, y, x)
+    origins, directions = rays.origins_world, rays.directions_world
     rgb, alpha, weight = data.pixels(view, y, x)
     assert origins.dtype == directions.dtype == rgb.dtype == alpha.dtype == weight.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=2e-7)
@@ -61,7 +62,9 @@ def test_tables_and_direct_rays_agree(tmp_path, make_scene, coded):
     tabled = Dataset.open(root, tmp_path / "cache")
     direct = Dataset.open(root, tmp_path / "cache", max_table_bytes=0)
     for view in range(8):
-        np.testing.assert_allclose(tabled.view_rays(view)[1], direct.view_rays(view)[1], atol=2e-7)
+        np.testing.assert_allclose(
+            tabled.view_rays(view).directions_world, direct.view_rays(view).directions_world, atol=2e-7
+        )
         np.testing.assert_array_equal(tabled.view_image(view)[2], direct.view_image(view)[2])
 
 
@@ -70,10 +73,9 @@ def test_whole_views_equal_their_pixels(tmp_path, make_scene, coded):
     for index, view in enumerate(data.views):
         shape = (view.height_px, view.width_px)
         pixels = all_pixels(data, index)
-        origin, directions = data.view_rays(index)
-        origins, expected = data.rays(*pixels)
-        np.testing.assert_array_equal(directions.reshape(-1, 3), expected)
-        assert (origins == origin).all()
+        whole, single = data.view_rays(index), data.rays(*pixels)
+        np.testing.assert_array_equal(whole.directions_world.reshape(-1, 3), single.directions_world)
+        assert (single.origins_world == whole.origin_world).all()
         rgb, alpha, weight = data.view_image(index)
         assert rgb.shape == (*shape, 3) and alpha.shape == weight.shape == shape
         for whole, single in zip((rgb.reshape(-1, 3), alpha, weight), data.pixels(*pixels), strict=True):

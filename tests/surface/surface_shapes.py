@@ -51,7 +51,8 @@ def cameras_on_sphere(count: int, distance: float, side_px: int, fov: float = 50
 
 def sphere_depth(camera: RenderCamera, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Distances along the rays of a camera to a sphere at the origin (infinite beside it), and cosines."""
-    origin, directions = camera.rays()
+    rays = camera.rays()
+    origin, directions = rays.origin_world, rays.directions_world
     origin = origin.astype(np.float64)
     along = directions.astype(np.float64) @ origin
     root = along**2 - origin @ origin + radius**2

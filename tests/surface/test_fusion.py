@@ -71,7 +71,8 @@ def test_unbounded_reaches_far_things_and_keeps_near_ones():
     distances, cosines = [], []
     for camera in cameras:
         distance, cosine = sphere_depth(camera, near)
-        origin, directions = camera.rays()
+        rays = camera.rays()
+        origin, directions = rays.origin_world, rays.directions_world
         along = directions.astype(np.float64) @ origin
         out = -along + np.sqrt(along**2 + far**2 - origin.astype(np.float64) @ origin)
         missed = ~np.isfinite(distance)
@@ -102,7 +103,8 @@ def test_unknown_depths_leave_a_hole():
     maps = sphere_maps()
     distances = []
     for camera, known in zip(maps.cameras, maps.distances, strict=True):
-        origin, directions = camera.rays()
+        rays = camera.rays()
+        origin, directions = rays.origin_world, rays.directions_world
         hit = origin + np.where(np.isfinite(known), known, 0)[..., None] * directions
         distances.append(np.where(np.isfinite(known) & (hit[..., 2] > 0.7), 0, known).astype(np.float32))
     mesh, region = mesh_of(DepthMaps(maps.cameras, tuple(distances), maps.cosines), resolution=96)

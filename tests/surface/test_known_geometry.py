@@ -72,7 +72,7 @@ def test_true_depth_gives_the_true_surface(tmp_path):
         depth_cam = read_channels(truth / "depth" / name)["Z"]
         layers = read_channels(truth / "normals" / name)
         normals = np.stack([layers[f"N.{axis}"] for axis in "xyz"], axis=-1)
-        _, directions = camera.rays()
+        directions = camera.rays().directions_world
         along = directions @ camera.rotation_cam_from_world[2]
         distances.append((depth_cam / along).astype(np.float32))
         cosines.append(np.abs((normals * directions).sum(axis=-1)).astype(np.float32))

@@ -55,7 +55,7 @@ def our_view(scene: FlatGaussians, camera: RenderCamera) -> Float32[np.ndarray, 
     """What our tracer sees over black, with nothing cut short."""
     tracer = CpuTracer(TraceSettings(transmittance_min=1e-6, alpha_max=0.9999), threads=1)
     tracer.build(scene)
-    return render_rays(tracer, *camera.rays(), background_colour("black")).rgb_srgb
+    return render_rays(tracer, camera.rays(), background_colour("black")).rgb_srgb
 
 
 def psnr_db(path: Path, expected: Float32[np.ndarray, "h w 3"]) -> float:

@@ -5,6 +5,8 @@ import pytest
 from trace_scenes import f32, in_plane, make_cloud, make_tracer, rays_inwards, unit
 
 from engine.gaussians.model import FlatGaussians, concatenate
+from engine.rays import RayBatch
+from engine.trace.cpu.recording import CpuRecording
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 
@@ -12,9 +14,7 @@ pytestmark = pytest.mark.usefixtures("both_ways")
 Q = 9.0
 
 
-def all_hits(
-    gaussians: FlatGaussians, origins: np.ndarray, directions: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def all_hits(gaussians: FlatGaussians, rays: RayBatch) -> list[tuple[np.ndarray, np.ndarray]]:
     """Ids and float32 distances of each ray's hits, by (distance, id), with the frames in 24 bits.
 
     The octagon is tested edge by edge: corners at multiples of 45 degrees, edge normals half-way between.
@@ -35,9 +35,9 @@ def all_hits(
     means = gaussians.means_world.astype(np.float64)
     edge_angles = np.pi / 8 + np.pi / 4 * np.arange(4)
     result = []
-    for start in range(0, len(origins), 100):
-        o = origins[start : start + 100].astype(np.float64)
-        d = directions[start : start + 100].astype(np.float64)
+    for start in range(0, len(rays), 100):
+        part = rays[start : start + 100]
+        o, d = part.origins_world.astype(np.float64), part.directions_world.astype(np.float64)
         cosine = d @ normal.T
         distance = ((means * normal).sum(1) - o @ normal.T) / cosine
         u = o @ axis_u.T - (means * axis_u).sum(1) + distance * (d @ axis_u.T)
@@ -52,16 +52,15 @@ def all_hits(
     return result
 
 
-def assert_same_hits(gaussians: FlatGaussians, origins: np.ndarray, directions: np.ndarray) -> int:
+def assert_same_hits(gaussians: FlatGaussians, rays: RayBatch) -> int:
     tracer = make_tracer(gaussians, q=Q, transmittance_min=1e-300, max_hits=2048)
-    found = tracer.trace(origins, directions, record=True)
-    hits = found.hits
-    assert hits is not None
+    found = tracer.trace(rays, record=True)
+    recording = found.hits
+    assert isinstance(recording, CpuRecording)
     total = 0
-    for ray, (ids, distances) in enumerate(all_hits(gaussians, origins, directions)):
-        row = slice(hits.starts[ray], hits.starts[ray] + hits.counts[ray])
-        assert hits.ids[row].tolist() == ids.tolist(), f"ray {ray}"
-        np.testing.assert_array_equal(hits.distances[row], distances)
+    for ray, (ids, distances) in enumerate(all_hits(gaussians, rays)):
+        assert recording.of_ray(ray).tolist() == ids.tolist(), f"ray {ray}"
+        np.testing.assert_array_equal(recording.hits.distances[recording.place(ray)], distances)
         total += len(ids)
     return total
 
@@ -69,17 +68,17 @@ def assert_same_hits(gaussians: FlatGaussians, origins: np.ndarray, directions: 
 @pytest.mark.heavy
 def test_ten_thousand_rays_through_a_cloud(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 3000)
-    assert assert_same_hits(cloud, *rays_inwards(rng, 10_000)) > 300_000
+    assert assert_same_hits(cloud, rays_inwards(rng, 10_000)) > 300_000
 
 
 def test_more_hits_than_one_traversal_gathers(rng: np.random.Generator) -> None:
     cloud = concatenate([make_cloud(rng, 1500, size=0.3), in_plane(rng, 500, size=0.5)])
-    assert assert_same_hits(cloud, *rays_inwards(rng, 300)) > 300 * 200
+    assert assert_same_hits(cloud, rays_inwards(rng, 300)) > 300 * 200
 
 
 def test_thousand_sizes_away(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 3000, size=0.01, radius=0.1)
-    assert assert_same_hits(cloud, *rays_inwards(rng, 1000, distance=10.0, spread=0.1)) > 30_000
+    assert assert_same_hits(cloud, rays_inwards(rng, 1000, distance=10.0, spread=0.1)) > 30_000
 
 
 def test_axis_aligned_planes_and_rays(rng: np.random.Generator) -> None:
@@ -88,13 +87,11 @@ def test_axis_aligned_planes_and_rays(rng: np.random.Generator) -> None:
     origins = f32(np.concatenate([xy, np.full((400, 1), 3.0)], axis=1))
     straight = np.tile([0.0, 0.0, -1.0], (400, 1))
     slanted = unit(straight + np.array([0.5, 0.0, 0.0]))
-    assert (
-        assert_same_hits(planes, origins, f32(np.where(rng.random((400, 1)) < 0.5, straight, slanted)))
-        > 10_000
-    )
+    directions = f32(np.where(rng.random((400, 1)) < 0.5, straight, slanted))
+    assert assert_same_hits(planes, RayBatch(origins, directions)) > 10_000
 
 
 def test_rays_that_start_among_gaussians(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 2000)
     origins = f32(0.5 * rng.normal(size=(500, 3)))
-    assert assert_same_hits(cloud, origins, f32(unit(rng.normal(size=(500, 3))))) > 5000
+    assert assert_same_hits(cloud, RayBatch(origins, f32(unit(rng.normal(size=(500, 3)))))) > 5000

@@ -6,6 +6,7 @@ from trace_scenes import f32, facing_z, make_tracer
 
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii
+from engine.rays import RayBatch
 from engine.trace.protocol import TraceGradients, TraceResult
 
 pytestmark = pytest.mark.usefixtures("both_ways")
@@ -16,7 +17,7 @@ UP = f32([[0.0, 0.0, 1.0]])
 
 def look_up(gaussians: FlatGaussians, x: float, y: float, z: float = -2.0, **options: object) -> TraceResult:
     """A ray along z from (x, y, z)."""
-    return make_tracer(gaussians, **options).trace(f32([[x, y, z]]), UP)
+    return make_tracer(gaussians, **options).trace(RayBatch(f32([[x, y, z]]), UP))
 
 
 def test_alpha_at_the_centre_is_the_opacity() -> None:
@@ -46,14 +47,16 @@ def test_one_sigma_along_each_axis(x: float, y: float) -> None:
 def test_oblique_ray_sees_the_gaussian_on_its_plane() -> None:
     direction = np.array([0.6, 0.0, 0.8])
     tracer = make_tracer(facing_z([0, 0, 0], opacities=0.8))
-    seen = tracer.trace(f32([[-1.5, 0.0, -4.0]]), f32([direction]))  # meets the plane at x = 1.5 after 5
+    seen = tracer.trace(
+        RayBatch(f32([[-1.5, 0.0, -4.0]]), f32([direction]))
+    )  # meets the plane at x = 1.5 after 5
     assert seen.alpha[0] == pytest.approx(0.8 * np.exp(-0.5 * 1.5**2), rel=1e-5)
     assert seen.expected_depth[0] == pytest.approx(5, rel=1e-6)
 
 
 def test_normal_is_turned_towards_the_viewer() -> None:
     tracer = make_tracer(facing_z([0, 0, 0], opacities=0.8))
-    both = tracer.trace(f32([[0, 0, -2], [0, 0, 2]]), f32([[0, 0, 1], [0, 0, -1]]))
+    both = tracer.trace(RayBatch(f32([[0, 0, -2], [0, 0, 2]]), f32([[0, 0, 1], [0, 0, -1]])))
     np.testing.assert_allclose(both.normal_world, 0.8 * np.array([[0, 0, -1], [0, 0, 1]]), atol=1e-6)
 
 
@@ -61,7 +64,7 @@ def test_two_gaussians_composite_front_to_back() -> None:
     pair = facing_z([[0, 0, 2], [0, 0, 1]], opacities=[0.5, 0.25], rgb_srgb=[[1, 0, 0], [0, 1, 0]])
     features = f32([[3.0], [5.0]])
     tracer = make_tracer(pair, features)
-    seen = tracer.trace(f32([[0, 0, 0]]), UP, record=True)
+    seen = tracer.trace(RayBatch(f32([[0, 0, 0]]), UP), record=True)
     assert seen.hits is not None
     assert seen.hits.of_ray(0).tolist() == [1, 0]
     np.testing.assert_allclose(seen.rgb_srgb[0], [0.75 * 0.5, 0.25, 0], atol=1e-6)
@@ -75,7 +78,7 @@ def test_two_gaussians_composite_front_to_back() -> None:
 def test_gradient_of_two_gaussians_by_hand() -> None:
     pair = facing_z([[0, 0, 2], [0, 0, 1]], opacities=[0.5, 0.25], rgb_srgb=[[1, 0.2, 0], [0, 0.6, 0]])
     tracer = make_tracer(pair)
-    seen = tracer.trace(f32([[0, 0, 0]]), UP, record=True)
+    seen = tracer.trace(RayBatch(f32([[0, 0, 0]]), UP), record=True)
     assert seen.hits is not None
     green = tracer.backward(seen.hits, TraceGradients(f32([[0, 1, 0]]), ray_errors=f32([4.0])))
     # C = b 0.6 + (1 - b) a 0.2 with a = 0.5 behind, b = 0.25 before; dC/dlogit = dC/da a (1 - a).
@@ -100,7 +103,7 @@ def test_rim_of_the_octagon(opacity: float) -> None:
     for factor, hits in ((0.9999, 1), (1.0001, 0)):
         targets = centre + factor * (rim - centre)
         origins = f32(np.concatenate([targets[:, :2], np.full((16, 1), -2.0)], axis=1))
-        seen = make_tracer(gaussian, q=q).trace(origins, np.repeat(UP, 16, axis=0))
+        seen = make_tracer(gaussian, q=q).trace(RayBatch(origins, np.repeat(UP, 16, axis=0)))
         assert seen.hit_counts.tolist() == [hits] * 16
         if hits:
             np.testing.assert_allclose(seen.alpha[:8], np.exp(-q / 2), rtol=2e-3)  # whatever the opacity
@@ -115,8 +118,8 @@ def test_faint_gaussian_has_no_octagon() -> None:
 
 def test_nearest_distance() -> None:
     stack = facing_z([[0, 0, z] for z in (-1.0, 0.0, 0.5, 1.0, 2.0)])
-    tracer = make_tracer(stack, t_min=0.5)
-    seen = tracer.trace(f32([[0, 0, 0]]), UP, record=True)
+    tracer = make_tracer(stack)
+    seen = tracer.trace(RayBatch(f32([[0, 0, 0]]), UP, t_min=0.5), record=True)
     assert seen.hits is not None
     assert seen.hits.of_ray(0).tolist() == [3, 4]  # strictly beyond t_min
     assert look_up(stack, 0, 0, z=0.0).hit_counts[0] == 3  # behind the origin and at it: not seen
@@ -125,7 +128,7 @@ def test_nearest_distance() -> None:
 def test_colour_is_clamped_at_zero_without_gradient() -> None:
     dark = facing_z([0, 0, 0], opacities=0.5, rgb_srgb=[-0.2, 0.3, 1.7])
     tracer = make_tracer(dark)
-    seen = tracer.trace(f32([[0, 0, -1]]), UP, record=True)
+    seen = tracer.trace(RayBatch(f32([[0, 0, -1]]), UP), record=True)
     np.testing.assert_allclose(seen.rgb_srgb[0], [0, 0.15, 0.85], atol=1e-6)
     assert seen.hits is not None
     gradients = tracer.backward(seen.hits, TraceGradients(f32([[1, 1, 1]])))
@@ -136,7 +139,7 @@ def test_harmonics_depend_on_the_direction_of_the_ray() -> None:
     lobe = facing_z([0, 0, 0], opacities=0.5, rgb_srgb=0.5)
     lobe.sh = np.concatenate([lobe.sh, np.zeros((1, 3, 3), np.float32)], axis=1)
     lobe.sh[0, 2] = [0.5, 0.0, -0.5]  # the z lobe
-    both = make_tracer(lobe).trace(f32([[0, 0, -2], [0, 0, 2]]), f32([[0, 0, 1], [0, 0, -1]]))
+    both = make_tracer(lobe).trace(RayBatch(f32([[0, 0, -2], [0, 0, 2]]), f32([[0, 0, 1], [0, 0, -1]])))
     swing = 0.4886025119029199 * 0.5
     expected = 0.5 * np.array([[0.5 + swing, 0.5, 0.5 - swing], [0.5 - swing, 0.5, 0.5 + swing]])
     np.testing.assert_allclose(both.rgb_srgb, expected, atol=1e-6)
@@ -157,7 +160,7 @@ def test_pulling_a_tilted_gaussian_moves_the_depth() -> None:
     # dt/dm = r1 / <d, r1>: along a ray through a plane facing it, depth follows the mean's z.
     gaussian = facing_z([0, 0, 1], opacities=0.5)
     tracer = make_tracer(gaussian)
-    seen = tracer.trace(f32([[0, 0, 0]]), UP, record=True)
+    seen = tracer.trace(RayBatch(f32([[0, 0, 0]]), UP), record=True)
     assert seen.hits is not None
     zero = np.zeros((1, 3), np.float32)
     by_depth = tracer.backward(seen.hits, TraceGradients(zero, depth_sum=f32([1.0])))

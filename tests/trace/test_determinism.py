@@ -20,13 +20,15 @@ from trace_scenes import (
 )
 
 from engine.gaussians.model import FlatGaussians, concatenate
+from engine.rays import RayBatch
 from engine.trace.protocol import GaussianGradients, TraceResult
 
 RAYS = 700
+Scene = tuple[FlatGaussians, np.ndarray, RayBatch]
 
 
 @pytest.fixture(scope="module")
-def scene() -> tuple[FlatGaussians, np.ndarray, np.ndarray, np.ndarray]:
+def scene() -> Scene:
     rng = np.random.default_rng(5)
     mixed = concatenate(
         [make_cloud(rng, 1500, degree=1), make_cloud(rng, 500, degree=1, size=0.3, logits=(-4, -3))]
@@ -34,17 +36,15 @@ def scene() -> tuple[FlatGaussians, np.ndarray, np.ndarray, np.ndarray]:
     plane = in_plane(rng, 300)
     plane.sh = np.concatenate([plane.sh, np.zeros((300, 3, 3), np.float32)], axis=1)
     cloud = concatenate([mixed, plane])
-    return cloud, f32(rng.normal(size=(len(cloud), 2))), *rays_inwards(rng, RAYS)
+    return cloud, f32(rng.normal(size=(len(cloud), 2))), rays_inwards(rng, RAYS)
 
 
-def run(
-    scene: tuple[FlatGaussians, np.ndarray, np.ndarray, np.ndarray], **options: object
-) -> tuple[TraceResult, GaussianGradients, list[list[int]]]:
-    cloud, features, origins, directions = scene
+def run(scene: Scene, **options: object) -> tuple[TraceResult, GaussianGradients, list[list[int]]]:
+    cloud, features, rays = scene
     tracer = make_tracer(cloud, features, **options)
-    seen = tracer.trace(origins, directions, record=True)
+    seen = tracer.trace(rays, record=True)
     assert seen.hits is not None
-    lists = hit_lists(seen.hits)
+    lists = hit_lists(seen)
     return seen, tracer.backward(seen.hits, random_gradients(np.random.default_rng(1), RAYS, 2)), lists
 
 
@@ -59,9 +59,7 @@ def run(
         {"box_padding": 0.3, "build_quality": 2, "threads": 2},
     ],
 )
-def test_same_bits(
-    scene: tuple[FlatGaussians, np.ndarray, np.ndarray, np.ndarray], options: dict[str, float]
-) -> None:
+def test_same_bits(scene: Scene, options: dict[str, float]) -> None:
     expected, found = run(scene, threads=1), run(scene, **options)
     same_bits(found[0], expected[0])
     same_bits(found[1], expected[1])
@@ -77,7 +75,7 @@ sys.path.insert(0, sys.argv[1])
 from trace_scenes import make_cloud, make_tracer, random_gradients, rays_inwards
 rng = np.random.default_rng(5)
 tracer = make_tracer(make_cloud(rng, 1500, degree=1), threads=int(sys.argv[2]))
-seen = tracer.trace(*rays_inwards(rng, 900), record=True)
+seen = tracer.trace(rays_inwards(rng, 900), record=True)
 gradients = tracer.backward(seen.hits, random_gradients(rng, 900))
 digest = hashlib.sha256()
 for group in (seen, gradients):
@@ -105,25 +103,25 @@ def test_four_threads_give_the_bits_of_one() -> None:
 
 
 def test_ray_does_not_depend_on_its_companions(
-    scene: tuple[FlatGaussians, np.ndarray, np.ndarray, np.ndarray],
+    scene: Scene,
 ) -> None:
-    cloud, features, origins, directions = scene
+    cloud, features, rays = scene
     tracer = make_tracer(cloud, features)
-    whole = tracer.trace(origins, directions)
+    whole = tracer.trace(rays)
     for chosen in (np.arange(RAYS)[::-1], np.arange(3, RAYS, 7), np.array([11]), np.repeat(np.arange(5), 9)):
-        part = tracer.trace(f32(origins[chosen]), f32(directions[chosen]))
+        part = tracer.trace(rays[chosen])
         for name in ("rgb_srgb", "transmittance", "depth_sum", "depth_median", "normal_world", "features"):
             np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[chosen])
 
 
 def test_recording_and_repeating_change_nothing(
-    scene: tuple[FlatGaussians, np.ndarray, np.ndarray, np.ndarray],
+    scene: Scene,
 ) -> None:
-    cloud, features, origins, directions = scene
+    cloud, features, rays = scene
     tracer = make_tracer(cloud, features)
-    first = tracer.trace(origins, directions)
-    same_bits(tracer.trace(origins, directions, record=True), first)
-    same_bits(tracer.trace(origins, directions), first)
+    first = tracer.trace(rays)
+    same_bits(tracer.trace(rays, record=True), first)
+    same_bits(tracer.trace(rays), first)
 
 
 def nudge(cloud: FlatGaussians, rng: np.random.Generator, chosen: np.ndarray) -> None:
@@ -139,20 +137,20 @@ def nudge(cloud: FlatGaussians, rng: np.random.Generator, chosen: np.ndarray) ->
 @pytest.mark.parametrize("share", [1.0, 0.3])
 def test_refresh_is_as_good_as_a_rebuild(rng: np.random.Generator, share: float) -> None:
     cloud = make_cloud(rng, 1500, size=0.1)
-    origins, directions = rays_inwards(rng, 400)
+    rays = rays_inwards(rng, 400)
     tracer = make_tracer(cloud, box_padding=0.5)
     chosen = np.sort(rng.permutation(1500)[: int(1500 * share)]).astype(np.int32)
-    before = tracer.trace(origins, directions)
+    before = tracer.trace(rays)
     nudge(cloud, rng, chosen)
     tracer.refresh(None if share == 1.0 else chosen)
-    refreshed = tracer.trace(origins, directions, record=True)
+    refreshed = tracer.trace(rays, record=True)
     rebuilt_tracer = make_tracer(cloud)
-    rebuilt = rebuilt_tracer.trace(origins, directions, record=True)
+    rebuilt = rebuilt_tracer.trace(rays, record=True)
     same_bits(refreshed, rebuilt)
     assert not np.array_equal(before.transmittance, refreshed.transmittance)
     given = random_gradients(rng, 400)
     assert refreshed.hits is not None and rebuilt.hits is not None
-    assert hit_lists(refreshed.hits) == hit_lists(rebuilt.hits)
+    assert hit_lists(refreshed) == hit_lists(rebuilt)
     same_bits(tracer.backward(refreshed.hits, given), rebuilt_tracer.backward(rebuilt.hits, given))
 
 
@@ -162,11 +160,11 @@ def test_rebuilding_with_another_count(rng: np.random.Generator) -> None:
     tracer = make_tracer(small)
     for cloud in (large, small, large):
         tracer.build(cloud)
-        same_bits(tracer.trace(*rays), make_tracer(cloud).trace(*rays))
+        same_bits(tracer.trace(rays), make_tracer(cloud).trace(rays))
 
 
 def test_a_tracer_of_one_thread_does_not_hold_back_the_next(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 20), rays_inwards(rng, 5)
     everything = make_tracer(cloud).threads
-    make_tracer(cloud, threads=1).trace(*rays)
+    make_tracer(cloud, threads=1).trace(rays)
     assert make_tracer(cloud).threads == everything == numba.config.NUMBA_NUM_THREADS

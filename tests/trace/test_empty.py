@@ -5,12 +5,13 @@ import pytest
 from trace_scenes import facing_z, make_cloud, make_tracer, random_gradients, rays_inwards
 
 from engine.gaussians.model import FlatGaussians, concatenate
+from engine.rays import RayBatch
 
 
-def assert_sees_nothing(cloud: FlatGaussians, rays: tuple[np.ndarray, np.ndarray]) -> None:
+def assert_sees_nothing(cloud: FlatGaussians, rays: RayBatch) -> None:
     tracer = make_tracer(cloud)
-    seen = tracer.trace(*rays, record=True)
-    count = len(rays[0])
+    seen = tracer.trace(rays, record=True)
+    count = len(rays)
     assert seen.hit_counts.tolist() == [0] * count
     assert (seen.transmittance == 1).all() and (seen.alpha == 0).all()
     for name in ("rgb_srgb", "depth_sum", "depth_median", "normal_world", "expected_depth"):
@@ -35,17 +36,18 @@ def test_all_invisible(rng: np.random.Generator) -> None:
 
 
 def test_all_missed(rng: np.random.Generator) -> None:
-    origins, directions = rays_inwards(rng, 50)
-    assert_sees_nothing(make_cloud(rng, 50, size=0.01), (origins, -directions))
+    rays = rays_inwards(rng, 50)
+    outwards = RayBatch(rays.origins_world, -rays.directions_world)
+    assert_sees_nothing(make_cloud(rng, 50, size=0.01), outwards)
 
 
 def test_visible_ones_among_invisible(rng: np.random.Generator) -> None:
     one = facing_z([0.0, 0.0, 0.0], opacities=0.5)
-    rays = np.array([[0.0, 0.0, -2.0]], np.float32), np.array([[0.0, 0.0, 1.0]], np.float32)
-    alone = make_tracer(one).trace(*rays)
+    rays = RayBatch(np.array([[0.0, 0.0, -2.0]]), np.array([[0.0, 0.0, 1.0]]))
+    alone = make_tracer(one).trace(rays)
     assert alone.hit_counts.tolist() == [1]
     hidden = make_cloud(rng, 40, logits=(-20.0, -10.0))
-    among = make_tracer(concatenate([hidden, one, hidden])).trace(*rays, record=True)
+    among = make_tracer(concatenate([hidden, one, hidden])).trace(rays, record=True)
     assert among.hits is not None
     assert among.hits.of_ray(0).tolist() == [40]
     assert among.transmittance[0] == alone.transmittance[0]
@@ -60,9 +62,9 @@ def test_gaussian_that_is_no_number_spoils_no_other(
         pytest.skip("an infinite logit is an opacity of one")
     cloud = make_cloud(rng, 300)
     rays = rays_inwards(rng, 80)
-    good = make_tracer(cloud).trace(*rays)
+    good = make_tracer(cloud).trace(rays)
     bad = cloud.select(np.arange(10))
     getattr(bad, field)[:] = value
-    both = make_tracer(concatenate([cloud, bad])).trace(*rays)
+    both = make_tracer(concatenate([cloud, bad])).trace(rays)
     np.testing.assert_array_equal(both.hit_counts, good.hit_counts)
     np.testing.assert_array_equal(both.rgb_srgb, good.rgb_srgb)

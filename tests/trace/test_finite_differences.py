@@ -30,7 +30,7 @@ def test_every_parameter_of_a_tiny_scene(output: str | None) -> None:
     rng = np.random.default_rng(3)
     cloud = make_cloud(rng, 6, degree=1, size=0.4, radius=0.3, logits=(-1.5, 2.0))
     features = f32(rng.normal(size=(6, 1)))
-    origins, directions = rays_inwards(rng, 30)
+    rays = rays_inwards(rng, 30)
     tracer = make_tracer(cloud, features)
     given = random_gradients(rng, 30, 1)
     if output is not None:  # through one output alone
@@ -38,9 +38,9 @@ def test_every_parameter_of_a_tiny_scene(output: str | None) -> None:
         given = TraceGradients(**{**zeros, output: getattr(given, output)})
 
     parameters = ReferenceParameters.of(cloud, features)
-    result = trace_reference(parameters, origins, directions, tracer.settings)
+    result = trace_reference(parameters, rays, tracer.settings)
     twin = reference_gradients(parameters, result, given)
-    seen = tracer.trace(origins, directions, record=True)
+    seen = tracer.trace(rays, record=True)
     assert seen.hits is not None
     ours = scattered(tracer.backward(seen.hits, given), 6)
 
@@ -55,7 +55,7 @@ def test_every_parameter_of_a_tiny_scene(output: str | None) -> None:
                 kept = flat[k].item()
                 flat[k] = kept + step
                 with torch.no_grad():
-                    moved = trace_reference(parameters, origins, directions, tracer.settings)
+                    moved = trace_reference(parameters, rays, tracer.settings)
                     losses.append(reference_loss(moved, given).item())
                 flat[k] = kept
             differences[k] = (losses[0] - losses[1]) / (2 * STEP)

@@ -19,9 +19,11 @@ from trace_scenes import (
 )
 
 from engine.gaussians.model import concatenate
+from engine.rays import RayBatch
 from engine.trace.cpu import CpuTracer
-from engine.trace.packets import MAX_RAYS, PacketHits, find_packets
-from engine.trace.protocol import HitLists
+from engine.trace.cpu.packets import MAX_RAYS, find_packets
+from engine.trace.cpu.recording import CpuRecording
+from engine.trace.protocol import TraceResult
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +36,7 @@ def always_packets() -> Iterator[None]:
 
 def tile_rays(
     rng: np.random.Generator, tiles: int, *, side: int = 8, width: float = 0.2, distance: float = 3.0
-) -> tuple[np.ndarray, np.ndarray]:
+) -> RayBatch:
     """Square tiles of rays, each from a point of a sphere towards its middle."""
     origins, directions = [], []
     for _ in range(tiles):
@@ -46,13 +48,26 @@ def tile_rays(
         a, b = (grid.reshape(-1, 1) for grid in np.meshgrid(steps, steps))
         directions.append(unit(middle + a * across + b * up))
         origins.append(np.broadcast_to(origin, (side * side, 3)))
-    return f32(np.concatenate(origins)), f32(np.concatenate(directions))
+    return RayBatch(np.concatenate(origins), np.concatenate(directions))
+
+
+def starts(rays: RayBatch) -> list[int]:
+    """First rays of the packets, and the number of rays."""
+    packets, alone = find_packets(rays, "always")
+    assert len(alone) == 0 and (packets[1:, 0] == packets[:-1, 1]).all()
+    return [*packets[:, 0].tolist(), *packets[-1:, 1].tolist()]
+
+
+def in_packets(seen: TraceResult) -> bool:
+    """Whether all rays of a recorded trace went in packets."""
+    assert isinstance(seen.hits, CpuRecording)
+    return len(seen.hits.alone) == 0 and len(seen.hits.packets) > 0
 
 
 def test_neighbours_with_one_origin_form_a_packet() -> None:
     origins = f32(np.repeat([[0, 0, 0], [1, 0, 0], [0, 0, 0]], [3, 2, 1], axis=0))
     directions = f32(np.tile([0, 0, 1], (6, 1)))
-    assert find_packets(origins, directions).tolist() == [0, 3, 5, 6]
+    assert starts(RayBatch(origins, directions)) == [0, 3, 5, 6]
 
 
 def test_a_packet_ends_where_it_is_full_or_looks_elsewhere() -> None:
@@ -60,49 +75,49 @@ def test_a_packet_ends_where_it_is_full_or_looks_elsewhere() -> None:
     origins = np.zeros((count, 3), np.float32)
     directions = f32(np.tile([0, 0, 1], (count, 1)))
     directions[2] = [0, 1, 0]
-    assert find_packets(origins, directions).tolist() == [0, 2, 3, 3 + MAX_RAYS, count]
-    assert find_packets(origins[:0], directions[:0]).tolist() == [0]
+    assert starts(RayBatch(origins, directions)) == [0, 2, 3, 3 + MAX_RAYS, count]
+    assert starts(RayBatch(origins[:0], directions[:0])) == []
 
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_tiles_are_like_the_twin(rng: np.random.Generator, degree: int) -> None:
     cloud = make_cloud(rng, 1000, degree=degree)
     features = f32(rng.normal(size=(1000, degree)))
-    ours, _ = assert_like_twin(cloud, *tile_rays(rng, 4), features=features)
-    assert isinstance(ours.hits, PacketHits)
+    ours, _ = assert_like_twin(cloud, tile_rays(rng, 4), features=features)
+    assert in_packets(ours)
     assert ours.hit_counts.mean() > 10
 
 
 @pytest.mark.parametrize("width", [0.01, 0.7])
 def test_narrow_and_wide_tiles_are_like_the_twin(rng: np.random.Generator, width: float) -> None:
     cloud = make_cloud(rng, 1000)
-    ours, _ = assert_like_twin(cloud, *tile_rays(rng, 4, width=width))
-    assert isinstance(ours.hits, PacketHits)
+    ours, _ = assert_like_twin(cloud, tile_rays(rng, 4, width=width))
+    assert in_packets(ours)
 
 
 def test_rays_from_within_the_cloud(rng: np.random.Generator) -> None:
-    ours, _ = assert_like_twin(make_cloud(rng, 1000, size=0.15), *tile_rays(rng, 4, distance=0.3, width=0.8))
-    assert isinstance(ours.hits, PacketHits)
+    ours, _ = assert_like_twin(make_cloud(rng, 1000, size=0.15), tile_rays(rng, 4, distance=0.3, width=0.8))
+    assert in_packets(ours)
 
 
 def test_far_away_and_off_centre(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 1000)
-    origins, directions = tile_rays(rng, 4)
+    rays = tile_rays(rng, 4)
     shift = f32([40.0, -25.0, 10.0])
     cloud.means_world += shift
-    assert_like_twin(cloud, origins + shift, directions)
+    assert_like_twin(cloud, RayBatch(rays.origins_world + shift, rays.directions_world))
 
 
 def test_more_candidates_than_there_is_room_for_at_first(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 3000, size=0.3, logits=(-4.0, -2.0))
-    origins, directions = tile_rays(rng, 2, side=4)
+    rays = tile_rays(rng, 2, side=4)
     packets, singles = (CpuTracer(packets=way) for way in ("always", "never"))
     for tracer in (packets, singles):
         tracer.build(cloud)
-    a, b = (tracer.trace(origins, directions, record=True) for tracer in (packets, singles))
+    a, b = (tracer.trace(rays, record=True) for tracer in (packets, singles))
     assert a.hit_counts.max() > 100
-    assert isinstance(a.hits, PacketHits) and type(b.hits) is HitLists
-    assert hit_lists(a.hits) == hit_lists(b.hits)
+    assert in_packets(a) and not in_packets(b)
+    assert hit_lists(a) == hit_lists(b)
     np.testing.assert_allclose(a.rgb_srgb, b.rgb_srgb, atol=2e-6)
 
 
@@ -113,20 +128,20 @@ def test_coincident_octagons_are_ordered_by_id(rng: np.random.Generator) -> None
     origins = np.tile(f32([0, 0, -2]), (16, 1))
     directions = f32(unit(np.concatenate([rng.uniform(-0.1, 0.1, (16, 2)), np.ones((16, 1))], axis=1)))
     tracer = make_tracer(many)
-    ours = tracer.trace(origins, directions, record=True)
-    assert isinstance(ours.hits, PacketHits)
-    assert hit_lists(ours.hits) == [list(range(9))] * 16
+    ours = tracer.trace(RayBatch(origins, directions), record=True)
+    assert in_packets(ours)
+    assert hit_lists(ours) == [list(range(9))] * 16
 
 
 def test_gradients_equal_those_of_single_rays(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 2000, degree=2)
-    origins, directions = tile_rays(rng, 6)
-    given = random_gradients(rng, len(origins))
+    rays = tile_rays(rng, 6)
+    given = random_gradients(rng, len(rays))
     found = []
     for way in ("always", "never"):
         tracer = CpuTracer(packets=way)
         tracer.build(cloud)
-        seen = tracer.trace(origins, directions, record=True)
+        seen = tracer.trace(rays, record=True)
         assert seen.hits is not None
         found.append(tracer.backward(seen.hits, given))
     a, b = found
@@ -146,14 +161,15 @@ def test_gradients_equal_those_of_single_rays(rng: np.random.Generator) -> None:
 
 def test_same_bits_on_any_number_of_threads(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 2000, degree=1)
-    origins, directions = tile_rays(rng, 12)
-    given = random_gradients(rng, len(origins))
+    rays = tile_rays(rng, 12)
+    given = random_gradients(rng, len(rays))
     seen, found = [], []
     for threads in (1, 2):
         tracer = CpuTracer(threads=threads)
         tracer.build(cloud)
-        result = tracer.trace(origins, directions, record=True)
-        assert isinstance(result.hits, PacketHits)
+        result = tracer.trace(rays, record=True)
+        assert in_packets(result)
+        assert result.hits is not None
         found.append(tracer.backward(result.hits, given))
         result.hits = None
         seen.append(result)
@@ -163,28 +179,29 @@ def test_same_bits_on_any_number_of_threads(rng: np.random.Generator) -> None:
 
 def test_refresh_follows_parameters_inside_their_boxes(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 500)
-    origins, directions = tile_rays(rng, 4)
+    rays = tile_rays(rng, 4)
     stale, fresh = CpuTracer(box_padding=0.5), CpuTracer()
     stale.build(cloud)
-    stale.trace(origins, directions)
+    stale.trace(rays)
     moved = np.arange(0, 500, 3, dtype=np.int32)
     cloud.means_world[moved] += 0.003
     cloud.log_scales[moved] += 0.05
     cloud.opacity_logits[moved] -= 0.5
     stale.refresh(moved)
     fresh.build(cloud)
-    same_bits(stale.trace(origins, directions), fresh.trace(origins, directions))
+    same_bits(stale.trace(rays), fresh.trace(rays))
 
 
 def test_a_gaussian_that_vanishes_is_not_seen(rng: np.random.Generator) -> None:
     wall = facing_z([[0, 0, 0]], scales=5.0, opacities=0.9)
     origins, directions = np.zeros((16, 3), np.float32), np.tile(f32([0, 0, 1]), (16, 1))
     origins[:, 2] = -1
+    rays = RayBatch(origins, directions)
     tracer = CpuTracer()
     tracer.build(wall)
-    assert (tracer.trace(origins, directions).hit_counts == 1).all()
+    assert (tracer.trace(rays).hit_counts == 1).all()
     wall.opacity_logits[:] = -20.0
     tracer.refresh()
-    assert (tracer.trace(origins, directions).hit_counts == 0).all()
+    assert (tracer.trace(rays).hit_counts == 0).all()
     tracer.build(wall)
-    assert (tracer.trace(origins, directions).transmittance == 1).all()
+    assert (tracer.trace(rays).transmittance == 1).all()

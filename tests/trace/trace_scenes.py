@@ -6,8 +6,9 @@ import numpy as np
 import torch
 
 from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
 from engine.trace.cpu import CpuTracer
-from engine.trace.protocol import GaussianGradients, HitLists, TraceGradients, TraceResult, TraceSettings
+from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
 from engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
 
 PACKETS = ["auto"]
@@ -74,12 +75,18 @@ def facing_z(
 
 
 def rays_inwards(
-    rng: np.random.Generator, count: int, *, distance: float = 3.0, spread: float = 0.8
-) -> tuple[np.ndarray, np.ndarray]:
+    rng: np.random.Generator,
+    count: int,
+    *,
+    distance: float = 3.0,
+    spread: float = 0.8,
+    t_min: np.ndarray | float = 0.0,
+    t_max: np.ndarray | float = np.inf,
+) -> RayBatch:
     """Rays from a sphere around the origin to random points near it."""
     origins = f32(unit(rng.normal(size=(count, 3))) * distance)
     directions = f32(unit(rng.normal(size=(count, 3)) * spread * 0.5 - origins))
-    return origins, directions
+    return RayBatch(origins, directions, t_min, t_max)
 
 
 def make_tracer(gaussians: FlatGaussians, features: np.ndarray | None = None, **options: object) -> CpuTracer:
@@ -89,8 +96,10 @@ def make_tracer(gaussians: FlatGaussians, features: np.ndarray | None = None, **
     return tracer
 
 
-def hit_lists(hits: HitLists) -> list[list[int]]:
-    return [hits.of_ray(ray).tolist() for ray in range(len(hits.counts))]
+def hit_lists(seen: TraceResult) -> list[list[int]]:
+    """Ids of the Gaussians of each ray of a recorded trace."""
+    assert seen.hits is not None
+    return [seen.hits.of_ray(ray).tolist() for ray in range(len(seen.hit_counts))]
 
 
 def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
@@ -154,8 +163,7 @@ def same_bits(a: object, b: object) -> None:
 
 def twin_chunks(
     gaussians: FlatGaussians,
-    origins: np.ndarray,
-    directions: np.ndarray,
+    rays: RayBatch,
     settings: TraceSettings,
     features: np.ndarray | None = None,
     given: TraceGradients | None = None,
@@ -166,9 +174,9 @@ def twin_chunks(
     values: dict[str, list[np.ndarray]] = {name: [] for name in OUTPUTS}
     total: dict[str, np.ndarray] = {}
     parameters = ReferenceParameters.of(gaussians, features)
-    for start in range(0, len(origins), rays_at_once):
+    for start in range(0, len(rays), rays_at_once):
         rows = slice(start, start + rays_at_once)
-        result = trace_reference(parameters, origins[rows], directions[rows], settings)
+        result = trace_reference(parameters, rays[rows], settings)
         ids += [row.tolist() for row in result.hit_ids]
         for name in OUTPUTS:
             values[name].append(getattr(result, name).detach().numpy())
@@ -181,8 +189,7 @@ def twin_chunks(
 
 def assert_like_twin(
     gaussians: FlatGaussians,
-    origins: np.ndarray,
-    directions: np.ndarray,
+    rays: RayBatch,
     *,
     features: np.ndarray | None = None,
     seed: int = 0,
@@ -192,11 +199,11 @@ def assert_like_twin(
 ) -> tuple[TraceResult, dict[str, np.ndarray]]:
     """Hit lists equal to the twin's; values and gradients within the tolerances. Returns ours."""
     tracer = make_tracer(gaussians, features, **options)
-    ours = tracer.trace(origins, directions, record=True)
-    given = random_gradients(np.random.default_rng(seed), len(origins), ours.features.shape[1])
-    ids, values, expected = twin_chunks(gaussians, origins, directions, tracer.settings, features, given)
+    ours = tracer.trace(rays, record=True)
+    given = random_gradients(np.random.default_rng(seed), len(rays), ours.features.shape[1])
+    ids, values, expected = twin_chunks(gaussians, rays, tracer.settings, features, given)
     assert ours.hits is not None
-    assert hit_lists(ours.hits) == ids
+    assert hit_lists(ours) == ids
     assert ours.hit_counts.tolist() == [len(row) for row in ids]
     for name in OUTPUTS:
         error = relative_error(getattr(ours, name), values[name])

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
 from engine.scene import View
 from engine.train.config import McmcConfig, TrainConfig
 from engine.train.initialise import from_points
@@ -35,18 +36,19 @@ class FlatWorld:
         self.extent = EXTENT
         self.poison = False
 
-    def rays(self, view: np.ndarray, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rays(self, view: np.ndarray, y: np.ndarray, x: np.ndarray) -> RayBatch:
         half = self.side_px / 2
         directions = np.stack(
             [(x + 0.5 - half) / half, (y + 0.5 - half) / half, np.full(len(x), 2.0)], axis=-1
         )
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        return self.origins[view].astype(np.float32), directions.astype(np.float32)
+        return RayBatch(self.origins[view], directions)
 
     def pixels(
         self, view: np.ndarray, y: np.ndarray, x: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        origins, directions = self.rays(view, y, x)
+        rays = self.rays(view, y, x)
+        origins, directions = rays.origins_world, rays.directions_world
         points = origins - directions * (origins[:, 2:] / directions[:, 2:])
         rgb = paint(points[:, 0], points[:, 1])
         if self.poison:

@@ -14,8 +14,7 @@ from engine.render.images import write_png
 from engine.render.jobs import view_shots
 from engine.render.renderer import background_colour, render_rays
 from engine.scene import SceneModel, load_scene, scene_extent, split_views
-from engine.trace.cpu import CpuTracer
-from engine.train.trainer import trace_settings
+from engine.trace.make import make_tracer
 
 SIDE_PX = 320
 FILE = ".preview.png"
@@ -75,10 +74,10 @@ class Previews:
             arrays = {n.removeprefix("gaussians."): archive[n] for n in archive.files if n.startswith("gaus")}
         gaussians = FlatGaussians(**arrays)
         extent = scene_extent(np.stack([model.views[i].origin_world for i in train]), model.points)
-        tracer = CpuTracer(trace_settings(config.train, extent), threads=1)
+        tracer = make_tracer(config.train.trace, threads=1)
         tracer.build(gaussians)
         chosen = test if len(test) else train
-        shot = view_shots(model, chosen[:1])[0]
-        image = render_rays(tracer, *shot.rays(), background_colour(config.evaluate_background))
+        shot = view_shots(model, chosen[:1], config.train.near * extent)[0]
+        image = render_rays(tracer, shot.rays(), background_colour(config.evaluate_background))
         write_png(self._run / FILE, image.rgb_srgb)
         self._listener(PreviewWritten(FILE, iteration, model.views[chosen[0]].name))

@@ -37,12 +37,12 @@ def write_basis(basis, count, x, y, z):
             basis[15] = C3[6] * x * (xx - 3.0 * yy)
 
 
-@njit
-def colour(sh, basis):
-    """Display colour max(0, 1/2 + sum_k sh[k] basis[k]) of one Gaussian, three float64."""
+@njit(forceinline=True)
+def colour(sh, i, basis):
+    """Display colour max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
     red = green = blue = 0.5
-    for k in range(sh.shape[0]):
-        red += np.float64(sh[k, 0]) * basis[k]
-        green += np.float64(sh[k, 1]) * basis[k]
-        blue += np.float64(sh[k, 2]) * basis[k]
+    for k in range(sh.shape[1]):
+        red += np.float64(sh[i, k, 0]) * basis[k]
+        green += np.float64(sh[i, k, 1]) * basis[k]
+        blue += np.float64(sh[i, k, 2]) * basis[k]
     return max(red, 0.0), max(green, 0.0), max(blue, 0.0)

@@ -28,6 +28,7 @@ RAY_TFAR = 8
 K = 64
 """Hits that one traversal gathers; a ray that needs more is traced on from the last one."""
 COUNT, LAST_ID, LAST_T, BUFFER_FULL = 2, 3, 4, 5  # words of the context (0 and 1 are Embree's)
+T_LIMIT = 26
 RECORDS = 3  # as 64-bit word
 TRANSMITTANCE, PRUNE_BELOW, ALPHA_MAX = 4, 5, 6  # as float64 words
 RAY64 = 7  # origin and direction, six float64 words
@@ -76,6 +77,38 @@ def insert_hit(context_i32, context_f32, context_f64, t, identity, alpha):
     return count
 
 
+@njit(forceinline=True, fastmath={"contract"})
+def plane_distance(record, context_f64):
+    """Distance along the ray at which it meets the Gaussian's plane; infinite where it runs inside it."""
+    nx, ny, nz = np.float64(record[NORMAL]), np.float64(record[NORMAL + 1]), np.float64(record[NORMAL + 2])
+    cosine = context_f64[RAY64 + 3] * nx + context_f64[RAY64 + 4] * ny + context_f64[RAY64 + 5] * nz
+    if abs(cosine) < GRAZING_COSINE:
+        return np.inf
+    x = context_f64[RAY64] - record[MEAN]
+    y = context_f64[RAY64 + 1] - record[MEAN + 1]
+    z = context_f64[RAY64 + 2] - record[MEAN + 2]
+    return -(x * nx + y * ny + z * nz) / cosine
+
+
+@njit(forceinline=True, fastmath={"contract"})
+def octagon_place(record, context_f64, distance):
+    """Where the ray meets the plane, in standard deviations, and whether that is inside the octagon."""
+    x = context_f64[RAY64] - record[MEAN] + distance * context_f64[RAY64 + 3]
+    y = context_f64[RAY64 + 1] - record[MEAN + 1] + distance * context_f64[RAY64 + 4]
+    z = context_f64[RAY64 + 2] - record[MEAN + 2] + distance * context_f64[RAY64 + 5]
+    u = x * record[AXIS_U] + y * record[AXIS_U + 1] + z * record[AXIS_U + 2]
+    v = x * record[AXIS_V] + y * record[AXIS_V + 1] + z * record[AXIS_V + 2]
+    abs_u, abs_v = abs(u), abs(v)
+    farthest = max(abs_u * COS_22 + abs_v * SIN_22, abs_u * SIN_22 + abs_v * COS_22)
+    return u, v, farthest <= record[INNER_RADIUS]
+
+
+@njit(forceinline=True, fastmath={"contract"})
+def alpha_at(record, context_f64, u, v):
+    """Alpha of the Gaussian at u, v, rounded to float32."""
+    return np.float32(min(record[OPACITY] * math.exp(-0.5 * (u * u + v * v)), context_f64[ALPHA_MAX]))
+
+
 @cfunc(types.void(types.CPointer(types.uint64)), cache=True, fastmath={"contract"})
 def intersect_octagon(arguments):
     """RTCIntersectFunctionN for one ray: exact plane hit, octagon test, alpha, insertion."""
@@ -90,40 +123,49 @@ def intersect_octagon(arguments):
         float32_pointer(context_u64[RECORDS] + np.uint64(gaussian * RECORD_WORDS * 4)), RECORD_WORDS
     )
 
-    dx, dy, dz = context_f64[RAY64 + 3], context_f64[RAY64 + 4], context_f64[RAY64 + 5]
-    nx, ny, nz = np.float64(record[NORMAL]), np.float64(record[NORMAL + 1]), np.float64(record[NORMAL + 2])
-    cosine = dx * nx + dy * ny + dz * nz
-    if abs(cosine) < GRAZING_COSINE:
-        return
-    x = context_f64[RAY64] - record[MEAN]
-    y = context_f64[RAY64 + 1] - record[MEAN + 1]
-    z = context_f64[RAY64 + 2] - record[MEAN + 2]
-    distance = -(x * nx + y * ny + z * nz) / cosine
+    distance = plane_distance(record, context_f64)
     t = np.float32(distance)
-    if t > ray[RAY_TFAR] or t < context_f32[LAST_T]:
+    if t > ray[RAY_TFAR] or t >= context_f32[T_LIMIT] or t < context_f32[LAST_T]:
         return
     if t == context_f32[LAST_T] and gaussian <= context_i32[LAST_ID]:
         return
-    x += distance * dx
-    y += distance * dy
-    z += distance * dz
-    u = x * record[AXIS_U] + y * record[AXIS_U + 1] + z * record[AXIS_U + 2]
-    v = x * record[AXIS_V] + y * record[AXIS_V + 1] + z * record[AXIS_V + 2]
-    abs_u, abs_v = abs(u), abs(v)
-    inner = record[INNER_RADIUS]
-    if abs_u * COS_22 + abs_v * SIN_22 > inner or abs_u * SIN_22 + abs_v * COS_22 > inner:
+    u, v, inside = octagon_place(record, context_f64, distance)
+    if not inside:
         return
     if context_i32[COUNT] == K:
         t_last = context_f32[HIT_T + K - 1]
         if t > t_last or (t == t_last and gaussian > context_i32[HIT_ID + K - 1]):
             return
-    alpha = np.float32(min(record[OPACITY] * math.exp(-0.5 * (u * u + v * v)), context_f64[ALPHA_MAX]))
+    alpha = alpha_at(record, context_f64, u, v)
     count = insert_hit(context_i32, context_f32, context_f64, t, np.int32(gaussian), alpha)
     if count == K:
         context_i32[BUFFER_FULL] = 1
     if count == K or context_f64[TRANSMITTANCE] < context_f64[PRUNE_BELOW]:
         # Slightly beyond the last kept hit: boxes are tested in float32 and ties are settled by id.
         ray[RAY_TFAR] = context_f32[HIT_T + count - 1] * np.float32(1.000001)
+
+
+@cfunc(types.void(types.CPointer(types.uint64)), cache=True, fastmath={"contract"})
+def absorb_octagon(arguments):
+    """RTCOccludedFunctionN for one ray: takes the ray's transmittance along until too little is left."""
+    words = carray(arguments, 6)
+    gaussian = np.int64(words[2] & np.uint64(0xFFFFFFFF))
+    context_f32 = carray(float32_pointer(words[3]), CONTEXT_WORDS)
+    context_f64 = carray(float64_pointer(words[3]), CONTEXT_WORDS // 2)
+    context_u64 = carray(uint64_pointer(words[3]), CONTEXT_WORDS // 2)
+    ray = carray(float32_pointer(words[4]), RAY_WORDS)
+    record = carray(
+        float32_pointer(context_u64[RECORDS] + np.uint64(gaussian * RECORD_WORDS * 4)), RECORD_WORDS
+    )
+    distance = plane_distance(record, context_f64)
+    t = np.float32(distance)
+    if t <= context_f32[LAST_T] or t >= context_f32[T_LIMIT]:
+        return
+    u, v, inside = octagon_place(record, context_f64, distance)
+    if inside:
+        context_f64[TRANSMITTANCE] *= 1.0 - np.float64(alpha_at(record, context_f64, u, v))
+        if context_f64[TRANSMITTANCE] < context_f64[PRUNE_BELOW]:
+            ray[RAY_TFAR] = -np.inf  # Embree: a hit, go no further
 
 
 @cfunc(types.void(types.CPointer(types.uint64)), cache=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
-from engine.trace.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
+from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
 
 BINS = 64
 GRID = 8

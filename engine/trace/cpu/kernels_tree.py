@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
+from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
 
 WIDTH = 8
 BOX_ROWS = 6

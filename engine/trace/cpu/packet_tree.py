@@ -1,9 +1,10 @@
-"""The packets' hierarchy as arrays; :mod:`engine.trace.kernels_tree` says how they are laid out."""
+"""The packets' hierarchy as arrays; :mod:`engine.trace.cpu.kernels_tree` says how they are laid out."""
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Int32
 
-from engine.trace.kernels_tree import (
+from engine.trace.cpu.kernels_packet import Tree
+from engine.trace.cpu.kernels_tree import (
     BOX_ROWS,
     LEAF_ROWS,
     LEFT_OUT,
@@ -22,15 +23,15 @@ class PacketTree:
     """Eight boxes a node over blocks of eight Gaussians along a Z-order curve.
 
     Args:
-        records: of all Gaussians; those without an octagon are left out. padding: fraction of its size by
-        which each Gaussian's box is enlarged, so that it may move until the next
-            build.
+        records: of all Gaussians; those without an octagon are left out.
+        padding: fraction of its size by which each Gaussian's box is enlarged, so that it may move until the
+            next build.
+
+    Attributes:
+        arrays: the hierarchy as kernels take it.
     """
 
-    nodes: Float32[np.ndarray, "m 6 8"]
-    level_starts: Int64[np.ndarray, " l"]
-    blocks: Float32[np.ndarray, "b 9 8"]
-    order: Int32[np.ndarray, " k"]
+    arrays: Tree
 
     def __init__(self, records: Float32[np.ndarray, "n 16"], padding: float) -> None:
         count = len(records)
@@ -38,22 +39,22 @@ class PacketTree:
         low, cell = _grid(records[:, :3])
         curve_keys(records, low, 1.0 / cell, keys)
         order = np.argsort(keys, kind="stable").astype(np.int32)
-        self.order = order[: int(np.count_nonzero(keys != LEFT_OUT))]
-        blocks = -(-len(self.order) // WIDTH)
+        order = order[: int(np.count_nonzero(keys != LEFT_OUT))]
+        blocks = -(-len(order) // WIDTH)
         sizes = [max(1, -(-blocks // WIDTH))]
         while sizes[-1] > 1:
             sizes.append(-(-sizes[-1] // WIDTH))
-        self.level_starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        self.nodes = np.full((int(self.level_starts[-1]), BOX_ROWS, WIDTH), np.inf, np.float32)
-        self.nodes[:, 3:] = -np.inf  # boxes turned inside out are in no pyramid
-        self.blocks = np.empty((blocks, LEAF_ROWS, WIDTH), np.float32)
+        level_starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        nodes = np.full((int(level_starts[-1]), BOX_ROWS, WIDTH), np.inf, np.float32)
+        nodes[:, 3:] = -np.inf  # boxes turned inside out are in no pyramid
+        self.arrays = Tree(nodes, level_starts, np.empty((blocks, LEAF_ROWS, WIDTH), np.float32), order)
         self._slots = np.full(count, -1, np.int32)
-        write_leaves(self.blocks, self._slots, records, self.order, padding, self.nodes)
-        write_upper_levels(self.nodes, self.level_starts)
+        write_leaves(self.arrays.blocks, self._slots, records, order, padding, nodes)
+        write_upper_levels(nodes, level_starts)
 
     def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
         """Take the changed records of ``ids`` over; boxes stay."""
-        refresh_leaves(self.blocks, self._slots, records, ids)
+        refresh_leaves(self.arrays.blocks, self._slots, records, ids)
 
 
 def _grid(means_world: Float32[np.ndarray, "n 3"]) -> tuple[np.ndarray, float]:

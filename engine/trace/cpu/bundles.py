@@ -1,0 +1,157 @@
+"""What kernels take: a named tuple for each subject, so that an argument is a subject and not an array.
+
+numba passes the fields of a named tuple like arguments of their own. Two things it does not do with them: the
+body of a parallel loop must hand them on to a function instead of writing to their arrays (it would take the
+writing for useless), and may not be given tuples of tuples.
+
+``r`` counts rays, ``n`` Gaussians,
+``p`` packets, ``h`` places for hits, ``k`` spherical harmonics and ``f`` extra channels.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int32, Int64
+
+from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
+from engine.trace.protocol import TraceSettings
+
+
+class Rays(NamedTuple):
+    """A :class:`engine.rays.RayBatch`; a single origin or limit stands for all."""
+
+    origins: Float32[np.ndarray, "#r 3"]
+    directions: Float32[np.ndarray, "r 3"]
+    t_min: Float32[np.ndarray, "#r"]
+    t_max: Float32[np.ndarray, "#r"]
+
+    @classmethod
+    def of(cls, rays: RayBatch) -> "Rays":
+        """The arrays of ``rays``, not copied."""
+        return cls(rays.origins_world, rays.directions_world, rays.t_min, rays.t_max)
+
+
+class Scene(NamedTuple):
+    """What hits are evaluated from: geometry (see :mod:`engine.trace.cpu.kernels_hit`) and colour."""
+
+    records: Float32[np.ndarray, "n 16"]
+    sh: Float32[np.ndarray, "n k 3"]
+    features: Float32[np.ndarray, "n f"]
+
+
+class Parameters(NamedTuple):
+    """The raw geometry of the Gaussians; fields as in :class:`engine.gaussians.model.FlatGaussians`."""
+
+    means: Float32[np.ndarray, "n 3"]
+    quats: Float32[np.ndarray, "n 4"]
+    log_scales: Float32[np.ndarray, "n 2"]
+    logits: Float32[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, gaussians: FlatGaussians) -> "Parameters":
+        """The arrays of ``gaussians``, not copied."""
+        return cls(
+            gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales, gaussians.opacity_logits
+        )
+
+
+class Limits(NamedTuple):
+    """Where a ray ends; ``eps2`` above 1 means that there is no second phase."""
+
+    eps1: float
+    eps2: float
+    alpha_max: float
+    max_hits: int
+
+    @classmethod
+    def of(cls, settings: TraceSettings) -> "Limits":
+        """The limits among ``settings``."""
+        eps2 = settings.second_phase_min
+        return cls(
+            settings.transmittance_min, 2.0 if eps2 is None else eps2, settings.alpha_max, settings.max_hits
+        )
+
+
+class Outputs(NamedTuple):
+    """The arrays of a :class:`engine.trace.protocol.TraceResult`, to be written."""
+
+    rgb: Float32[np.ndarray, "r 3"]
+    transmittance: Float32[np.ndarray, " r"]
+    depth_sum: Float32[np.ndarray, " r"]
+    depth_median: Float32[np.ndarray, " r"]
+    normal: Float32[np.ndarray, "r 3"]
+    features: Float32[np.ndarray, "r f"]
+    counts: Int32[np.ndarray, " r"]
+
+
+class Hits(NamedTuple):
+    """Hits in order along each ray: those of ray r from ``starts[r]`` on."""
+
+    starts: Int64[np.ndarray, " r"]
+    ids: Int32[np.ndarray, " h"]
+    alphas: Float32[np.ndarray, " h"]
+    distances: Float32[np.ndarray, " h"]
+    rgb: Float32[np.ndarray, "h 3"]
+
+
+class PacketHits(NamedTuple):
+    """What packets keep of their hits beside :class:`Hits`.
+
+    ``us`` and ``vs`` are the hits in standard deviations. ``slots`` numbers the Gaussians of each packet in
+    the order in which it met them: the Gaussian in slot s of the packet that begins with ray f is
+    ``slot_ids[f * max_hits + s]``, and packet p has ``slot_counts[p]`` of them.
+    """
+
+    us: Float32[np.ndarray, " h"]
+    vs: Float32[np.ndarray, " h"]
+    slots: Int32[np.ndarray, " h"]
+    slot_ids: Int32[np.ndarray, " h"]
+    slot_counts: Int32[np.ndarray, " p"]
+
+
+class Forward(NamedTuple):
+    """A forward pass: ``hits`` are only written if it is ``recording``."""
+
+    rays: Rays
+    scene: Scene
+    limits: Limits
+    out: Outputs
+    hits: Hits
+    recording: bool
+
+
+class OutputGradients(NamedTuple):
+    """Gradients of a loss by each output; those of depths and normals are zero unless ``with_geometry``."""
+
+    rgb: Float32[np.ndarray, "r 3"]
+    transmittance: Float32[np.ndarray, " r"]
+    depth_sum: Float32[np.ndarray, " r"]
+    depth_median: Float32[np.ndarray, " r"]
+    normal: Float32[np.ndarray, "r 3"]
+    features: Float32[np.ndarray, "r f"]
+    ray_errors: Float32[np.ndarray, " r"]
+    with_geometry: bool
+
+
+class RawGradients(NamedTuple):
+    """The arrays of a :class:`engine.trace.protocol.GaussianGradients`, to be written."""
+
+    ids: Int32[np.ndarray, " u"]
+    means: Float32[np.ndarray, "u 3"]
+    quats: Float32[np.ndarray, "u 4"]
+    log_scales: Float32[np.ndarray, "u 2"]
+    logits: Float32[np.ndarray, " u"]
+    sh: Float32[np.ndarray, "u k 3"]
+    features: Float32[np.ndarray, "u f"]
+    weights: Float32[np.ndarray, " u"]
+    errors: Float32[np.ndarray, " u"]
+    counts: Int32[np.ndarray, " u"]
+
+
+class ByGaussian(NamedTuple):
+    """Rows sorted by Gaussian: the s-th one that was hit has rows ``order[starts[s] : starts[s + 1]]``."""
+
+    order: Int32[np.ndarray, " e"]
+    ids: Int32[np.ndarray, " e"]
+    starts: Int64[np.ndarray, " s1"]

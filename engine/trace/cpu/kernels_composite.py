@@ -1,0 +1,110 @@
+"""What a hit does to its ray: the one place where both forward passes add colour, depth and normal."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from engine.trace.cpu.kernels_sh import colour
+
+
+class Front(NamedTuple):
+    """A ray as far as it has been followed; sums are over the hits so far, each times its weight.
+
+    ``t1`` is the transmittance, ``t2`` that of the second phase, which begins where ``t1`` falls below eps1
+    (Algorithm 1 of RaySplats). ``place`` is where the next hit is stored.
+    """
+
+    t1: float
+    t2: float
+    second_phase: bool
+    red: float
+    green: float
+    blue: float
+    depth: float
+    normal_x: float
+    normal_y: float
+    normal_z: float
+    median: float
+    hits: int
+    place: int
+
+
+class Hit(NamedTuple):
+    """A Gaussian on a ray: its id, the distance (float32), alpha and the plane's normal."""
+
+    gaussian: int
+    t: float
+    alpha: float
+    normal_x: float
+    normal_y: float
+    normal_z: float
+
+
+@njit(error_model="numpy")
+def begin(forward, r, place):
+    """Ray ``r`` before its first hit; its hits will be stored from ``place`` on."""
+    for f in range(forward.scene.features.shape[1]):
+        forward.out.features[r, f] = np.float32(0.0)
+    if forward.recording:
+        forward.hits.starts[r] = place
+    return Front(1.0, 1.0, False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.float32(0.0), 0, place)
+
+
+@njit(forceinline=True, fastmath={"contract"}, error_model="numpy")
+def composite(front, hit, forward, r, direction, basis):
+    """The ray ``r`` behind ``hit``, and whether it ends there.
+
+    The hit is stored if the pass is recording. ``basis`` are the harmonics at the ray's direction.
+    """
+    i, t, alpha = hit.gaussian, hit.t, hit.alpha
+    weight = alpha * front.t1
+    red, green, blue = colour(forward.scene.sh, i, basis)
+    along = direction[0] * hit.normal_x + direction[1] * hit.normal_y + direction[2] * hit.normal_z
+    facing = -weight if along > 0.0 else weight  # the normal is turned towards the viewer
+    for f in range(forward.scene.features.shape[1]):
+        forward.out.features[r, f] += np.float32(weight * forward.scene.features[i, f])
+    t1 = front.t1 * (1.0 - alpha)
+    if forward.recording:
+        hits = forward.hits
+        hits.ids[front.place] = i
+        hits.alphas[front.place] = np.float32(alpha)
+        hits.distances[front.place] = t
+        hits.rgb[front.place, 0] = red
+        hits.rgb[front.place, 1] = green
+        hits.rgb[front.place, 2] = blue
+    t2, second_phase = front.t2, front.second_phase
+    if second_phase:
+        t2 *= 1.0 - alpha
+    elif t1 < forward.limits.eps1:
+        second_phase = True
+    count = front.hits + 1
+    ends = (second_phase and t2 < forward.limits.eps2) or count >= forward.limits.max_hits
+    behind = Front(
+        t1,
+        t2,
+        second_phase,
+        front.red + weight * red,
+        front.green + weight * green,
+        front.blue + weight * blue,
+        front.depth + weight * t,
+        front.normal_x + facing * hit.normal_x,
+        front.normal_y + facing * hit.normal_y,
+        front.normal_z + facing * hit.normal_z,
+        t if front.t1 > 0.5 and t1 <= 0.5 else front.median,
+        count,
+        front.place + 1,
+    )
+    return behind, ends
+
+
+@njit(error_model="numpy")
+def finish(front, forward, r):
+    """Write the outputs of ray ``r``."""
+    out = forward.out
+    out.counts[r] = front.hits
+    out.rgb[r, 0], out.rgb[r, 1], out.rgb[r, 2] = front.red, front.green, front.blue
+    out.transmittance[r] = front.t1
+    out.depth_sum[r] = front.depth
+    out.depth_median[r] = front.median
+    out.normal[r, 0], out.normal[r, 1], out.normal[r, 2] = front.normal_x, front.normal_y, front.normal_z

@@ -1,0 +1,497 @@
+r"""Packets of rays that share an origin: which Gaussians may they meet, and these Gaussians' rows for SIMD.
+
+    Seen from the side, with the packet's rays between d0 and d63:
+
+                                  . - '  d0             o         origin of all rays, wherever each begins
+                          . - '  /e2                    [A] [B]   boxes over eight Gaussians each
+                  . - '         /                       e1 e2     ellipses of candidates, seen edge on
+          . - '    [A]   |                              b         slope across the axis (a: out of the page)
+      o  - - - - - - - - | - - - - - -  axis            safe      no later chunk has a hit before this
+          ' - .       e1 |
+                  ' - .              [B]
+                          ' - .
+                                  ' - .  d63
+      |<----- safe ----->|
+
+1. One walk down the hierarchy finds the blocks of eight Gaussians whose box reaches into the pyramid (A, not
+   B), and of these Gaussians those whose ellipse does: the candidates, once for all 64 rays.
+2. The outline of an ellipse, seen from o, lies between two slopes a and two slopes b. Tables over 64 bins of
+   each give the rays in between as the bits of one word. A candidate without a bit lies between the rays.
+3. Candidates are sorted by their likely distance and cut into chunks of 128. Within a chunk those that the
+   same rays may meet come together, so that a block of eight has few bits.
+4. Each ray tests the blocks that have its bit, eight octagons at once, sorts what it has met, and composites
+   the hits before "safe". It ends where its transmittance says so; what lies behind is never tested.
+5. Backwards, the rays of a packet sum their shares of a Gaussian in one row of moments, which is enough as
+   all share o (:mod:`engine.trace.cpu.kernels_packet_backward`). Rows are sorted and summed by Gaussian.
+
+Steps 1 to 3 leave out only what no ray meets; a hit itself is computed in float64 from the record. So a ray
+has the same hits in any packet and alone, up to the last digits of float64.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, Int64, UInt64
+from numba import njit
+
+from engine.trace.cpu.kernels_footprint import BINS, CELLS, FRAME_WORDS, footprints, rays_between, write_bins
+from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
+from engine.trace.cpu.kernels_rays import ray_origin
+from engine.trace.cpu.kernels_simd import (
+    boxes_in_pyramid,
+    ellipses_in_pyramid,
+    float32_bits,
+    float64_from_bits,
+    lowest_bit,
+    meet_block,
+    prefetch,
+)
+from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
+
+STACK = 1024
+"""Words for the nodes that wait, two each; a walk goes down at once, so that seven wait on each level."""
+# --- rows of a block of eight candidates, float64; u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0 ---
+N_X, A_X, B_X, N_0, INNER, ALPHA_0, T_ROW, U_ROW, V_ROW = 0, 3, 6, 9, 10, 11, 12, 13, 14
+ROWS = 15
+ROW_BYTES, NODE_BYTES, BLOCK_BYTES = ROWS * WIDTH * 8, BOX_ROWS * WIDTH * 4, LEAF_ROWS * WIDTH * 4
+AHEAD = 8
+"""Candidates between asking for a record and reading it: about as long as memory takes to answer."""
+RECORD_BYTES = RECORD_WORDS * 4
+CHUNK = 128
+"""Candidates that a ray tests before it composites what lies safely in front of the rest.
+
+Small enough that rays which end early leave most candidates untested, large enough that the sorting of a
+ray's hits, once a chunk, does not show; a chunk's rows (15 kB) stay in the first cache.
+"""
+FEW_KEYS = 48
+"""An insertion sort is faster than two passes over 256 buckets for so few."""
+SIDES = 5
+"""Planes of a pyramid: four through its sides, one through its apex across the axis."""
+SLOPE_ROOM = 1e-9
+"""The pyramid is wider than its rays by this, which covers the rounding of slopes in float64."""
+START_ROOM = 512
+"""Candidates that a thread has room for at first; a packet that has more makes it grow."""
+
+
+class Tree(NamedTuple):
+    """The hierarchy; :mod:`engine.trace.cpu.kernels_tree` says how it is laid out."""
+
+    nodes: Float32[np.ndarray, "m 6 8"]
+    level_starts: Int64[np.ndarray, " l"]
+    blocks: Float32[np.ndarray, "b 9 8"]
+    order: Int32[np.ndarray, " k"]
+
+
+class Pyramid(NamedTuple):
+    """The pyramid around the rays of a packet.
+
+    ``planes`` are inward normals and, as int64, the rows of a box's farthest corner along them; ``frame`` the
+    axis, two directions across it, the range of slopes and bins per slope; ``below`` the bits of the rays in
+    the bins before each, along either slope.
+    """
+
+    planes: Float64[np.ndarray, "5 6"]
+    frame: Float64[np.ndarray, "15"]
+    below: UInt64[np.ndarray, "2 65"]
+
+
+class Walk(NamedTuple):
+    """Memory of a walk: waiting nodes, bins and distances of one block, and buckets for sorting."""
+
+    stack: Int64[np.ndarray, " s"]
+    bins: Int32[np.ndarray, "4 8"]
+    distances: Float64[np.ndarray, "2 8"]
+    histogram: Int32[np.ndarray, "256"]
+
+
+class Candidates(NamedTuple):
+    """The candidates of a packet, ``c`` at most.
+
+    As they are found: ``found``, the place on the curve; ``keys``, the likely distance in the upper half and
+    the number in the lower; ``bounds``, the least distance; ``cells``, where in the cross section; ``masks``,
+    the bits of the rays. In order: ``ids``; ``near``, where a chunk begins, the least distance of what
+    follows; ``block_rays``, the bits of the rays that may meet any of a block's eight; ``rows``, what is
+    tested; ``slot_of``, the number under which the packet met it, or -1. Of one ray: ``met``, ``pending``.
+    """
+
+    found: Int32[np.ndarray, " c"]
+    keys: UInt64[np.ndarray, " c"]
+    bounds: Float32[np.ndarray, " c"]
+    cells: Int32[np.ndarray, " c"]
+    masks: UInt64[np.ndarray, " c"]
+    ids: Int32[np.ndarray, " c"]
+    near: Float32[np.ndarray, " c1"]
+    block_rays: UInt64[np.ndarray, " b"]
+    rows: Float64[np.ndarray, "b 15 8"]
+    slot_of: Int32[np.ndarray, " c"]
+    met: Int32[np.ndarray, " c8"]
+    pending: UInt64[np.ndarray, " c8"]
+
+
+@njit(error_model="numpy")
+def new_pyramid():
+    """Room for a pyramid."""
+    return Pyramid(
+        np.empty((SIDES, 6), np.float64),
+        np.empty(FRAME_WORDS, np.float64),
+        np.empty((2, BINS + 1), np.uint64),
+    )
+
+
+@njit(error_model="numpy")
+def new_walk():
+    """Memory for walks, one after another."""
+    return Walk(
+        np.empty(STACK, np.int64),
+        np.empty((4, WIDTH), np.int32),
+        np.empty((2, WIDTH), np.float64),
+        np.empty(256, np.int32),
+    )
+
+
+@njit(error_model="numpy")
+def new_candidates(room):
+    """Room for so many candidates, a multiple of eight."""
+    return Candidates(
+        np.empty(room, np.int32),
+        np.empty(room, np.uint64),
+        np.empty(room, np.float32),
+        np.empty(room, np.int32),
+        np.empty(room, np.uint64),
+        np.empty(room, np.int32),
+        np.empty(room + 1, np.float32),
+        np.empty(room // WIDTH, np.uint64),
+        np.empty((room // WIDTH, ROWS, WIDTH), np.float64),
+        np.empty(room, np.int32),
+        np.empty(room + WIDTH, np.int32),
+        np.empty(room + WIDTH, np.uint64),
+    )
+
+
+@njit(cache=True)
+def packet_starts(origins, directions, most, least_cosine, starts):
+    """First ray of each packet: neighbours in the array that share an origin and look about one way.
+
+    Returns the number of packets; ``starts`` has room for one more than there are rays.
+    """
+    packets = 0
+    first = 0
+    one_origin = len(origins) == 1
+    for r in range(len(directions)):
+        if r > 0 and r - first < most:
+            cosine = (
+                directions[r, 0] * directions[first, 0]
+                + directions[r, 1] * directions[first, 1]
+                + directions[r, 2] * directions[first, 2]
+            )
+            same = one_origin or (
+                origins[r, 0] == origins[first, 0]
+                and origins[r, 1] == origins[first, 1]
+                and origins[r, 2] == origins[first, 2]
+            )
+            if same and cosine >= least_cosine:
+                continue
+        starts[packets] = r
+        packets += 1
+        first = r
+    starts[packets] = len(directions)
+    return packets
+
+
+@njit(error_model="numpy")
+def write_pyramid(directions, first, last, pyramid):
+    """The pyramid around rays ``first`` to ``last``."""
+    planes, frame = pyramid.planes, pyramid.frame
+    x = y = z = 0.0
+    for r in range(first, last):
+        x += directions[r, 0]
+        y += directions[r, 1]
+        z += directions[r, 2]
+    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+    x, y, z = x * scale, y * scale, z * scale
+    # any frame around the axis
+    if abs(x) < 0.6:
+        e0, e1, e2 = 0.0, z, -y
+    else:
+        e0, e1, e2 = -z, 0.0, x
+    scale = 1.0 / math.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
+    e0, e1, e2 = e0 * scale, e1 * scale, e2 * scale
+    f0, f1, f2 = y * e2 - z * e1, z * e0 - x * e2, x * e1 - y * e0
+    a_low = b_low = np.inf
+    a_high = b_high = -np.inf
+    for r in range(first, last):
+        d0, d1, d2 = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
+        inverse = 1.0 / (d0 * x + d1 * y + d2 * z)
+        a = (d0 * e0 + d1 * e1 + d2 * e2) * inverse
+        b = (d0 * f0 + d1 * f1 + d2 * f2) * inverse
+        a_low, a_high, b_low, b_high = min(a_low, a), max(a_high, a), min(b_low, b), max(b_high, b)
+    a_low, a_high = a_low - SLOPE_ROOM, a_high + SLOPE_ROOM
+    b_low, b_high = b_low - SLOPE_ROOM, b_high + SLOPE_ROOM
+    planes[0, 0], planes[0, 1], planes[0, 2] = e0 - a_low * x, e1 - a_low * y, e2 - a_low * z
+    planes[1, 0], planes[1, 1], planes[1, 2] = a_high * x - e0, a_high * y - e1, a_high * z - e2
+    planes[2, 0], planes[2, 1], planes[2, 2] = f0 - b_low * x, f1 - b_low * y, f2 - b_low * z
+    planes[3, 0], planes[3, 1], planes[3, 2] = b_high * x - f0, b_high * y - f1, b_high * z - f2
+    planes[4, 0], planes[4, 1], planes[4, 2] = x, y, z
+    rows = planes.view(np.int64)
+    for side in range(SIDES):
+        for axis in range(3):
+            rows[side, 3 + axis] = 3 + axis if planes[side, axis] > 0.0 else axis
+    frame[0], frame[1], frame[2] = x, y, z
+    frame[3], frame[4], frame[5] = e0, e1, e2
+    frame[6], frame[7], frame[8] = f0, f1, f2
+    frame[9], frame[10], frame[11], frame[12] = a_low, a_high, b_low, b_high
+    write_bins(directions, first, last, frame, pyramid.below)
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def gather_candidates(tree, pyramid, origin, farthest, walk, candidates):
+    """The Gaussians whose ellipse a ray of the pyramid may meet before ``farthest``; returns how many.
+
+    Only as many as there is room for are written.
+    """
+    ox, oy, oz = origin
+    stack, bins, distances = walk.stack, walk.bins, walk.distances
+    level_starts = tree.level_starts
+    n_found = 0
+    top = len(level_starts) - 2
+    stack[0] = level_starts[top]
+    stack[1] = top
+    depth = 1
+    room = len(candidates.found)
+    nodes_at, blocks_at = tree.nodes.ctypes.data, tree.blocks.ctypes.data
+    planes_at, frame_at = pyramid.planes.ctypes.data, pyramid.frame.ctypes.data
+    bins_at, distances_at = bins.ctypes.data, distances.ctypes.data
+    while depth > 0:
+        depth -= 1
+        node = stack[2 * depth]
+        level = stack[2 * depth + 1]
+        mask = boxes_in_pyramid(nodes_at + node * NODE_BYTES, planes_at, ox, oy, oz)
+        first_child = (node - level_starts[level]) * WIDTH
+        while mask != 0:
+            child = first_child + lowest_bit(mask)
+            mask &= mask - 1
+            if level > 0:
+                stack[2 * depth] = level_starts[level - 1] + child
+                stack[2 * depth + 1] = level - 1
+                depth += 1
+                continue
+            block_at = blocks_at + child * BLOCK_BYTES
+            reached = ellipses_in_pyramid(block_at, planes_at, ox, oy, oz)
+            if reached != 0:
+                reached &= footprints(block_at, frame_at, ox, oy, oz, bins_at, distances_at)
+            while reached != 0:
+                lane = lowest_bit(reached)
+                reached &= reached - 1
+                if distances[0, lane] >= farthest:
+                    continue
+                rays, cell = rays_between(bins, lane, pyramid.below)
+                if rays == 0:
+                    continue  # it lies between the rays
+                if n_found < room:
+                    candidates.found[n_found] = child * WIDTH + lane
+                    # non-negative floats sort like their bits
+                    likely = np.uint64(float32_bits(np.float32(distances[1, lane])))
+                    candidates.keys[n_found] = (likely << np.uint64(32)) | np.uint64(n_found)
+                    candidates.bounds[n_found] = distances[0, lane]
+                    candidates.cells[n_found] = cell
+                    candidates.masks[n_found] = rays
+                n_found += 1
+    return n_found
+
+
+@njit(error_model="numpy")
+def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
+    """Candidates of the packet of rays ``first`` to ``last``, and how many; room grows as needed."""
+    write_pyramid(rays.directions, first, last, pyramid)
+    one_end = len(rays.t_max) == 1
+    farthest = rays.t_max[0 if one_end else first]
+    if not one_end:
+        for r in range(first + 1, last):
+            farthest = max(farthest, rays.t_max[r])
+    origin = ray_origin(rays, first)
+    count = gather_candidates(tree, pyramid, origin, farthest, walk, candidates)
+    if count > len(candidates.found):
+        candidates = new_candidates((count * 5 // 4 + WIDTH - 1) // WIDTH * WIDTH)
+        count = gather_candidates(tree, pyramid, origin, farthest, walk, candidates)
+    return candidates, count
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def sort_candidates(candidates, count, order, histogram):
+    """Order the candidates in chunks by distance, within a chunk by the rays that may meet them."""
+    keys, bounds, cells, near = candidates.keys, candidates.bounds, candidates.cells, candidates.near
+    block_rays = candidates.block_rays
+    if count > FEW_KEYS:
+        sort_keys(keys, candidates.pending, count, histogram)
+    else:
+        insertion_sort(keys, count)
+    nearest = np.float32(np.inf)
+    near[count] = nearest
+    for k in range(count - 1, -1, -1):
+        nearest = min(nearest, bounds[np.int64(keys[k] & np.uint64(0xFFFFFFFF))])
+        near[k] = nearest
+    for b in range((count + WIDTH - 1) // WIDTH):
+        block_rays[b] = 0
+    for start in range(0, count, CHUNK):
+        end = min(start + CHUNK, count)
+        histogram[: CELLS + 1] = 0
+        for k in range(start, end):
+            histogram[cells[np.int64(keys[k] & np.uint64(0xFFFFFFFF))] + 1] += 1
+        for cell in range(CELLS):
+            histogram[cell + 1] += histogram[cell]
+        for k in range(start, end):
+            which = np.int64(keys[k] & np.uint64(0xFFFFFFFF))
+            cell = cells[which]
+            place = start + histogram[cell]
+            histogram[cell] += 1
+            candidates.ids[place] = order[candidates.found[which]]
+            block_rays[place // WIDTH] |= candidates.masks[which]
+
+
+@njit(error_model="numpy")
+def keep_candidates(candidates, count, order):
+    """Leave the candidates in the order in which they were found, where none is needed."""
+    for b in range((count + WIDTH - 1) // WIDTH):
+        candidates.block_rays[b] = 0
+    for k in range(count):
+        candidates.ids[k] = order[candidates.found[k]]
+        candidates.block_rays[k // WIDTH] |= candidates.masks[k]
+
+
+@njit
+def insertion_sort(keys, count):
+    """Sort a few keys in place."""
+    for i in range(1, count):
+        key = keys[i]
+        j = i
+        while j > 0 and keys[j - 1] > key:
+            keys[j] = keys[j - 1]
+            j -= 1
+        keys[j] = key
+
+
+@njit
+def sort_keys(keys, scratch, count, histogram):
+    """Sort in place by the upper bits of the keys' distances, then by the rest.
+
+    Two passes over the 16 bits below the distances' common upper bits leave so little disorder that the
+    insertion sort afterwards hardly moves anything.
+    """
+    low, high = keys[0], keys[0]
+    for k in range(1, count):
+        low, high = min(low, keys[k]), max(high, keys[k])
+    low, high = low >> np.uint64(32), high >> np.uint64(32)
+    shift = np.uint64(32)
+    span = high - low
+    while span >= np.uint64(1 << 16):
+        span >>= np.uint64(1)
+        shift += np.uint64(1)
+    low <<= np.uint64(32)
+    for digit in range(2):
+        histogram[:] = 0
+        at = shift + np.uint64(8 * digit)
+        for k in range(count):
+            histogram[((keys[k] - low) >> at) & np.uint64(255)] += 1
+        total = 0
+        for b in range(256):
+            size = histogram[b]
+            histogram[b] = total
+            total += size
+        for k in range(count):
+            bucket = ((keys[k] - low) >> at) & np.uint64(255)
+            scratch[histogram[bucket]] = keys[k]
+            histogram[bucket] += 1
+        keys, scratch = scratch, keys
+    insertion_sort(keys, count)
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def write_rows(candidates, count, scene, origin, coloured):
+    """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit.
+
+    Harmonics are asked for if hits will be ``coloured``.
+    """
+    ox, oy, oz = origin
+    rows, ids, records, sh = candidates.rows, candidates.ids, scene.records, scene.sh
+    records_at, sh_at = records.ctypes.data, sh.ctypes.data
+    sh_bytes = sh.shape[1] * 12
+    for k in range((count + WIDTH - 1) // WIDTH * WIDTH):
+        if k + AHEAD < count:
+            prefetch(records_at + ids[k + AHEAD] * RECORD_BYTES)
+            if coloured:
+                prefetch(sh_at + ids[k + AHEAD] * sh_bytes)
+        block, lane = rows[k // WIDTH], k % WIDTH
+        if k >= count:
+            for row in range(ROWS):
+                block[row, lane] = 0.0
+            block[N_X, lane] = 1.0
+            block[INNER, lane] = -1.0
+            continue
+        record = records[ids[k]]
+        x, y, z = record[MEAN] - ox, record[MEAN + 1] - oy, record[MEAN + 2] - oz
+        n0, n1, n2 = (
+            np.float64(record[NORMAL]),
+            np.float64(record[NORMAL + 1]),
+            np.float64(record[NORMAL + 2]),
+        )
+        a0, a1, a2 = (
+            np.float64(record[AXIS_U]),
+            np.float64(record[AXIS_U + 1]),
+            np.float64(record[AXIS_U + 2]),
+        )
+        b0, b1, b2 = (
+            np.float64(record[AXIS_V]),
+            np.float64(record[AXIS_V + 1]),
+            np.float64(record[AXIS_V + 2]),
+        )
+        height = x * n0 + y * n1 + z * n2
+        xa = x * a0 + y * a1 + z * a2
+        xb = x * b0 + y * b1 + z * b2
+        block[N_X, lane], block[N_X + 1, lane], block[N_X + 2, lane] = n0, n1, n2
+        block[A_X, lane] = height * a0 - xa * n0
+        block[A_X + 1, lane] = height * a1 - xa * n1
+        block[A_X + 2, lane] = height * a2 - xa * n2
+        block[B_X, lane] = height * b0 - xb * n0
+        block[B_X + 1, lane] = height * b1 - xb * n1
+        block[B_X + 2, lane] = height * b2 - xb * n2
+        block[N_0, lane] = height
+        block[INNER, lane] = record[INNER_RADIUS]
+        block[ALPHA_0, lane] = record[OPACITY]
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def meet_blocks(candidates, ray, first, last, direction):
+    """Candidates of blocks ``first`` to ``last`` whose octagon the packet's ray ``ray`` meets; how many.
+
+    Leaves t, u and v of each in the rows.
+    """
+    count = 0
+    dx, dy, dz = direction
+    met, block_rays = candidates.met, candidates.block_rays
+    rows_at = candidates.rows.ctypes.data
+    for b in range(first, last):
+        if (block_rays[b] >> np.uint64(ray)) & np.uint64(1) == 0:
+            continue
+        mask = meet_block(rows_at + b * ROW_BYTES, dx, dy, dz)
+        while mask != 0:
+            met[count] = b * WIDTH + lowest_bit(mask)
+            mask &= mask - 1
+            count += 1
+    return count
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def exponential(x):
+    """exp(x) for |x| < 700 to a relative 1e-8."""
+    n = math.floor(x * 1.4426950408889634 + 0.5)
+    r = x - n * 0.6931471805599453
+    p = 1.0 / 5040.0 + r * (1.0 / 40320.0)
+    p = 1.0 / 720.0 + r * p
+    p = 1.0 / 120.0 + r * p
+    p = 1.0 / 24.0 + r * p
+    p = 1.0 / 6.0 + r * p
+    p = 0.5 + r * p
+    p = 1.0 + r * p
+    p = 1.0 + r * p
+    return p * float64_from_bits((np.int64(n) + 1023) << 52)

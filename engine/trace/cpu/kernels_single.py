@@ -1,0 +1,179 @@
+"""Forward passes for rays that come alone: Embree gathers hits, nearest first, and they are composited."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, UInt64
+from numba import njit, prange
+
+from engine.trace.cpu.bundles import Forward
+from engine.trace.cpu.kernels_composite import Hit, begin, composite, finish
+from engine.trace.cpu.kernels_hit import (
+    ALPHA_MAX,
+    BUFFER_FULL,
+    COUNT,
+    HIT_ALPHA,
+    HIT_ID,
+    HIT_T,
+    LAST_ID,
+    LAST_T,
+    NORMAL,
+    PRUNE_BELOW,
+    RAY64,
+    RAY_TFAR,
+    RAY_WORDS,
+    RECORDS,
+    T_LIMIT,
+    TRANSMITTANCE,
+)
+from engine.trace.cpu.kernels_rays import ray_direction, ray_limits, ray_origin
+from engine.trace.cpu.kernels_sh import write_basis
+from engine.trace.kernels_native import call_with_three_pointers, next_from_counter
+
+INT32_MAX = 2**31 - 1
+BEFORE, BEHIND = np.float32(0.999999), np.float32(1.000001)
+"""Embree tests boxes in float32: it searches from a little before a distance to a little behind one."""
+
+
+class Embree(NamedTuple):
+    """Addresses of a function of Embree and of a scene; for each chunk of rays, a ray and arguments.
+
+    The columns of ``scratch`` are those of :mod:`engine.trace.cpu.kernels_hit`.
+    """
+
+    function: int
+    scene: int
+    scratch: Float32[np.ndarray, "c w"]
+    arguments: UInt64[np.ndarray, "c 8"]
+
+
+@njit(error_model="numpy")
+def context_of(embree, chunk):
+    """The ray of a chunk and its context, as words of each type."""
+    ray = embree.scratch[chunk]
+    context = ray[RAY_WORDS:]
+    return ray, ray.view(np.int32), context, context.view(np.int32), context.view(np.float64)
+
+
+@njit(error_model="numpy")
+def write_query(ray, ray_i32, context_i32, origin, direction, t_near, t_far):
+    """The ray and the start of its context as Embree wants them."""
+    for axis in range(3):
+        ray[axis] = origin[axis]
+        ray[4 + axis] = direction[axis]
+    ray[3], ray[7], ray[RAY_TFAR] = t_near * BEFORE, np.float32(0.0), t_far * BEHIND
+    ray_i32[9], ray_i32[10], ray_i32[11] = -1, 0, 0
+    ray_i32[17], ray_i32[18], ray_i32[19] = -1, -1, -1
+    context_i32[0], context_i32[1] = -1, -1
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def trace_from_counter(embree, forward, which, rays_per_chunk, counter):
+    """Trace the rays ``which``, in ascending order, until the ``counter`` has passed the last chunk.
+
+    The hits of ray r are stored from r * max_hits on, or behind those of ray r - 1 where its chunk has it. A
+    ray's result depends on nothing but the ray, so it is the same for every number of threads.
+    """
+    rays, scene, limits = forward.rays, forward.scene, forward.limits
+    chunk_count = (len(which) + rays_per_chunk - 1) // rays_per_chunk
+    # Certainly behind the stop: T2 <= T / (eps1 (1 - alpha_max)), and the margin covers rounding.
+    last_phase = limits.eps2 * (1.0 - limits.alpha_max) if limits.eps2 <= 1.0 else 1.0
+    prune_below = 0.999 * limits.eps1 * last_phase
+    basis = np.empty(16, np.float64)
+    while True:
+        chunk = next_from_counter(counter.ctypes.data)
+        if chunk >= chunk_count:
+            break
+        ray, ray_i32, context, context_i32, context_f64 = context_of(embree, chunk)
+        context.view(np.uint64)[RECORDS] = scene.records.ctypes.data
+        context_f64[PRUNE_BELOW], context_f64[ALPHA_MAX] = prune_below, limits.alpha_max
+        place, before = 0, -2
+        for s in range(chunk * rays_per_chunk, min(len(which), (chunk + 1) * rays_per_chunk)):
+            r = which[s]
+            if r != before + 1:
+                place = r * limits.max_hits
+            before = r
+            origin, direction = ray_origin(rays, r), ray_direction(rays, r)
+            t_min, t_max = ray_limits(rays, r)
+            for axis in range(3):
+                context_f64[RAY64 + axis] = origin[axis]
+                context_f64[RAY64 + 3 + axis] = direction[axis]
+            write_basis(basis, forward.scene.sh.shape[1], direction[0], direction[1], direction[2])
+            front = begin(forward, r, place)
+            context[LAST_T], context_i32[LAST_ID], context[T_LIMIT] = t_min, INT32_MAX, t_max
+            stop = not t_min < t_max
+            while not stop:
+                write_query(ray, ray_i32, context_i32, origin, direction, context[LAST_T], t_max)
+                context_i32[COUNT], context_i32[BUFFER_FULL] = 0, 0
+                context_f64[TRANSMITTANCE] = front.t1
+                call_with_three_pointers(
+                    embree.function, embree.scene, ray.ctypes.data, embree.arguments[chunk].ctypes.data
+                )
+                gathered = context_i32[COUNT]
+                stop = context_i32[BUFFER_FULL] == 0 or context_f64[TRANSMITTANCE] < prune_below
+                for k in range(gathered):
+                    i = context_i32[HIT_ID + k]
+                    record = scene.records[i]
+                    hit = Hit(
+                        i,
+                        context[HIT_T + k],
+                        np.float64(context[HIT_ALPHA + k]),
+                        np.float64(record[NORMAL]),
+                        np.float64(record[NORMAL + 1]),
+                        np.float64(record[NORMAL + 2]),
+                    )
+                    front, ends = composite(front, hit, forward, r, direction, basis)
+                    if ends:
+                        stop = True
+                        break
+                if not stop:
+                    context[LAST_T] = context[HIT_T + gathered - 1]
+                    context_i32[LAST_ID] = context_i32[HIT_ID + gathered - 1]
+            finish(front, forward, r)
+            place = front.place
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def trace_rays(embree, rays, scene, limits, out, hits, recording, which, rays_per_chunk, workers, counter):
+    """:func:`trace_from_counter` on ``workers`` threads; ``counter`` holds one zero.
+
+    ``rays`` to ``recording`` are a :class:`Forward`, as a parallel loop takes no tuples of tuples.
+    """
+    for _worker in prange(workers):
+        forward = Forward(rays, scene, limits, out, hits, recording)
+        trace_from_counter(embree, forward, which, rays_per_chunk, counter)
+
+
+@njit(fastmath={"contract"}, error_model="numpy")
+def absorb_from_counter(embree, rays, scene, limits, which, rays_per_chunk, counter, transmittance):
+    """The transmittance alone of the rays ``which``, 0 where it falls below eps1."""
+    chunk_count = (len(which) + rays_per_chunk - 1) // rays_per_chunk
+    while True:
+        chunk = next_from_counter(counter.ctypes.data)
+        if chunk >= chunk_count:
+            break
+        ray, ray_i32, context, context_i32, context_f64 = context_of(embree, chunk)
+        context.view(np.uint64)[RECORDS] = scene.records.ctypes.data
+        context_f64[PRUNE_BELOW], context_f64[ALPHA_MAX] = limits.eps1, limits.alpha_max
+        for s in range(chunk * rays_per_chunk, min(len(which), (chunk + 1) * rays_per_chunk)):
+            r = which[s]
+            origin, direction = ray_origin(rays, r), ray_direction(rays, r)
+            for axis in range(3):
+                context_f64[RAY64 + axis] = origin[axis]
+                context_f64[RAY64 + 3 + axis] = direction[axis]
+            context[LAST_T], context[T_LIMIT] = ray_limits(rays, r)
+            context_f64[TRANSMITTANCE] = 1.0
+            if context[LAST_T] < context[T_LIMIT]:
+                write_query(ray, ray_i32, context_i32, origin, direction, context[LAST_T], context[T_LIMIT])
+                call_with_three_pointers(
+                    embree.function, embree.scene, ray.ctypes.data, embree.arguments[chunk].ctypes.data
+                )
+            left = context_f64[TRANSMITTANCE]
+            transmittance[r] = 0.0 if left < limits.eps1 else left
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def absorb_rays(embree, rays, scene, limits, which, rays_per_chunk, workers, counter, transmittance):
+    """:func:`absorb_from_counter` on ``workers`` threads; ``counter`` holds one zero."""
+    for _worker in prange(workers):
+        absorb_from_counter(embree, rays, scene, limits, which, rays_per_chunk, counter, transmittance)

@@ -1,0 +1,136 @@
+"""Memory that the tracer's kernels fill."""
+
+import weakref
+
+import numpy as np
+from jaxtyping import Float32
+from numpy.typing import DTypeLike
+
+from engine.trace.cpu.bundles import OutputGradients, Outputs, RawGradients
+from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
+
+
+def aligned_empty(shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
+    """Uninitialised float32 array whose memory starts on a cache line (64 bytes)."""
+    size = int(np.prod(shape)) * 4
+    raw = np.empty(size + 64, np.uint8)
+    offset = -raw.ctypes.data % 64
+    return raw[offset : offset + size].view(np.float32).reshape(shape)
+
+
+class Pool:
+    """Hands out arrays whose memory is used again once nobody holds any array over it.
+
+    Fresh pages for large arrays would cost as much as the work done in them. An array, its slices and views
+    keep their memory; when the last of them is gone, the memory returns here. So a recording owns what it
+    holds for as long as it lives, and many may live at once.
+    """
+
+    def __init__(self) -> None:
+        self._free: list[np.ndarray] = []
+
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
+        """An uninitialised array; pages are only taken when they are written to."""
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        fitting = [block for block in self._free if size <= block.nbytes <= 4 * size]
+        if fitting:
+            block = min(fitting, key=lambda block: block.nbytes)
+            self._free = [other for other in self._free if other is not block]
+        else:
+            block = np.empty(size + size // 4, np.uint8)
+        lease = _Lease(block)
+        weakref.finalize(lease, _give_back, weakref.ref(self), block).atexit = False
+        return np.asarray(lease)[:size].view(dtype).reshape(shape)
+
+    def _take_back(self, block: np.ndarray) -> None:
+        self._free.append(block)
+        if len(self._free) > _MOST_FREE:
+            del self._free[0]
+
+
+_MOST_FREE = 32
+"""Blocks kept for later; the one that has waited longest goes first."""
+
+
+class _Lease:
+    """What arrays over a block refer to, so that the end of the last of them is the end of this."""
+
+    def __init__(self, block: np.ndarray) -> None:
+        self.__array_interface__ = block.__array_interface__
+
+
+def _give_back(pool: "weakref.ref[Pool]", block: np.ndarray) -> None:
+    owner = pool()
+    if owner is not None:
+        owner._take_back(block)
+
+
+def empty_result(rays: int, features: int) -> TraceResult:
+    """Uninitialised outputs of ``rays`` rays."""
+    return TraceResult(
+        rgb_srgb=np.empty((rays, 3), np.float32),
+        transmittance=np.empty(rays, np.float32),
+        depth_sum=np.empty(rays, np.float32),
+        depth_median=np.empty(rays, np.float32),
+        normal_world=np.empty((rays, 3), np.float32),
+        features=np.empty((rays, features), np.float32),
+        hit_counts=np.empty(rays, np.int32),
+    )
+
+
+def empty_gradients(gaussians: int, basis_count: int, features: int) -> GaussianGradients:
+    """Uninitialised gradients of ``gaussians`` Gaussians that were hit."""
+    return GaussianGradients(
+        ids=np.empty(gaussians, np.int32),
+        means_world=np.empty((gaussians, 3), np.float32),
+        quats_wxyz=np.empty((gaussians, 4), np.float32),
+        log_scales=np.empty((gaussians, 2), np.float32),
+        opacity_logits=np.empty(gaussians, np.float32),
+        sh=np.empty((gaussians, basis_count, 3), np.float32),
+        features=np.empty((gaussians, features), np.float32),
+        weight_sums=np.empty(gaussians, np.float32),
+        error_sums=np.empty(gaussians, np.float32),
+        hit_counts=np.empty(gaussians, np.int32),
+    )
+
+
+def raw_gradients(gradients: GaussianGradients) -> RawGradients:
+    """The arrays of ``gradients`` as kernels take them."""
+    g = gradients
+    return RawGradients(
+        g.ids, g.means_world, g.quats_wxyz, g.log_scales, g.opacity_logits, g.sh, g.features, g.weight_sums,
+        g.error_sums, g.hit_counts,
+    )  # fmt: skip
+
+
+def outputs(result: TraceResult) -> Outputs:
+    """The arrays of ``result`` as kernels take them."""
+    r = result
+    return Outputs(
+        r.rgb_srgb, r.transmittance, r.depth_sum, r.depth_median, r.normal_world, r.features, r.hit_counts
+    )
+
+
+def output_gradients(gradients: TraceGradients, rays: int, features: int) -> OutputGradients:
+    """``gradients`` as kernels take them, zero where there is none."""
+    g = gradients
+    return OutputGradients(
+        contiguous(g.rgb_srgb),
+        or_zeros(g.transmittance, (rays,)),
+        or_zeros(g.depth_sum, (rays,)),
+        or_zeros(g.depth_median, (rays,)),
+        or_zeros(g.normal_world, (rays, 3)),
+        or_zeros(g.features, (rays, features)),
+        or_zeros(g.ray_errors, (rays,)),
+        g.with_geometry,
+    )
+
+
+def contiguous(array: np.ndarray) -> np.ndarray:
+    """``array`` as contiguous float32, itself where it is that already."""
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def or_zeros(array: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """``array``, or zeros where there is none."""
+    return np.zeros(shape, np.float32) if array is None else contiguous(array)

@@ -1,0 +1,147 @@
+"""Rays that come in packets: neighbours with one origin, such as the pixels of a tile."""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Int32, Int64
+
+from engine.rays import RayBatch
+from engine.trace.cpu.bundles import (
+    ByGaussian,
+    Forward,
+    Limits,
+    OutputGradients,
+    PacketHits,
+    Parameters,
+    Rays,
+    Scene,
+)
+from engine.trace.cpu.kernels_packet import packet_starts
+from engine.trace.cpu.kernels_packet_backward import ROW_WORDS, Rows, replay_packets, sum_packets
+from engine.trace.cpu.kernels_packet_forward import absorb_packets, trace_packets
+from engine.trace.cpu.kernels_sort import sort_by_gaussian
+from engine.trace.cpu.memory import Pool, empty_gradients, raw_gradients
+from engine.trace.cpu.packet_tree import PacketTree
+from engine.trace.cpu.recording import CpuRecording
+from engine.trace.protocol import GaussianGradients
+
+MAX_RAYS = 64
+"""Rays of a packet: their set is the bits of one word."""
+LEAST_COSINE = 0.98
+"""A packet's rays look this much (11 degrees) the way its first ray looks, so that its pyramid is narrow."""
+WORTH_A_PACKET = 3
+"""Rays from which a packet is faster than following each alone."""
+WORTH_A_HIERARCHY = 8
+"""Rays in smaller groups are followed alone if they are one in so many or more; for fewer, building Embree's
+hierarchy would cost more than it saves."""
+SUM_CHUNKS = 16
+"""Chunks a thread when rows are summed: enough that no thread waits long for another."""
+
+Ways = Literal["auto", "always", "never"]
+
+
+def find_packets(
+    rays: RayBatch, ways: Ways = "auto"
+) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
+    """Which rays go in packets, and which alone.
+
+    A group are neighbours in the batch that share an origin, to the bit, and look about one way. Each is
+    judged by its own size, but few small ones go as packets, too.
+
+    Args:
+        rays: any rays.
+        ways: ``auto`` by what is faster; ``always`` or ``never`` in packets.
+
+    Returns:
+        First ray of each packet and the one behind its last; and the rays that go alone.
+    """
+    count = len(rays)
+    if ways == "never" or count == 0:
+        return np.empty((0, 2), np.int64), np.arange(count)
+    starts = np.empty(count + 1, np.int64)
+    groups = packet_starts(rays.origins_world, rays.directions_world, MAX_RAYS, LEAST_COSINE, starts)
+    packets = np.stack([starts[:groups], starts[1 : groups + 1]], axis=1)
+    sizes = packets[:, 1] - packets[:, 0]
+    small = sizes < WORTH_A_PACKET
+    if ways == "always" or WORTH_A_HIERARCHY * int(sizes[small].sum()) < count:
+        return packets, np.empty(0, np.int64)
+    return packets[~small], np.flatnonzero(np.repeat(small, sizes))
+
+
+class PacketTracer:
+    """Walks the hierarchy once a packet, then tests its candidates eight at a time against each ray.
+
+    Args:
+        limits: where rays end.
+        threads: threads for tracing.
+        pool: where memory comes from.
+    """
+
+    def __init__(self, limits: Limits, *, threads: int, pool: Pool) -> None:
+        self._limits = limits
+        self._threads = threads
+        self._pool = pool
+        self._tree: PacketTree | None = None
+
+    def build(self, records: Float32[np.ndarray, "n 16"], padding: float) -> None:
+        """Build the hierarchy."""
+        self._tree = PacketTree(records, padding)
+
+    def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
+        """Take changed records over."""
+        assert self._tree is not None, "build first"
+        self._tree.refresh(records, ids)
+
+    def room(self, packets: Int64[np.ndarray, "p 2"], rays: int, *, recording: bool) -> PacketHits:
+        """Memory for what packets keep of their hits."""
+        places = rays * self._limits.max_hits if recording and len(packets) else 0
+        return PacketHits(
+            us=self._pool.empty((places,), np.float32),
+            vs=self._pool.empty((places,), np.float32),
+            slots=self._pool.empty((places,), np.int32),
+            slot_ids=self._pool.empty((places,), np.int32),
+            slot_counts=np.zeros(len(packets), np.int32),
+        )
+
+    def trace(self, forward: Forward, packets: Int64[np.ndarray, "p 2"], kept: PacketHits) -> None:
+        """Follow the rays of the packets."""
+        assert self._tree is not None, "build first"
+        trace_packets(*forward, packets, self._tree.arrays, kept, self._threads, np.zeros(1, np.int64))
+
+    def absorb(
+        self,
+        rays: Rays,
+        scene: Scene,
+        packets: Int64[np.ndarray, "p 2"],
+        transmittance: Float32[np.ndarray, " r"],
+    ) -> None:
+        """Write the transmittance of the rays of the packets."""
+        assert self._tree is not None, "build first"
+        absorb_packets(
+            rays, scene, self._limits, packets, self._tree.arrays, self._threads, np.zeros(1, np.int64),
+            transmittance,
+        )  # fmt: skip
+
+    def backward(
+        self, recording: CpuRecording, gradients: OutputGradients, scene: Scene, parameters: Parameters
+    ) -> GaussianGradients:
+        """Gradients of the raw parameters: summed within each packet, then over packets in their order."""
+        firsts = np.concatenate([[0], np.cumsum(recording.kept.slot_counts, dtype=np.int64)])
+        count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
+        rows = Rows(
+            firsts=firsts,
+            ids=self._pool.empty((count,), np.int32),
+            sums=self._pool.empty((count, ROW_WORDS), np.float32),
+            sh=self._pool.empty((count, basis_count, 3), np.float32),
+            features=np.empty((count, feature_count), np.float32),
+        )
+        replay_packets(
+            Rays.of(recording.rays), recording.packets, recording.hits, recording.kept, recording.counts,
+            parameters, scene.features, self._limits, gradients, self._threads, np.zeros(1, np.int64), rows,
+        )  # fmt: skip
+        by_gaussian = ByGaussian(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
+        out = empty_gradients(len(by_gaussian.starts) - 1, basis_count, feature_count)
+        sum_packets(
+            parameters, scene.records, by_gaussian, rows, SUM_CHUNKS * self._threads, raw_gradients(out)
+        )
+        return out

@@ -1,0 +1,41 @@
+"""What a recording trace of the CPU keeps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int32, Int64
+
+from engine.rays import RayBatch
+from engine.trace.cpu.bundles import Hits, PacketHits
+
+
+@dataclass(frozen=True)
+class CpuRecording:
+    """Hits in order along each ray; follows :class:`engine.trace.protocol.Recording`.
+
+    Attributes:
+        rays: the rays.
+        counts: hits on each ray.
+        packets: first ray of each packet and the one behind its last.
+        alone: the other rays, in ascending order.
+        hits: the hits of both.
+        kept: what packets keep beside them; of no size where there are none.
+        build: which build of which tracer it belongs to.
+    """
+
+    rays: RayBatch
+    counts: Int32[np.ndarray, " r"]
+    packets: Int64[np.ndarray, "p 2"]
+    alone: Int64[np.ndarray, " s"]
+    hits: Hits
+    kept: PacketHits
+    build: object
+
+    def place(self, ray: int) -> slice:
+        """Where the arrays of ``hits`` have those of one ray."""
+        start = int(self.hits.starts[ray])
+        return slice(start, start + int(self.counts[ray]))
+
+    def of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
+        """Ids of the Gaussians of one ray, front to back."""
+        return self.hits.ids[self.place(ray)]

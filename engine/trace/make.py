@@ -1,0 +1,29 @@
+"""The one place where tracers are made."""
+
+from engine.trace.protocol import Tracer, TraceSettings
+
+
+def make_tracer(
+    settings: TraceSettings | None = None,
+    *,
+    threads: int = 0,
+    box_padding: float = 0.0,
+    build_quality: int = 1,
+) -> Tracer:
+    """The tracer that ``settings`` name.
+
+    Args:
+        settings: which tracer, and where rays are cut off.
+        threads: threads for building and tracing; 0 takes all.
+        box_padding: for tracers with a hierarchy, see :class:`engine.trace.cpu.CpuTracer`.
+        build_quality: likewise; 0 is for scenes that change, 2 for those that are only looked at.
+    """
+    settings = settings or TraceSettings()
+    # Here, as each brings libraries that another one does without.
+    if settings.tracer == "reference":
+        from engine.trace.reference_tracer import ReferenceTracer
+
+        return ReferenceTracer(settings)
+    from engine.trace.cpu import CpuTracer
+
+    return CpuTracer(settings, threads=threads, box_padding=box_padding, build_quality=build_quality)

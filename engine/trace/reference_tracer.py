@@ -1,0 +1,143 @@
+"""The slow twin as a tracer, which any part of the engine can run on, if the scene is small."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int32
+from torch import Tensor
+
+from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
+from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, TraceResult, TraceSettings
+from engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
+
+PAIRS_AT_ONCE = 1 << 17
+"""Rays times Gaussians of one piece; each pair takes about a kilobyte while its gradient is kept."""
+_OUTPUTS = ("rgb_srgb", "transmittance", "depth_sum", "depth_median", "normal_world", "features")
+_PARAMETERS = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh", "features")
+
+
+@dataclass(frozen=True)
+class ReferenceRecording:
+    """Rays and their hits; :meth:`ReferenceTracer.backward` traces the rays again."""
+
+    rays: RayBatch
+    ids: list[np.ndarray]
+    build: object
+
+    def of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
+        """Ids of the Gaussians of one ray, front to back."""
+        return self.ids[ray].astype(np.int32)
+
+
+class ReferenceTracer:
+    """:func:`engine.trace.reference.trace_reference` behind :class:`engine.trace.protocol.Tracer`.
+
+    Args:
+        settings: where rays are cut off.
+    """
+
+    def __init__(self, settings: TraceSettings | None = None) -> None:
+        self.settings = settings or TraceSettings(tracer="reference")
+        self._gaussians: FlatGaussians | None = None
+        self._features = np.empty((0, 1), np.float32)
+        self._build = object()
+
+    def build(self, gaussians: FlatGaussians, features: Float32[np.ndarray, "n f"] | None = None) -> None:
+        """Take over ``gaussians``; there is nothing to build."""
+        ones = np.ones((len(gaussians), 1), np.float32)
+        # One channel more than asked for, whose sum along a ray is the sum of the weights.
+        self._features = ones if features is None else np.concatenate([features, ones], axis=1)
+        self._gaussians = gaussians
+        self._build = object()
+
+    def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
+        """Nothing to do: parameters are read at each trace."""
+
+    def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
+        """Follow rays; see the protocol."""
+        parameters = self._parameters()
+        with torch.no_grad():
+            parts = [trace_reference(parameters, rays[piece], self.settings) for piece in self._pieces(rays)]
+        hit_ids = [ids for part in parts for ids in part.hit_ids]
+        shapes = {"rgb_srgb": (3,), "normal_world": (3,), "features": (self._features.shape[1],)}
+        found = {
+            name: np.concatenate(
+                [np.empty((0, *shapes.get(name, ()))), *(getattr(part, name).numpy() for part in parts)]
+            ).astype(np.float32)
+            for name in _OUTPUTS
+        }
+        found["features"] = np.ascontiguousarray(found["features"][:, :-1])
+        counts = np.array([len(ids) for ids in hit_ids], np.int32)
+        hits = ReferenceRecording(rays, hit_ids, self._build) if record else None
+        return TraceResult(**found, hit_counts=counts, hits=hits)
+
+    def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
+        """What light is left along each ray; see the protocol."""
+        parameters = self._parameters()
+        unlimited = self.settings.model_copy(
+            update={"transmittance_min": 0.0, "second_phase_min": None, "max_hits": 2**31}
+        )
+        left = np.empty(len(rays), np.float32)
+        with torch.no_grad():
+            for piece in self._pieces(rays):
+                left[piece] = trace_reference(parameters, rays[piece], unlimited).transmittance.numpy()
+        left[left < self.settings.transmittance_min] = 0.0
+        return left
+
+    def backward(self, hits: Recording, gradients: TraceGradients) -> GaussianGradients:
+        """Gradients of the raw parameters by autograd; see the protocol."""
+        if not isinstance(hits, ReferenceRecording) or hits.build is not self._build:
+            raise ValueError("the recording is not of this tracer, or older than its last build")
+        parameters = self._parameters()
+        leaves = [getattr(parameters, name) for name in _PARAMETERS]
+        sums = [np.zeros(leaf.shape) for leaf in leaves]
+        weights, errors = np.zeros(len(parameters.means_world)), np.zeros(len(parameters.means_world))
+        for piece in self._pieces(hits.rays):
+            result = trace_reference(parameters, hits.rays[piece], self.settings)
+            for total, found in zip(sums, _by_leaves(_loss(result, gradients, piece), leaves), strict=True):
+                total += found
+            seen = result.features[:, -1]
+            weights += _by_leaves(seen.sum(), leaves)[-1][:, -1]
+            if gradients.ray_errors is not None:
+                shared = (seen * torch.tensor(gradients.ray_errors[piece], dtype=torch.float64)).sum()
+                errors += _by_leaves(shared, leaves)[-1][:, -1]
+        ids, counts = np.unique(np.concatenate([np.empty(0, np.int64), *hits.ids]), return_counts=True)
+        rows = {name: total[ids].astype(np.float32) for name, total in zip(_PARAMETERS, sums, strict=True)}
+        rows["features"] = np.ascontiguousarray(rows["features"][:, :-1])
+        return GaussianGradients(
+            ids=ids.astype(np.int32),
+            **rows,
+            weight_sums=weights[ids].astype(np.float32),
+            error_sums=errors[ids].astype(np.float32),
+            hit_counts=counts.astype(np.int32),
+        )
+
+    def _parameters(self) -> ReferenceParameters:
+        assert self._gaussians is not None, "build first"
+        return ReferenceParameters.of(self._gaussians, self._features)
+
+    def _pieces(self, rays: RayBatch) -> list[slice]:
+        size = max(1, PAIRS_AT_ONCE // max(1, len(self._features)))
+        return [slice(start, min(start + size, len(rays))) for start in range(0, len(rays), size)]
+
+
+def _loss(result: ReferenceResult, gradients: TraceGradients, piece: slice) -> Tensor:
+    """The scalar whose gradients by the outputs are ``gradients``."""
+    loss = torch.zeros((), dtype=torch.float64)
+    for name in _OUTPUTS:
+        given = getattr(gradients, name)
+        if given is not None:
+            output = getattr(result, name)
+            output = output[:, :-1] if name == "features" else output
+            loss = loss + (output * torch.tensor(given[piece], dtype=torch.float64)).sum()
+    return loss
+
+
+def _by_leaves(loss: Tensor, leaves: list[Tensor]) -> list[Float64[np.ndarray, "..."]]:
+    """Gradients of ``loss``, zero where it does not depend on a leaf."""
+    if not loss.requires_grad:
+        return [np.zeros(leaf.shape) for leaf in leaves]
+    found = torch.autograd.grad(loss, leaves, retain_graph=True, allow_unused=True)
+    return [np.zeros(leaf.shape) if g is None else g.numpy() for g, leaf in zip(found, leaves, strict=True)]
