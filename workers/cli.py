@@ -27,6 +27,7 @@ from workers.commands.quota import quota
 from workers.commands.reconstruct import reconstruct
 from workers.commands.render import render
 from workers.commands.serve import serve
+from workers.commands.stage import stage
 from workers.commands.surface import surface
 from workers.commands.token import token
 from workers.commands.transform import transform
@@ -85,7 +86,7 @@ def cli() -> None:
 
 
 for _command in (
-    reconstruct, evaluate, export, import_, render, surface,
+    reconstruct, evaluate, export, import_, render, stage, surface,
     edit, deform, transform, crop, merge, clean, demo,
     serve, worker, token, fsck, quota, *CLIENT_COMMANDS,
 ):  # fmt: skip

@@ -13,6 +13,7 @@ from engine.errors import OutputError
 from engine.events import Listener
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.ply import read_gaussian_ply
+from engine.light.stage_file import read_stage
 from engine.pipeline import CONFIG, SCENE, run_scene
 from engine.render.cameras import RenderCamera
 from engine.render.jobs import (
@@ -35,6 +36,7 @@ from engine.trace.protocol import TraceSettings
 from workers.options import is_run
 from workers.progress import show_progress, staged
 from workers.scene_files import open_scene
+from workers.stage_jobs import StagePlace, render_stage
 
 DEFAULT_FPS = 30.0
 DEFAULT_FRAMES = 120
@@ -76,6 +78,7 @@ def render_files(mode: str, options: dict[str, Any], listener: Listener) -> tupl
         OctasplatError: the source cannot be read or the output not written.
     """
     output: Path = options["output"]
+    stage = read_stage(options["stage"]) if options.get("stage") else None
     cameras, fps = None, options["fps"] or DEFAULT_FPS
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
@@ -85,9 +88,18 @@ def render_files(mode: str, options: dict[str, Any], listener: Listener) -> tupl
         cameras = _turntable(source, options, fps)
     if cameras is not None:
         cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
+    background = background_colour(options["background"] or source.background)
+    if stage is not None:
+        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
+        place = StagePlace(
+            source.gaussians, source.settings, source.photographs, options["stage"].parent,
+            lambda path: open_scene(path, quiet=options["quiet"]), background, options["threads"],
+        )  # fmt: skip
+        film = fps if output.suffix.lower() == ".mp4" else None
+        names = None if options.get("preview") else _FileNames(output, options["exr"])
+        return render_stage(stage, place, shots, output, names, film, listener)
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
-    background = background_colour(options["background"] or source.background)
     with staged("render", listener) as progress:
         if cameras is not None and output.suffix.lower() == ".mp4":
             render_video(tracer, cameras, output, fps, background, progress)
@@ -133,6 +145,23 @@ def _read_run(options: dict[str, Any]) -> _Source:
 
 def _read_file(options: dict[str, Any]) -> _Source:
     return _Source(open_scene(options["source"], quiet=options["quiet"]), TraceSettings())
+
+
+def stage_place(
+    source: Path, scene: Path | None, up: str | None, *, quiet: bool
+) -> tuple[StagePlace, Float64[np.ndarray, "3"] | None]:
+    """The scene of a run or file in which a stage is to be set, and the direction that is named as up.
+
+    Raises:
+        OctasplatError: the source cannot be read.
+    """
+    options = {"source": source, "scene": scene, "max_side": None, "quiet": quiet}
+    found = _read_run(options) if is_run(source) else _read_file(options)
+    place = StagePlace(
+        found.gaussians, found.settings, found.photographs, source.parent,
+        lambda path: open_scene(path, quiet=quiet), background_colour(found.background), 0,
+    )  # fmt: skip
+    return place, None if up is None else _axis(up)
 
 
 def _turntable(source: _Source, options: dict[str, Any], fps: float) -> tuple[RenderCamera, ...]:

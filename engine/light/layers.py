@@ -14,7 +14,7 @@ from engine.light.kernels_layer import AMBIENT, RELIT, SHADOWED
 from engine.light.meshes import rotation_matrix
 from engine.light.stage import Stage, StageGaussians
 from engine.rays import RayBatch
-from engine.trace.cpu import CpuTracer
+from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer, TraceResult, TraceSettings
 
 FEATURES = 3
@@ -85,13 +85,13 @@ def stage_layers(
     if not parts:
         return None
     whole = concatenate(same_degree(parts))
-    tracer = CpuTracer(settings, threads=threads, build_quality=2)
+    tracer = make_tracer(settings, threads=threads, build_quality=2)
     tracer.build(whole, np.concatenate(features).astype(np.float32))
 
     def caster(chosen: Bool[np.ndarray, " n"]) -> Tracer | None:
         if chosen.all() or not chosen.any():
             return tracer if chosen.any() else None
-        some = CpuTracer(settings, threads=threads, build_quality=2)
+        some = make_tracer(settings, threads=threads, build_quality=2)
         some.build(whole.select(chosen))
         return some
 

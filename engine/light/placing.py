@@ -66,19 +66,21 @@ def _met(rest: Rest, tracer: Tracer, ray_of_pixel: RayOfPixel, key: str) -> Floa
 
 def scene_facts(
     gaussians: FlatGaussians,
+    tracer: Tracer,
     up_world: Float64[np.ndarray, "3"],
     centre_world: Float64[np.ndarray, "3"],
     size: float,
-    camera_world: Float64[np.ndarray, "3"],
+    cameras_world: Float64[np.ndarray, "c 3"],
 ) -> StageFacts:
     """What a first stage is fitted to.
 
     Args:
         gaussians: of the scene.
+        tracer: of the same Gaussians.
         up_world: up.
         centre_world: of what the cameras look at.
         size: about as large as that, world units.
-        camera_world: about where the cameras are.
+        cameras_world: where some of the cameras are.
     """
     up = up_world / np.linalg.norm(up_world)
     near = np.linalg.norm(gaussians.means_world - centre_world, axis=1) < 1.5 * size
@@ -86,10 +88,18 @@ def scene_facts(
     if len(some) < 10:
         return _facts(up, centre_world, size, -up)
     normals = some.rotations[:, :, 0].astype(np.float64)
-    towards = camera_world - some.means_world
+    towards = cameras_world.mean(axis=0) - some.means_world
     normals *= np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
     area = (some.opacities * np.exp(some.log_scales.sum(axis=1))).astype(np.float64)
-    floor = _floor(some.means_world.astype(np.float64), normals @ up, area, up, centre_world, size)
+    spots, standing = _floor(some.means_world.astype(np.float64), normals @ up, area, up, size)
+    # Somewhat above the spot, so that the surface itself is not in the way.
+    ways = [RayBatch.between(camera[None], spots + 0.05 * size * up) for camera in cameras_world]
+    seen = np.mean([tracer.transmittance(way) for way in ways], axis=0)
+    free = np.full(len(spots), 0.3 * size)
+    if len(standing):
+        free = np.minimum(cKDTree(standing).query(spots)[0], free)
+    away = np.linalg.norm(spots - centre_world, axis=1)
+    floor = spots[np.argmax(size * seen + free - 0.7 * away)]
     return _facts(up, floor, size, -_light_from(some.base_rgb_srgb, normals, area, up))
 
 
@@ -98,10 +108,9 @@ def _floor(
     cosines: Float64[np.ndarray, " n"],
     area: Float64[np.ndarray, " n"],
     up: Float64[np.ndarray, "3"],
-    centre: Float64[np.ndarray, "3"],
     size: float,
-) -> Float64[np.ndarray, "3"]:
-    """A free spot on the height at which most of the level surface lies."""
+) -> tuple[Float64[np.ndarray, "s 3"], Float64[np.ndarray, "k 3"]]:
+    """Spots on the height at which most of the level surface lies, and the points that stand on it."""
     heights = points @ up
     level = cosines > LEVEL_COSINE
     if not level.any():
@@ -114,13 +123,8 @@ def _floor(
     if len(on_floor) == 0:
         on_floor = np.flatnonzero(level)
     spots = points[on_floor[:: max(1, len(on_floor) // SPOTS)]]
-    standing = heights > height + 0.06 * size
-    away = np.linalg.norm(spots - centre, axis=1)
-    free = np.full(len(spots), size)
-    if standing.any():
-        free = np.minimum(cKDTree(points[standing]).query(spots)[0], 0.4 * size)
-    best = spots[np.argmax(free - 0.3 * away)]
-    return np.asarray(best + (height - best @ up) * up)
+    spots = spots + (height - spots @ up)[:, None] * up
+    return spots, points[heights > height + 0.06 * size]
 
 
 def _light_from(

@@ -3,15 +3,12 @@
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from engine.light.film import StageImage
 from engine.light.integrator import PathTracer
 from engine.light.stage import Integrator
 from engine.light.staging import LitMeshes, refuse_inside_glass
-from engine.render.cameras import RenderCamera
 from engine.render.images import write_exr, write_png
-from engine.render.jobs import Shot, camera_shots
+from engine.render.jobs import Shot
 from engine.render.video import VideoWriter
 
 Progress = Callable[[int, int], None]
@@ -56,21 +53,21 @@ def render_stage_video(
     tracer: PathTracer,
     meshes: LitMeshes,
     settings: Integrator,
-    cameras: Sequence[RenderCamera],
+    shots: Sequence[Shot],
     path: Path,
     fps: float,
     progress: Progress = lambda _done, _total: None,
 ) -> None:
-    """Render cameras of one image size as the frames of a video.
+    """Render shots of one image size as the frames of a video.
 
     Raises:
         ConfigError: a camera stands in glass; then nothing is rendered.
         OutputError: the video cannot be written.
     """
-    shots = camera_shots(cameras)
-    for shot, camera in zip(shots, cameras, strict=True):
-        refuse_inside_glass(meshes, camera.centre_world.astype(np.float32), shot.name)
-    with VideoWriter(path, fps, cameras[0].width_px, cameras[0].height_px) as video:
+    first = shots[0].rays()
+    for shot in shots:
+        refuse_inside_glass(meshes, shot.rays().origin_world, shot.name)
+    with VideoWriter(path, fps, first.width_px, first.height_px) as video:
         for _, image in _rendered(tracer, settings, shots, progress):
             video.write(image.rgb_srgb)
 

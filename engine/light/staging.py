@@ -120,7 +120,7 @@ def refuse_inside_glass(meshes: LitMeshes, origin_world: Float32[np.ndarray, "3"
     """
     if not (meshes.materials.kinds == GLASS).any():
         return
-    # A way that meets no edge by chance; the surfaces that it crosses are counted one by one.
+    # A direction that meets edges by bad luck only; what the ray crosses is counted surface by surface.
     direction = np.array([[0.5773, 0.5774, 0.5772]], np.float32)
     sides: dict[int, int] = {}
     t = 0.0

@@ -7,6 +7,7 @@ import click
 
 from workers.options import background_option, is_run, quiet_option, threads_option
 
+PREVIEW_SIDE_PX = 480
 AXES = ("x", "-x", "y", "-y", "z", "-z")
 
 
@@ -43,6 +44,13 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
     "--max-side", type=click.IntRange(min=16), metavar="PX", help="Views: longer side of the images."
 )
 @click.option("--scene", type=click.Path(path_type=Path), help="Where the run's photographs are now.")
+@click.option(
+    "--stage",
+    type=click.Path(path_type=Path),
+    metavar="STAGE.toml",
+    help="Render with the meshes, lights and materials of a stage, see docs/light.md.",
+)
+@click.option("--preview", is_flag=True, help="Stage: the first image only, -o one file, finer and finer.")
 @threads_option
 @quiet_option
 def render(**options: Any) -> None:
@@ -61,7 +69,14 @@ def render(**options: Any) -> None:
         raise click.UsageError("--views needs the folder of a run; a file has --turntable and --path.")
     if mode == "views" and options["output"].suffix.lower() == ".mp4":
         raise click.UsageError("--views gives images; name a folder.")
-    _check_output(options["output"], options["exr"])
+    if options["preview"]:
+        if options["stage"] is None or options["output"].suffix.lower() not in (".png", ".exr"):
+            raise click.UsageError(
+                "--preview goes with --stage and writes one .png or .exr; name it with -o."
+            )
+        options["max_side"] = options["max_side"] or PREVIEW_SIDE_PX
+    else:
+        _check_output(options["output"], options["exr"])
 
     from workers.render_jobs import run_render
     from workers.signals import orderly_termination
