@@ -72,7 +72,8 @@ class StagePlace:
         names = [view.name for view in self.photographs.views]
         if name not in names:
             raise ConfigError(f"{name}: the run has no photograph of this name.")
-        view, info = (of[names.index(name)] for of in (self.photographs.views, self.photographs.image_infos))
+        view = self.photographs.views[names.index(name)]
+        info = self.photographs.image_infos[names.index(name)]
         at = np.array(pixel) * [view.width_px / info.width_px, view.height_px / info.height_px]
         direction = self.photographs.cameras[view.camera_index].directions_cam(at[None])[0]
         inside = (at >= 0).all() and at[0] <= view.width_px and at[1] <= view.height_px

@@ -109,6 +109,7 @@ class ShadowRays(NamedTuple):
         t_max: up to where something may be in the way.
         lit: what is added where the way is free, times the transmittance of what is in it.
         lost: what is added (it is negative) where a mesh is in the way of light that would have come.
+        straight: whether glass in the way lets light straight through, as no path could find it otherwise.
     """
 
     origins_world: Float32[np.ndarray, "n 3"]
@@ -116,6 +117,7 @@ class ShadowRays(NamedTuple):
     t_max: Float32[np.ndarray, " n"]
     lit: Float32[np.ndarray, "n 3"]
     lost: Float32[np.ndarray, "n 3"]
+    straight: Bool[np.ndarray, " n"]
 
 
 class View(NamedTuple):
@@ -166,5 +168,5 @@ def new_shadow_rays(count: int) -> ShadowRays:
     """Shadow rays that bring nothing."""
     return ShadowRays(
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.float32),
-        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32),
+        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.bool_),
     )  # fmt: skip

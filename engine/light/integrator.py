@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from engine.light.arrays import Paths, Rules, ShadowRays, View, new_paths, new_shadow_rays
 from engine.light.film import Film
 from engine.light.kernels_layer import add_layer_light, meet_layers
 from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
 from engine.light.layers import GaussianLayers
+from engine.light.shadows import let_through, shadow_rays
 from engine.light.stage import Integrator
 from engine.light.staging import LitMeshes
 from engine.rays import ImageRays, RayBatch
@@ -165,12 +166,11 @@ class PathTracer:
         asked = np.flatnonzero(shadows.lit.any(axis=1))
         if len(asked) == 0:
             return
-        free = self._free(shadows, asked)
-        share = free.astype(np.float32)
+        share = let_through(self._scene.meshes, shadows, asked)
         layers = self._scene.layers
-        if layers is not None and layers.on_meshes is not None:
-            open_ways = asked[free]
-            share[free] = layers.on_meshes.transmittance(_rays(shadows, open_ways))
+        free = share.any(axis=1)
+        if layers is not None and layers.on_meshes is not None and free.any():
+            share[free] *= layers.on_meshes.transmittance(shadow_rays(shadows, asked[free]))[:, None]
         self._share(add_lit, len(asked), paths, active[asked], shadows.lit[asked], share)
 
     def _add_layer_light(
@@ -180,17 +180,18 @@ class PathTracer:
         asked = np.flatnonzero(shadows.lit.any(axis=1) | shadows.lost.any(axis=1))
         if len(asked) == 0:
             return
-        free = self._free(shadows, asked)
+        share = let_through(self._scene.meshes, shadows, asked)
+        free, whole = share.any(axis=1), (share == 1.0).all(axis=1)
         through = np.ones((2, len(asked)), np.float32)
         for row, tracer in enumerate((layers.on_gaussians, layers.not_on_gaussians)):
             # What nobody keeps off needs no tracing where nothing else would count it.
-            needed = free if row == 0 else ~free | (layers.on_gaussians is not None)
+            needed = free if row == 0 else ~whole | (layers.on_gaussians is not None)
             if tracer is not None and needed.any():
-                rays = _rays(shadows, asked[needed], layers.shadow_bias)
+                rays = shadow_rays(shadows, asked[needed], layers.shadow_bias)
                 through[row, needed] = tracer.transmittance(rays)
         self._share(
             add_layer_light, len(asked), paths, active[asked], shadows.lit[asked], shadows.lost[asked],
-            free.astype(np.float32), through[0], through[1],
+            share, through[0], through[1],
         )  # fmt: skip
 
     def _share(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:
@@ -203,15 +204,6 @@ class PathTracer:
         tasks = [self._pool.submit(kernel, *cut, *arguments) for cut in pairwise(cuts)]
         for task in tasks:
             task.result()
-
-    def _free(self, shadows: ShadowRays, asked: np.ndarray) -> Bool[np.ndarray, " n"]:
-        return ~self._scene.meshes.triangles.occluded(_rays(shadows, asked))
-
-
-def _rays(shadows: ShadowRays, which: np.ndarray, t_min: float = 0.0) -> RayBatch:
-    return RayBatch(
-        shadows.origins_world[which], shadows.directions_world[which], t_min, shadows.t_max[which]
-    )
 
 
 def _axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:

@@ -32,6 +32,7 @@ from engine.light.kernels_random import uniform_pair
 from engine.light.kernels_surface import unit
 
 NOTHING = 1e-6
+ONE_SURFACE = 0.05
 SHADOWED, RELIT, AMBIENT = 0, 1, 2
 """Features of Gaussians: share that shadows take, share that is relit, and that times its ambient part."""
 
@@ -75,7 +76,10 @@ def meet_layers(
         clear = paths.marks[p] & CLEAR != 0
         shadowed, relit = features[k, SHADOWED] / share, features[k, RELIT] / share
         base = 1.0 - relit + features[k, AMBIENT] / share
-        distance = depth_median[k] if depth_median[k] > 0.0 else depth_sum[k] / share
+        # The mean distance is smoother than the median, but lies in the air where the layer is two surfaces.
+        distance = depth_sum[k] / share
+        if abs(distance - depth_median[k]) > ONE_SURFACE * depth_median[k] and depth_median[k] > 0.0:
+            distance = depth_median[k]
         b_r, b_g, b_b = beyond(lights, environment, rules, paths.marks[p], d[0], d[1], d[2])
         # --- what one unit of the layer's light counts, and how its colour is lit ---
         if clear:
@@ -116,6 +120,7 @@ def meet_layers(
                 shadows.directions_world[k, 0] = w_x
                 shadows.directions_world[k, 1] = w_y
                 shadows.directions_world[k, 2] = w_z
+                shadows.straight[k] = True
                 shadows.t_max[k] = reach * SHORT_OF_LIGHT if reach < FAR else math.inf
         if clear:
             for channel in range(3):
@@ -152,14 +157,14 @@ def meet_layers(
 def add_layer_light(first, last, paths, active, lit, lost, free, through_casters, through_others):
     """Add what shadow rays of layers brought.
 
-    ``free`` is 1 where no mesh is in the way, ``through_casters`` and ``through_others`` are transmittances
-    of the Gaussians that cast shadows on Gaussians and of those that do not.
+    ``free`` is the share in each channel that meshes let through, ``through_casters`` and ``through_others``
+    are transmittances of the Gaussians that cast shadows on Gaussians and of those that do not.
     """
     for k in range(first, last):
         p = active[k]
-        reached = free[k] * through_casters[k]
-        taken = through_others[k] * (1.0 - reached)
         for channel in range(3):
+            reached = free[k, channel] * through_casters[k]
+            taken = through_others[k] * (1.0 - reached)
             amount = lit[k, channel] * reached + lost[k, channel] * taken
             if paths.marks[p] & CLEAR:
                 paths.shade[p, channel] += amount

@@ -310,6 +310,7 @@ def meet_surfaces(
                             materials.mirror, coat, coat_mean,
                         )  # fmt: skip
                     factor = 1.0 / share
+                    shadows.straight[k] = l_pdf == 0.0
                     if l_pdf > 0.0:
                         l_pdf *= share
                         factor = 1.0 / (l_pdf + pdf) if lights.seen[l] else 1.0 / l_pdf
@@ -366,4 +367,4 @@ def add_lit(first, last, paths, active, lit, share):
     """Add what shadow rays brought: ``lit`` times the share of it that got through."""
     for k in range(first, last):
         for channel in range(3):
-            paths.radiance_linear[active[k], channel] += lit[k, channel] * share[k]
+            paths.radiance_linear[active[k], channel] += lit[k, channel] * share[k, channel]

@@ -18,7 +18,7 @@ from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer, TraceResult, TraceSettings
 
 FEATURES = 3
-BIAS_OF_SIZE = 0.01
+BIAS_OF_SIZE = 0.03
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def stage_layers(
         read: reads a file of Gaussians.
         folder: where files are relative to.
         settings: where rays are cut off.
-        size: of the scene, world units; the bias of shadows is a hundredth of it unless the stage says else.
+        size: of the scene, world units; the bias of shadows is 3 % of it unless the stage says else.
         threads: for building and tracing; 0 takes all.
 
     Raises:

@@ -53,7 +53,7 @@ def read_shape(path: Path) -> Shape:
     if mesh.uv is not None:
         uv = np.nan_to_num(mesh.uv)
         if path.suffix.lower() != ".glb":
-            uv = uv * np.float32([1, -1]) + np.float32([0, 1])  # counted from the lower left
+            uv = uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)  # from the lower left
         uv = uv[mesh.triangles].astype(np.float32)
     return Shape(mesh.vertices, mesh.triangles, uv)
 
@@ -156,7 +156,9 @@ def _sphere() -> Shape:
 
 
 def _cube() -> Shape:
-    vertices, faces, uv = [], [], []
+    vertices: list[Float64[np.ndarray, 3]] = []
+    faces: list[list[int]] = []
+    uv: list[list[list[int]]] = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
             n = np.eye(3)[axis] * sign

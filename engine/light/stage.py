@@ -328,7 +328,7 @@ class StageGaussians(Placed):
         shadows_on_gaussians: whether they keep light off the Gaussians. Trained colours hold the scene's
             own shadows already.
         shadow_bias: Gaussians nearer than this to a lit point cast no shadow on it, world units; None takes
-            a hundredth of the scene's size.
+            3 % of the scene's size.
     """
 
     file: str | None = None

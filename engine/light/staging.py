@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
 from engine.colour import srgb_to_linear
 from engine.errors import ConfigError, DatasetError
@@ -42,6 +42,9 @@ class LitMeshes:
     Attributes:
         surfaces: all triangles, those of visible rectangle lights included.
         triangles: what rays are sent through.
+        obstacles: the same without glass; None where there is no glass.
+        glass: glass alone, its faces in the order of ``glass_faces``.
+        glass_faces: rows in the surfaces.
         materials: of the triangles.
         lights: of the stage; the environment is the last of them.
         environment_visible: whether the camera sees the environment.
@@ -52,6 +55,9 @@ class LitMeshes:
     materials: Materials
     lights: LightArrays
     environment_visible: bool
+    obstacles: TriangleScene | None = None
+    glass: TriangleScene | None = None
+    glass_faces: Int64[np.ndarray, " g"] | None = None
 
 
 def stage_meshes(stage: Stage, folder: Path, *, threads: int = 0) -> LitMeshes:
@@ -103,12 +109,18 @@ def stage_meshes(stage: Stage, folder: Path, *, threads: int = 0) -> LitMeshes:
     )
     points = surfaces.corners_world.reshape(-1, 3)
     faces = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
+    materials = table.arrays()
+    is_glass = materials.kinds[surfaces.materials] == GLASS
+    some = bool(is_glass.any())
     return LitMeshes(
         surfaces,
         TriangleScene(points, faces, threads=threads),
-        table.arrays(),
+        materials,
         light_arrays(stage.lights, up, environment),
         stage.environment is not None and stage.environment.visible,
+        TriangleScene(points, faces[~is_glass], threads=threads) if some else None,
+        TriangleScene(points, faces[is_glass], threads=threads) if some else None,
+        np.flatnonzero(is_glass) if some else None,
     )
 
 
@@ -153,7 +165,7 @@ def stage_shape(mesh: StageMesh, number: int, folder: Path) -> Shape:
         SceneFileError: its file cannot be read.
     """
     if mesh.shape is not None:
-        shape, name = simple_shape(mesh.shape), mesh.shape
+        shape, name = simple_shape(mesh.shape), str(mesh.shape)
     else:
         assert mesh.file is not None
         shape, name = read_shape(folder / mesh.file), str(folder / mesh.file)
@@ -174,7 +186,7 @@ def _rectangle(light: RectangleLight, up_world: Float64[np.ndarray, "3"]) -> Flo
     return np.array([[corners[0], corners[1], corners[2]], [corners[0], corners[2], corners[3]]], np.float32)
 
 
-_DEFAULTS = {
+_DEFAULTS: dict[str, np.ndarray] = {
     "kinds": np.array(DIFFUSE, np.int32),
     "colours_linear": np.ones(3),
     "metallic": np.array(0.0),

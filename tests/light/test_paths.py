@@ -186,6 +186,18 @@ def test_depth_of_field_blurs_what_is_not_in_focus(tmp_path: Path) -> None:
     assert 6 <= edge_width(8.0 / 3.0) <= 14
 
 
+def test_light_of_a_point_goes_straight_through_a_pane(tmp_path: Path) -> None:
+    floor = StageMesh(shape="plane", position=(0, 1, 0), scale=9, material=Diffuse(colour_srgb=WHITE))
+    pane = StageMesh(
+        shape="cube", scale=(3, 0.5, 3), position=(0, -2, 0), material=Glass(ior=1.5, absorption=(0.5, 0, 0))
+    )
+    sun = DirectionalLight(direction=(0, 1, 0), irradiance=np.pi / 2)
+    numbers = Integrator(samples=1, max_depth=1, anti_aliasing=False)
+    stage = Stage(gaussians=(), meshes=(floor, pane), lights=(sun,), integrator=numbers)
+    seen = film_of(stage, camera((-3, 0.5, 0), (0, 1, 0), (3, 3), 1e-3), tmp_path).image().rgb_linear
+    np.testing.assert_allclose(seen.mean(axis=(0, 1)), 0.5 * 0.96**2 * np.exp([-0.5, 0, 0]), rtol=1e-4)
+
+
 def test_glass_that_is_open_and_a_camera_inside_glass_are_refused(tmp_path: Path) -> None:
     ball = StageMesh(shape="sphere", material=Glass())
     meshes = stage_meshes(Stage(gaussians=(), meshes=(ball,)), tmp_path)
