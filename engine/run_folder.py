@@ -14,6 +14,11 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 
 
+def is_run(source: Path) -> bool:
+    """Whether a command was given the folder of a run, not a file or the folder of an unpacked SOG."""
+    return source.is_dir() and not (source / "meta.json").exists()
+
+
 def run_scene(output: Path) -> Path:
     """The scene folder that a run was made from.
 

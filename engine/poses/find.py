@@ -7,7 +7,6 @@ import select
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from typing import IO, Any
 
 from engine.errors import Cancelled, DatasetError, PosesCrashed
 from engine.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
+from engine.isolated_python import python_command
 from engine.poses.config import DEFAULT_CONFIG, FOUND, RECORD, PosesConfig, Request
 from engine.poses.photographs import photographs_in, photographs_sha256
 from engine.writing import write_json
@@ -159,8 +159,8 @@ class _Waiting:
 def _process(request: Request, noise: IO[bytes]) -> Iterator["subprocess.Popen[bytes]"]:
     """The process at work; killed in the end, whatever happens. In the caller's group, to die with it."""
     environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1")}  # COLMAP has threads of its own
-    process = subprocess.Popen(
-        [sys.executable, "-I", "-m", "engine.poses.child"],
+    process = subprocess.Popen(  # noqa: S603 - a program of ours
+        python_command("engine.poses.child"),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=noise,

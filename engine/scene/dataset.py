@@ -73,11 +73,6 @@ class Dataset:
         self.record: ViewsRecord = views_record(scene, cache.digests, self.test_indices)
         self.has_masks: bool = len(cache.mask.values) > 0
         self._mask_is_alpha = masks == "alpha"
-        if self._mask_is_alpha and not self.has_masks:
-            raise DatasetError(
-                f"{scene.root} has no masks to take as the alpha; put them into "
-                f"{scene.root / 'masks'}/<image name>.png, or leave masks at ignore."
-            )
         self.has_alpha: bool = len(cache.alpha.values) > 0 or (self._mask_is_alpha and self.has_masks)
         self._cache = cache
         self._tables = tables

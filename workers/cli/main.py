@@ -27,6 +27,7 @@ from workers.cli.commands.quota import quota
 from workers.cli.commands.reconstruct import reconstruct
 from workers.cli.commands.render import render
 from workers.cli.commands.serve import serve
+from workers.cli.commands.stage import stage
 from workers.cli.commands.surface import surface
 from workers.cli.commands.token import token
 from workers.cli.commands.transform import transform
@@ -85,7 +86,7 @@ def cli() -> None:
 
 
 for _command in (
-    reconstruct, evaluate, export, import_, render, surface,
+    reconstruct, evaluate, export, import_, render, stage, surface,
     edit, deform, transform, crop, merge, clean, demo,
     serve, worker, token, fsck, quota, *CLIENT_COMMANDS,
 ):  # fmt: skip

@@ -82,8 +82,3 @@ def exports_option(command: F) -> F:
 def background_option(help_text: str) -> Callable[[F], F]:
     """``--background black|white``."""
     return click.option("--background", type=click.Choice(["black", "white"]), default=None, help=help_text)
-
-
-def is_run(source: Path) -> bool:
-    """Whether a command was given the folder of a run, not a file or the folder of an unpacked SOG."""
-    return source.is_dir() and not (source / "meta.json").exists()

@@ -1,12 +1,13 @@
 """Scenes that commands are given: read, with a word on stderr about what reading lost."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import click
 
-from engine.files import lost_channels, read_scene
-from engine.gaussians.flattening import ImportReport
+from engine.files import lost_channels
 from engine.gaussians.model import FlatGaussians
+from workers.telling.losses import open_scene as read_telling
 
 
 def open_scene(path: Path, *, drop_invalid: bool = False, quiet: bool = False) -> FlatGaussians:
@@ -20,11 +21,17 @@ def open_scene(path: Path, *, drop_invalid: bool = False, quiet: bool = False) -
     Raises:
         SceneFileError: the file cannot be read.
     """
-    gaussians, report = read_scene(path, drop_invalid=drop_invalid)
-    for line in losses(path, report):
+    return read_telling(path, speaker_of_losses(quiet), drop_invalid=drop_invalid)
+
+
+def speaker_of_losses(quiet: bool) -> Callable[[str], None]:
+    """Tells on stderr what reading lost; if ``quiet``, only what changes the look."""
+
+    def say(line: str) -> None:
         if not quiet or line.startswith("Warning"):
             click.echo(line, err=True)
-    return gaussians
+
+    return say
 
 
 def warn_of_lost_channels(gaussians: FlatGaussians, target: Path, format_name: str | None = None) -> None:
@@ -35,23 +42,3 @@ def warn_of_lost_channels(gaussians: FlatGaussians, target: Path, format_name: s
     """
     if text := lost_channels(gaussians, target, format_name):
         click.echo(f"Warning: {text}", err=True)
-
-
-def losses(path: Path, report: ImportReport) -> tuple[str, ...]:
-    """What was lost, a sentence each; those that change the look begin with ``Warning:``."""
-    lines = []
-    if report.dropped:
-        lines.append(f"{path}: {report.dropped:,} Gaussians without finite values were left out.")
-    if report.saturated:
-        lines.append(f"{path}: {report.saturated:,} opacities of exactly 0 or 1 were made finite.")
-    if report.flattened:
-        loss = (
-            f"{path}: {report.flattened:,} of {report.count:,} Gaussians were not flat and lost their "
-            f"smallest extent, which was {report.median_thickness:.2g} of the next one in the median"
-        )
-        if 2 * report.thick > report.flattened:
-            lines.append(f"Warning: {loss}; as flat Gaussians the scene will look different.")
-        else:
-            lines.append(f"{loss}.")
-    lines.extend(f"{path}: {note}" for note in report.notes)
-    return tuple(lines)

@@ -14,14 +14,13 @@ from engine.files import check_surface_path, write_surface
 from engine.files.gaussian_ply import read_near_world
 from engine.gaussians.model import FlatGaussians
 from engine.render.cameras import RenderCamera
-from engine.run_folder import CONFIG, SCENE, run_viewpoints
+from engine.run_folder import CONFIG, SCENE, is_run, run_viewpoints
 from engine.scene import load_scene
 from engine.surface.cameras import cameras_around, photograph_cameras
 from engine.surface.extract import ExtractedSurface, extract_surface
 from engine.surface.options import SurfaceOptions
 from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
-from workers.cli.options import is_run
 from workers.cli.progress import show_progress
 from workers.cli.scene_files import open_scene
 

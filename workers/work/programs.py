@@ -97,7 +97,7 @@ def export(task: Task) -> None:
 
 def render(task: Task) -> None:
     """New views of the scene of a reconstruction."""
-    from workers.cli.rendering import render_files
+    from workers.rendering.views import render_files
 
     options = RenderJobOptions.model_validate(task.options)
     target = task.results / "turntable.mp4" if options.format == "mp4" else task.results / "views"
@@ -118,7 +118,8 @@ def render(task: Task) -> None:
         "max_side": options.max_side,
         "threads": task.threads,
     }
-    render_files(options.mode, arguments, stopping(task.listener, task.should_stop))
+    tell = stopping(task.listener, task.should_stop)
+    render_files(options.mode, arguments, tell, lambda line: tell(Warned(line)))
 
 
 def _places(task: Task) -> Places:

@@ -48,8 +48,8 @@ def import_(
     from engine.files import read_scene
     from engine.files.gaussian_ply import write_gaussian_ply
     from workers.cli.progress import show_progress
-    from workers.cli.scene_files import losses
     from workers.cli.signals import orderly_termination
+    from workers.telling.losses import losses
 
     if target.suffix.lower() != ".ply":
         raise click.UsageError(f"{target} should end in .ply; octasplat export writes the other formats.")

@@ -5,8 +5,9 @@ from typing import Any
 
 import click
 
-from workers.cli.options import background_option, is_run, quiet_option, threads_option
+from workers.cli.options import background_option, quiet_option, threads_option
 
+PREVIEW_SIDE_PX = 480
 AXES = ("x", "-x", "y", "-y", "z", "-z")
 
 
@@ -50,6 +51,13 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
     type=click.Path(path_type=Path),
     help="Take the cameras of the photographs in this folder.  [default: those the run keeps]",
 )
+@click.option(
+    "--stage",
+    type=click.Path(path_type=Path),
+    metavar="STAGE.toml",
+    help="Render with the meshes, lights and materials of a stage, see docs/light.md.",
+)
+@click.option("--preview", is_flag=True, help="Stage: the first image only, -o one file, finer and finer.")
 @threads_option
 @quiet_option
 def render(**options: Any) -> None:
@@ -62,19 +70,33 @@ def render(**options: Any) -> None:
         raise click.UsageError("Choose one of --views, --turntable and --path.")
     if options["frames"] and options["seconds"]:
         raise click.UsageError("Choose one of --frames and --seconds.")
+    from engine.run_folder import is_run
+
     of_run = is_run(options["source"])
     mode = modes[0] if modes else "views" if of_run else "turntable"
     if mode == "views" and not of_run:
         raise click.UsageError("--views needs the folder of a run; a file has --turntable and --path.")
     if mode == "views" and options["output"].suffix.lower() == ".mp4":
         raise click.UsageError("--views gives images; name a folder.")
-    _check_output(options["output"], options["exr"])
+    if options["preview"]:
+        if options["stage"] is None or options["output"].suffix.lower() not in (".png", ".exr"):
+            raise click.UsageError(
+                "--preview goes with --stage and writes one .png or .exr; name it with -o."
+            )
+        options["max_side"] = options["max_side"] or PREVIEW_SIDE_PX
+    else:
+        _check_output(options["output"], options["exr"])
 
-    from workers.cli.rendering import run_render
+    from workers.cli.progress import show_progress
+    from workers.cli.scene_files import speaker_of_losses
     from workers.cli.signals import orderly_termination
+    from workers.rendering.views import render_files
 
-    with orderly_termination():
-        run_render(mode, options)
+    quiet = options["quiet"]
+    with orderly_termination(), show_progress(quiet=quiet) as listener:
+        files = render_files(mode, options, listener, speaker_of_losses(quiet))
+    if not quiet:
+        click.echo(f"Wrote {files[0]}" + (f" and {len(files) - 1} more." if len(files) > 1 else "."))
 
 
 def _check_output(output: Path, exr: bool) -> None:

@@ -1,10 +1,10 @@
-"""What ``octasplat render`` does once its options are understood."""
+"""Images and films of a scene, as the options of ``octasplat render`` or of a job say."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 from jaxtyping import Float64
 
@@ -13,6 +13,7 @@ from engine.errors import OutputError
 from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
+from engine.light.stage_file import read_stage
 from engine.render.cameras import RenderCamera
 from engine.render.jobs import (
     DEFAULT_FOV_Y_DEGREES,
@@ -28,17 +29,19 @@ from engine.render.jobs import (
 )
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
-from engine.run_folder import CONFIG, SCENE, run_viewpoints
+from engine.run_folder import CONFIG, SCENE, is_run, run_viewpoints
+from engine.scene.model import Viewpoints
 from engine.scene.views_file import SplitViewpoints
 from engine.stages import counted_stage
 from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
-from workers.cli.options import is_run
-from workers.cli.progress import show_progress
-from workers.cli.scene_files import open_scene
+from workers.rendering.stages import StagePlace, render_stage
+from workers.telling.losses import open_scene
 
 DEFAULT_FPS = 30.0
 DEFAULT_FRAMES = 120
+ANY_SIDE_PX = 1 << 30
+"""A cap that no photograph reaches."""
 
 
 @dataclass(frozen=True)
@@ -52,21 +55,16 @@ class _Source:
     viewpoints: SplitViewpoints | None = None
 
 
-def run_render(mode: str, options: dict[str, Any]) -> None:
-    """Render as the options of the command say, with the progress shown; see :func:`render_files`."""
-    with show_progress(quiet=options["quiet"]) as listener:
-        files = render_files(mode, options, listener)
-    if not options["quiet"]:
-        click.echo(f"Wrote {files[0]}" + (f" and {len(files) - 1} more." if len(files) > 1 else "."))
-
-
-def render_files(mode: str, options: dict[str, Any], listener: Listener) -> tuple[Path, ...]:
+def render_files(
+    mode: str, options: dict[str, Any], listener: Listener, say: Callable[[str], None]
+) -> tuple[Path, ...]:
     """Render as the options of the command say.
 
     Args:
         mode: ``views``, ``turntable`` or ``camera_path``.
         options: the options of the command by parameter name.
         listener: hears the progress.
+        say: told in a sentence what reading a scene has lost.
 
     Returns:
         The files written.
@@ -75,15 +73,26 @@ def render_files(mode: str, options: dict[str, Any], listener: Listener) -> tupl
         OctasplatError: the source cannot be read or the output not written.
     """
     output: Path = options["output"]
+    stage = read_stage(options["stage"]) if options.get("stage") else None
     cameras, fps = None, options["fps"] or DEFAULT_FPS
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
         cameras, fps = path.cameras, options["fps"] or path.fps
-    source = _read_run(options) if is_run(options["source"]) else _read_file(options)
+    source = _read_run(options) if is_run(options["source"]) else _read_file(options, say)
     if mode == "turntable":
         cameras = _turntable(source, options, fps)
     if cameras is not None:
         cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
+    background = background_colour(options["background"] or source.background)
+    if stage is not None:
+        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
+        place = StagePlace(
+            source.gaussians, source.settings, _full_size(options), options["stage"].parent,
+            lambda path: open_scene(path, say), background, options["threads"],
+        )  # fmt: skip
+        film = fps if output.suffix.lower() == ".mp4" else None
+        names = None if options.get("preview") else _FileNames(output, options["exr"])
+        return render_stage(stage, place, shots, output, names, film, listener)
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
     background = background_colour(options["background"] or source.background)
@@ -123,10 +132,40 @@ def _read_run(options: dict[str, Any]) -> _Source:
     )
 
 
-def _read_file(options: dict[str, Any]) -> _Source:
+def _read_file(options: dict[str, Any], say: Callable[[str], None]) -> _Source:
     path: Path = options["source"]
-    gaussians = open_scene(path, quiet=options["quiet"])
+    gaussians = open_scene(path, say)
     return _Source(gaussians, TraceSettings(), read_near_world(path))
+
+
+def stage_place(
+    source: Path, scene: Path | None, up: str | None, say: Callable[[str], None]
+) -> tuple[StagePlace, Float64[np.ndarray, "3"] | None]:
+    """The scene of a run or file in which a stage is to be set, and the direction that is named as up.
+
+    Args:
+        source: folder of a run, or file.
+        scene: where the run's photographs are, if their cameras are to be read there.
+        up: an axis by name.
+        say: told in a sentence what reading a scene has lost.
+
+    Raises:
+        OctasplatError: the source cannot be read.
+    """
+    options = {"source": source, "scene": scene, "max_side": None}
+    found = _read_run(options) if is_run(source) else _read_file(options, say)
+    place = StagePlace(
+        found.gaussians, found.settings, _full_size(options), source.parent,
+        lambda path: open_scene(path, say), background_colour(found.background), 0,
+    )  # fmt: skip
+    return place, None if up is None else _axis(up)
+
+
+def _full_size(options: dict[str, Any]) -> Viewpoints | None:
+    """Where the photographs of a run were taken from, at their full size; None of a file."""
+    if not is_run(options["source"]):
+        return None
+    return run_viewpoints(options["source"], scene=options["scene"], max_side=ANY_SIDE_PX)
 
 
 def _turntable(source: _Source, options: dict[str, Any], fps: float) -> tuple[RenderCamera, ...]:

@@ -1,0 +1,172 @@
+"""What the path tracer's kernels read and write, as named tuples of arrays."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
+
+
+class Surfaces(NamedTuple):
+    """All triangles of a stage.
+
+    Attributes:
+        corners_world: of each face.
+        corner_normals: shading normals at the corners, unit vectors.
+        corner_uv: texture coordinates at the corners, (0, 0) at the upper left.
+        materials: row of each face in :class:`Materials`.
+    """
+
+    corners_world: Float32[np.ndarray, "f 3 3"]
+    corner_normals: Float32[np.ndarray, "f 3 3"]
+    corner_uv: Float32[np.ndarray, "f 3 2"]
+    materials: Int32[np.ndarray, " f"]
+
+
+class Materials(NamedTuple):
+    """``m`` materials.
+
+    Attributes:
+        kinds: which of the kinds of :mod:`engine.light.kernels_surface`.
+        colours_linear: base colour, reflectance or tint.
+        metallic: share of the metal.
+        roughness: perceptual.
+        iors: index of refraction.
+        absorption: per world unit.
+        grounds: how the ground shares light with the coat.
+        kept: whether light that facets throw at each other is kept.
+        coats: which of the tables the coat has.
+        colour_textures: number of a texture, -1 for none.
+        metallic_roughness_textures: likewise.
+        lights: number of the light that a shining surface is.
+        mirror: table of facets that reflect everything.
+        coat: tables of dielectrics' surfaces.
+        coat_means: their means.
+        texels_linear: all textures' values, one texture after another.
+        texture_sizes: first texel, height and width of each.
+    """
+
+    kinds: Int32[np.ndarray, " m"]
+    colours_linear: Float64[np.ndarray, "m 3"]
+    metallic: Float64[np.ndarray, " m"]
+    roughness: Float64[np.ndarray, " m"]
+    iors: Float64[np.ndarray, " m"]
+    absorption: Float64[np.ndarray, "m 3"]
+    grounds: Int32[np.ndarray, " m"]
+    kept: Int32[np.ndarray, " m"]
+    coats: Int32[np.ndarray, " m"]
+    colour_textures: Int32[np.ndarray, " m"]
+    metallic_roughness_textures: Int32[np.ndarray, " m"]
+    lights: Int32[np.ndarray, " m"]
+    mirror: Float64[np.ndarray, "a c"]
+    coat: Float64[np.ndarray, "t a c"]
+    coat_means: Float64[np.ndarray, "t a 2"]
+    texels_linear: Float32[np.ndarray, "x 3"]
+    texture_sizes: Int64[np.ndarray, "k 3"]
+
+
+class Paths(NamedTuple):
+    """``p`` paths from the camera: what they have gathered, and where they go on.
+
+    Attributes:
+        keys: what a pixel's numbers begin from.
+        samples: number of the path in its pixel.
+        origins_world: where the next ray begins.
+        directions_world: where it goes, unit vectors.
+        weights: what light that it brings still counts, per channel.
+        radiance_linear: light of the surfaces and surroundings behind the first layer.
+        layer_srgb: display colours of the Gaussians of the first layer, premultiplied.
+        transmittance: what the first layer lets through.
+        shade: sum over the first layer of coverage times the factor that the stage's lights give to it.
+        coverage: 1 less what is seen of the background behind everything.
+        densities: of the last direction over solid angle; 0 for the camera, mirrors and glass.
+        inside: material that the path is in, -1 for air.
+        marks: bits of :mod:`engine.light.kernels_path`.
+        alive: whether the path goes on.
+    """
+
+    keys: UInt32[np.ndarray, " p"]
+    samples: Int32[np.ndarray, " p"]
+    origins_world: Float32[np.ndarray, "p 3"]
+    directions_world: Float32[np.ndarray, "p 3"]
+    weights: Float32[np.ndarray, "p 3"]
+    radiance_linear: Float32[np.ndarray, "p 3"]
+    layer_srgb: Float32[np.ndarray, "p 3"]
+    transmittance: Float32[np.ndarray, " p"]
+    shade: Float32[np.ndarray, "p 3"]
+    coverage: Float32[np.ndarray, " p"]
+    densities: Float32[np.ndarray, " p"]
+    inside: Int32[np.ndarray, " p"]
+    marks: Int32[np.ndarray, " p"]
+    alive: Bool[np.ndarray, " p"]
+
+
+class ShadowRays(NamedTuple):
+    """Rays from ``n`` lit points to lights, and what they bring where nothing is in the way.
+
+    Attributes:
+        origins_world: the points.
+        directions_world: unit vectors to the lights.
+        t_max: up to where something may be in the way.
+        lit: what is added where the way is free, times the transmittance of what is in it.
+        lost: what is added (it is negative) where a mesh is in the way of light that would have come.
+        straight: whether glass in the way lets light straight through, as no path could find it otherwise.
+    """
+
+    origins_world: Float32[np.ndarray, "n 3"]
+    directions_world: Float32[np.ndarray, "n 3"]
+    t_max: Float32[np.ndarray, " n"]
+    lit: Float32[np.ndarray, "n 3"]
+    lost: Float32[np.ndarray, "n 3"]
+    straight: Bool[np.ndarray, " n"]
+
+
+class View(NamedTuple):
+    """A camera's rays.
+
+    Attributes:
+        origin_world: where they begin.
+        directions_world: unit vectors through the centres of the pixels.
+        axis: the camera's axis.
+        aperture: diameter of the lens.
+        focus_distance: along the axis.
+    """
+
+    origin_world: Float64[np.ndarray, "3"]
+    directions_world: Float32[np.ndarray, "h w 3"]
+    axis: Float64[np.ndarray, "3"]
+    aperture: float
+    focus_distance: float
+
+
+class Rules(NamedTuple):
+    """The numbers of an integrator that the kernels read; see :class:`engine.light.stage.Integrator`."""
+
+    seed: int
+    max_depth: int
+    roulette_depth: int
+    clamp: float
+    anti_aliasing: bool
+    environment_visible: bool
+    background_linear: Float64[np.ndarray, "3"]
+
+
+def new_paths(count: int) -> Paths:
+    """Paths of which nothing is known."""
+
+    def vectors() -> Float32[np.ndarray, "p 3"]:
+        return np.empty((count, 3), np.float32)
+
+    return Paths(
+        np.empty(count, np.uint32), np.empty(count, np.int32),
+        vectors(), vectors(), vectors(), vectors(), vectors(),
+        np.empty(count, np.float32), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
+        np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.bool_),
+    )  # fmt: skip
+
+
+def new_shadow_rays(count: int) -> ShadowRays:
+    """Shadow rays that bring nothing."""
+    return ShadowRays(
+        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.float32),
+        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.bool_),
+    )  # fmt: skip

@@ -1,0 +1,90 @@
+"""Numbers that look random and are a pure function of (seed, pixel, sample, dimension).
+
+Each pair of dimensions is a Sobol sequence over the samples of a pixel, its order and its digits scrambled
+by hashes: "Practical Hash-based Owen Scrambling" (Burley 2020, https://jcgt.org/published/0009/04/01/). So a
+pixel's samples are spread evenly, no two pixels alike, and the number of threads or the order of the work
+cannot matter.
+"""
+
+import numpy as np
+from numba import njit
+
+SCALE = 2.0**-32
+BELOW_ONE = 1.0 - 2.0**-24
+
+
+@njit(error_model="numpy", inline="always")
+def hashed(x):
+    """32 well mixed bits of a uint32."""
+    x = np.uint32(x)
+    x = np.uint32((x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D))
+    x = np.uint32((x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B))
+    return np.uint32(x ^ (x >> np.uint32(16)))
+
+
+@njit(error_model="numpy")
+def reversed_bits(x):
+    """The bits of a uint32 in the opposite order."""
+    x = np.uint32(x)
+    x = np.uint32((x << np.uint32(16)) | (x >> np.uint32(16)))
+    x = np.uint32(
+        ((x & np.uint32(0x00FF00FF)) << np.uint32(8)) | ((x & np.uint32(0xFF00FF00)) >> np.uint32(8))
+    )
+    x = np.uint32(
+        ((x & np.uint32(0x0F0F0F0F)) << np.uint32(4)) | ((x & np.uint32(0xF0F0F0F0)) >> np.uint32(4))
+    )
+    x = np.uint32(
+        ((x & np.uint32(0x33333333)) << np.uint32(2)) | ((x & np.uint32(0xCCCCCCCC)) >> np.uint32(2))
+    )
+    return np.uint32(
+        ((x & np.uint32(0x55555555)) << np.uint32(1)) | ((x & np.uint32(0xAAAAAAAA)) >> np.uint32(1))
+    )
+
+
+@njit(error_model="numpy")
+def _upwards(x, seed):
+    """Change each bit by a hash of the bits below it (Laine and Karras)."""
+    x = np.uint32(x + seed)
+    x = np.uint32(x ^ np.uint32(x * np.uint32(0x6C50B47C)))
+    x = np.uint32(x ^ np.uint32(x * np.uint32(0xB82F1E52)))
+    x = np.uint32(x ^ np.uint32(x * np.uint32(0xC7AFE638)))
+    return np.uint32(x ^ np.uint32(x * np.uint32(0x8D22F6E6)))
+
+
+@njit(error_model="numpy")
+def sobol_pair(index):
+    """The first two dimensions of Sobol's sequence, as uint32 fractions."""
+    first = reversed_bits(index)
+    second = np.uint32(first ^ (first << np.uint32(16)))
+    # Pascal's triangle modulo 2 as a product of five sparse matrices.
+    second = np.uint32(second ^ ((second & np.uint32(0x00FF00FF)) << np.uint32(8)))
+    second = np.uint32(second ^ ((second & np.uint32(0x0F0F0F0F)) << np.uint32(4)))
+    second = np.uint32(second ^ ((second & np.uint32(0x33333333)) << np.uint32(2)))
+    second = np.uint32(second ^ ((second & np.uint32(0x55555555)) << np.uint32(1)))
+    return first, second
+
+
+@njit(error_model="numpy")
+def pixel_key(seed, pixel):
+    """What the numbers of a pixel begin from."""
+    return hashed(np.uint32(hashed(np.uint32(seed)) + np.uint32(0x9E3779B9) * np.uint32(pixel)))
+
+
+@njit(error_model="numpy")
+def uniform_pair(key, sample, pair):
+    """Two numbers in [0, 1) for number ``sample`` (below 65,536) in the pair of dimensions ``pair``."""
+    seed = hashed(np.uint32(key + np.uint32(0x85EBCA6B) * np.uint32(pair + 1)))
+    # The order is scrambled within its 16 bits, so that the first 2^k samples stay a whole block.
+    place = np.uint32(sample) << np.uint32(16)
+    place = reversed_bits(_upwards(reversed_bits(place), seed)) >> np.uint32(16)
+    first, second = sobol_pair(place)
+    first = reversed_bits(_upwards(reversed_bits(first), hashed(np.uint32(seed ^ np.uint32(0x68E31DA4)))))
+    second = reversed_bits(_upwards(reversed_bits(second), hashed(np.uint32(seed ^ np.uint32(0xB5297A4D)))))
+    return min(first * SCALE, BELOW_ONE), min(second * SCALE, BELOW_ONE)
+
+
+@njit(cache=True)
+def fill_uniform(seed, pixels, samples, pair, out):
+    """The numbers of many (pixel, sample), for tests and for what draws them outside of the kernels."""
+    for i in range(len(pixels)):
+        out[i, 0], out[i, 1] = uniform_pair(pixel_key(seed, pixels[i]), samples[i], pair)

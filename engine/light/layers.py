@@ -1,0 +1,137 @@
+"""The Gaussians of a stage as the path tracer sees them: layers on rays, and what they keep off."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from engine.edit.affine import scaling, transform, translation
+from engine.errors import ConfigError
+from engine.gaussians.model import FlatGaussians, concatenate
+from engine.light.kernels_layer import AMBIENT, RELIT, SHADOWED
+from engine.light.meshes import rotation_matrix
+from engine.light.stage import Stage, StageGaussians
+from engine.rays import RayBatch
+from engine.trace.make import make_tracer
+from engine.trace.protocol import Tracer, TraceResult, TraceSettings
+
+FEATURES = 3
+BIAS_OF_SIZE = 0.03
+
+
+@dataclass(frozen=True)
+class GaussianLayers:
+    """Gaussians, with features that say how they take light.
+
+    Attributes:
+        tracer: all Gaussians, with the features of :mod:`engine.light.kernels_layer`.
+        spent_below: transmittance at which a ray counts as ended.
+        on_meshes: those that cast shadows on meshes; None where none do.
+        on_gaussians: those that cast shadows on Gaussians.
+        not_on_gaussians: those that do not; the light that they keep off is in the colours already.
+        shadow_bias: Gaussians nearer than this to a lit layer keep nothing off it, world units.
+    """
+
+    tracer: Tracer
+    spent_below: float
+    on_meshes: Tracer | None = None
+    on_gaussians: Tracer | None = None
+    not_on_gaussians: Tracer | None = None
+    shadow_bias: float = 0.0
+
+    def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
+        """What lies on rays up to a distance each."""
+        return self.tracer.trace(RayBatch(rays.origins_world, rays.directions_world, rays.t_min, t_max))
+
+
+def stage_layers(
+    stage: Stage,
+    main: FlatGaussians | None,
+    read: Callable[[Path], FlatGaussians],
+    folder: Path,
+    settings: TraceSettings,
+    *,
+    size: float,
+    threads: int = 0,
+) -> GaussianLayers | None:
+    """The Gaussian scenes of a stage, placed, joined and ready to be traced; None where it has none.
+
+    Args:
+        stage: what to read.
+        main: the scene that is rendered, for entries that name no file.
+        read: reads a file of Gaussians.
+        folder: where files are relative to.
+        settings: where rays are cut off.
+        size: of the scene, world units; the bias of shadows is 3 % of it unless the stage says else.
+        threads: for building and tracing; 0 takes all.
+
+    Raises:
+        ConfigError: an entry without a file, and no scene is rendered.
+        SceneFileError: a file cannot be read.
+    """
+    parts, features, on_meshes, on_gaussians, biases = [], [], [], [], []
+    for number, scene in enumerate(stage.gaussians):
+        if scene.file is None and main is None:
+            raise ConfigError(f"gaussians[{number}]: name a file; no scene is rendered here.")
+        gaussians = main if scene.file is None else read(folder / scene.file)
+        assert gaussians is not None
+        parts.append(moved(gaussians, scene))
+        features.append(np.tile(_features(scene), (len(gaussians), 1)))
+        on_meshes.append(np.full(len(gaussians), scene.shadows_on_meshes))
+        on_gaussians.append(np.full(len(gaussians), scene.shadows_on_gaussians))
+        biases.append(BIAS_OF_SIZE * size if scene.shadow_bias is None else scene.shadow_bias)
+    if not parts:
+        return None
+    whole = concatenate(same_degree(parts))
+    tracer = make_tracer(settings, threads=threads, build_quality=2)
+    tracer.build(whole, np.concatenate(features).astype(np.float32))
+
+    def caster(chosen: Bool[np.ndarray, " n"]) -> Tracer | None:
+        if chosen.all() or not chosen.any():
+            return tracer if chosen.any() else None
+        some = make_tracer(settings, threads=threads, build_quality=2)
+        some.build(whole.select(chosen))
+        return some
+
+    casting = np.concatenate(on_gaussians)
+    return GaussianLayers(
+        tracer,
+        settings.transmittance_min,
+        caster(np.concatenate(on_meshes)),
+        caster(casting),
+        caster(~casting),
+        max(biases),
+    )
+
+
+def moved(gaussians: FlatGaussians, place: StageGaussians) -> FlatGaussians:
+    """Gaussians scaled, turned and moved; the very same ones where nothing is to be done."""
+    assert isinstance(place.scale, float | int)
+    if place.scale == 1.0 and not any(place.rotation_degrees) and not any(place.position):
+        return gaussians
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrix(place.rotation_degrees)
+    matrix = translation(np.array(place.position)) @ matrix @ scaling(np.full(3, place.scale))
+    return transform(gaussians, matrix)
+
+
+def same_degree(parts: Sequence[FlatGaussians]) -> list[FlatGaussians]:
+    """The parts with harmonics of the highest degree among them, the missing ones 0."""
+    most = max(part.sh.shape[1] for part in parts)
+    return [
+        part
+        if part.sh.shape[1] == most
+        else replace(part, sh=np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0))))
+        for part in parts
+    ]
+
+
+def _features(scene: StageGaussians) -> Float32[np.ndarray, "3"]:
+    values = np.zeros(FEATURES, np.float32)
+    if scene.light == "shadowed":
+        values[SHADOWED] = 1.0 - scene.ambient
+    elif scene.light == "relit":
+        values[RELIT], values[AMBIENT] = 1.0, scene.ambient
+    return values

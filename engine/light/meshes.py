@@ -1,0 +1,178 @@
+"""Meshes of a stage: simple shapes, files, their place in the world, and normals that look round."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+
+from engine.errors import ConfigError
+from engine.files import read_mesh
+from engine.light.kernels_normals import smooth_normals
+from engine.light.stage import Placed
+from engine.surface.mesh import edge_report
+
+SPHERE_DIVISIONS = 5
+WELD = 1e-6
+"""Points nearer than this share of the mesh's size are one, whatever the file says."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Triangles in a frame of their own.
+
+    Attributes:
+        vertices: positions.
+        faces: three vertices each, anticlockwise from outside.
+        corner_uv: texture coordinates of the faces' corners, (0, 0) at the upper left; None without.
+        normals: of the vertices where they are known exactly.
+    """
+
+    vertices: Float64[np.ndarray, "v 3"]
+    faces: Int64[np.ndarray, "f 3"]
+    corner_uv: Float32[np.ndarray, "f 3 2"] | None = None
+    normals: Float64[np.ndarray, "v 3"] | None = None
+
+
+def simple_shape(name: str) -> Shape:
+    """A ``sphere`` of radius 1, a ``cube`` from -1 to 1, or a ``plane`` from -1 to 1 whose normal is y."""
+    return {"sphere": _sphere, "cube": _cube, "plane": _plane}[name]()
+
+
+def read_shape(path: Path) -> Shape:
+    """The triangles of a mesh file.
+
+    Raises:
+        SceneFileError: the file cannot be read.
+        ConfigError: it holds no triangles.
+    """
+    mesh = read_mesh(path)
+    if len(mesh.triangles) == 0:
+        raise ConfigError(f"{path}: holds no triangles, so that light has nothing to fall on.")
+    uv = None
+    if mesh.uv is not None:
+        uv = np.nan_to_num(mesh.uv)
+        if path.suffix.lower() != ".glb":
+            uv = uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)  # from the lower left
+        uv = uv[mesh.triangles].astype(np.float32)
+    return Shape(mesh.vertices, mesh.triangles, uv)
+
+
+def rotation_matrix(degrees: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
+    """Turns about the fixed axes x, then y, then z."""
+    matrix = np.eye(3)
+    for axis, angle in enumerate(np.radians(degrees)):
+        turn = np.eye(3)
+        a, b = (axis + 1) % 3, (axis + 2) % 3
+        turn[a, a] = turn[b, b] = np.cos(angle)
+        turn[b, a], turn[a, b] = np.sin(angle), -np.sin(angle)
+        matrix = turn @ matrix
+    return matrix
+
+
+def turn_to(axis: str, up_world: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The shortest turn that takes an axis (``y``, ``-z``, ...) to a direction; ``world`` turns nothing.
+
+    Opposite directions turn about x, or about y where the axis is x: glTF's y to COLMAP's -y is the half
+    turn about x that the project's own GLB files are written with.
+    """
+    if axis == "world":
+        return np.eye(3)
+    place = "xyz".index(axis[-1])
+    start = np.eye(3)[place] * (-1.0 if axis.startswith("-") else 1.0)
+    end = up_world / np.linalg.norm(up_world)
+    cosine = float(start @ end)
+    if cosine < -1 + 1e-9:
+        return np.diag([-1.0, 1.0, -1.0]) if place == 0 else np.diag([1.0, -1.0, -1.0])
+    v = np.cross(start, end)
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def placed(points: Float64[np.ndarray, "n 3"], place: Placed) -> Float64[np.ndarray, "n 3"]:
+    """Points scaled, turned and moved."""
+    return points * np.array(place.scale) @ rotation_matrix(place.rotation_degrees).T + np.array(
+        place.position
+    )
+
+
+def corner_normals(
+    corners_world: Float[np.ndarray, "f 3 3"], smooth_degrees: float
+) -> Float32[np.ndarray, "f 3 3"]:
+    """Normals at the corners of faces: those of neighbours across edges up to an angle are averaged."""
+    points = corners_world.reshape(-1, 3).astype(np.float64)
+    size = max(float(np.ptp(points, axis=0).max(initial=0.0)), 1e-30)
+    _, owner = np.unique(np.round(points / (WELD * size)).astype(np.int64), axis=0, return_inverse=True)
+    order = np.argsort(owner.reshape(-1), kind="stable")
+    counts = np.bincount(owner.reshape(-1))
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    normals = np.empty(corners_world.shape, np.float32)
+    least = -2.0 if smooth_degrees >= 180 else np.cos(np.radians(smooth_degrees)) - 1e-9
+    smooth_normals(corners_world.astype(np.float64), order, starts, least, normals)
+    return normals
+
+
+def open_edges(shape: Shape) -> int:
+    """Edges that are not shared by two faces that wind alike; a closed mesh has none.
+
+    Vertices that lie in one place count as one, as in files that repeat them for normals and textures.
+    """
+    size = max(float(np.ptp(shape.vertices, axis=0).max()), 1e-30)
+    _, owner = np.unique(
+        np.round(shape.vertices / (WELD * size)).astype(np.int64), axis=0, return_inverse=True
+    )
+    faces = owner.reshape(-1)[shape.faces].astype(np.int32)
+    sound = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    report = edge_report(faces[sound])
+    return report.open_edges + report.crowded_edges + report.twisted_edges
+
+
+def _sphere() -> Shape:
+    """An icosahedron whose triangles are cut into four again and again."""
+    golden = (1 + 5**0.5) / 2
+    around = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
+    vertices = np.concatenate([around, np.roll(around, 1, axis=1), np.roll(around, 2, axis=1)])
+    faces = np.array(
+        [[0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2],
+         [10, 7, 6], [7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9], [4, 9, 5], [2, 4, 11],
+         [6, 2, 10], [8, 6, 7], [9, 8, 1]]
+    )  # fmt: skip
+    for _ in range(SPHERE_DIVISIONS):
+        edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        unique, place = np.unique(edges, axis=0, return_inverse=True)
+        middle = place.reshape(-1, 3) + len(vertices)
+        vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
+        a, b, c = faces.T
+        ab, bc, ca = middle.T
+        faces = np.concatenate(
+            [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+        )
+    vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    corners = vertices[faces]
+    u = 0.5 + np.arctan2(corners[..., 0], corners[..., 2]) / (2 * np.pi)
+    u = np.where(u.max(axis=1, keepdims=True) - u > 0.5, u + 1, u)  # faces across the seam
+    uv = np.stack([u, np.arccos(np.clip(corners[..., 1], -1, 1)) / np.pi], axis=-1)
+    return Shape(vertices, faces.astype(np.int64), uv.astype(np.float32), vertices)
+
+
+def _cube() -> Shape:
+    vertices: list[Float64[np.ndarray, 3]] = []
+    faces: list[list[int]] = []
+    uv: list[list[list[int]]] = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            n = np.eye(3)[axis] * sign
+            u = np.roll(n, 1) if sign > 0 else np.roll(-n, 2)
+            w = np.cross(n, u)
+            first = len(vertices)
+            vertices += [n - u - w, n + u - w, n + u + w, n - u + w]
+            faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
+            square = [[0, 1], [1, 1], [1, 0], [0, 0]]
+            uv += [[square[0], square[1], square[2]], [square[0], square[2], square[3]]]
+    return Shape(np.array(vertices), np.array(faces, np.int64), np.array(uv, np.float32))
+
+
+def _plane() -> Shape:
+    vertices = np.array([[-1.0, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]])
+    uv = np.array([[[0, 1], [1, 1], [1, 0]], [[0, 1], [1, 0], [0, 0]]], np.float32)
+    return Shape(vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int64), uv)

@@ -1,0 +1,156 @@
+"""Where things go in a scene: where one can stand, what a pixel shows, where the light comes from."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.spatial import cKDTree
+
+from engine.errors import ConfigError
+from engine.gaussians.model import FlatGaussians
+from engine.light.meshes import placed, turn_to
+from engine.light.stage import Rest, Stage
+from engine.light.stage_file import StageFacts
+from engine.light.staging import stage_shape, up_axis
+from engine.rays import RayBatch
+from engine.trace.protocol import Tracer
+
+Ray = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]
+RayOfPixel = Callable[[str, tuple[float, float]], Ray]
+
+LEVEL_COSINE = 0.9
+SPOTS = 256
+LEAST_OPACITY = 0.3
+
+
+def rested(stage: Stage, tracer: Tracer | None, ray_of_pixel: RayOfPixel, folder: Path) -> Stage:
+    """The stage with the meshes that rest ``on`` something moved there.
+
+    Raises:
+        ConfigError: the stage has no Gaussians, a ray meets nothing, or a photograph is not known.
+    """
+    up = np.array(stage.up) / np.linalg.norm(stage.up)
+    meshes = list(stage.meshes)
+    for number, mesh in enumerate(stage.meshes):
+        if mesh.on is None:
+            continue
+        key = f"meshes[{number}].on"
+        if tracer is None:
+            raise ConfigError(f"{key}: there are no Gaussians on which it could stand.")
+        spot = _met(mesh.on, tracer, ray_of_pixel, key)
+        shape = stage_shape(mesh, number, folder)
+        points = placed(shape.vertices @ turn_to(up_axis(mesh), up).T, mesh) - np.array(mesh.position)
+        heights = points @ up
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        foot = middle - (middle @ up - heights.min()) * up
+        position = spot - foot + np.array(mesh.position)
+        meshes[number] = mesh.model_copy(update={"position": tuple(float(x) for x in position), "on": None})
+    return stage.model_copy(update={"meshes": tuple(meshes)})
+
+
+def _met(rest: Rest, tracer: Tracer, ray_of_pixel: RayOfPixel, key: str) -> Float64[np.ndarray, "3"]:
+    """The point of the Gaussians on which something comes to rest."""
+    if rest.view is not None and rest.pixel is not None:
+        origin, direction = ray_of_pixel(rest.view, rest.pixel)
+        what = f"pixel {rest.pixel[0]:g}, {rest.pixel[1]:g} of {rest.view}"
+    else:
+        origin, direction = np.array(rest.origin), np.array(rest.direction)
+        what = "the ray"
+    direction = direction / np.linalg.norm(direction)
+    seen = tracer.trace(RayBatch(origin[None], direction[None].astype(np.float32)))
+    if not seen.depth_median[0] > 0:
+        raise ConfigError(f"{key}: {what} meets nothing solid; choose another.")
+    return np.asarray(origin + float(seen.depth_median[0]) * direction)
+
+
+def scene_facts(
+    gaussians: FlatGaussians,
+    tracer: Tracer,
+    up_world: Float64[np.ndarray, "3"],
+    centre_world: Float64[np.ndarray, "3"],
+    size: float,
+    cameras_world: Float64[np.ndarray, "c 3"],
+) -> StageFacts:
+    """What a first stage is fitted to.
+
+    Args:
+        gaussians: of the scene.
+        tracer: of the same Gaussians.
+        up_world: up.
+        centre_world: of what the cameras look at.
+        size: about as large as that, world units.
+        cameras_world: where some of the cameras are.
+    """
+    up = up_world / np.linalg.norm(up_world)
+    near = np.linalg.norm(gaussians.means_world - centre_world, axis=1) < 1.5 * size
+    some = gaussians.select(near & (gaussians.opacities > LEAST_OPACITY))
+    if len(some) < 10:
+        return _facts(up, centre_world, size, -up)
+    normals = some.rotations[:, :, 0].astype(np.float64)
+    towards = cameras_world.mean(axis=0) - some.means_world
+    normals *= np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    area = (some.opacities * np.exp(some.log_scales.sum(axis=1))).astype(np.float64)
+    spots, standing = _floor(some.means_world.astype(np.float64), normals @ up, area, up, size)
+    # Somewhat above the spot, so that the surface itself is not in the way.
+    ways = [RayBatch.between(camera[None], spots + 0.05 * size * up) for camera in cameras_world]
+    seen = np.mean([tracer.transmittance(way) for way in ways], axis=0)
+    free = np.full(len(spots), 0.3 * size)
+    if len(standing):
+        free = np.minimum(cKDTree(standing).query(spots)[0], free)
+    away = np.linalg.norm(spots - centre_world, axis=1)
+    floor = spots[np.argmax(size * seen + free - 0.7 * away)]
+    return _facts(up, floor, size, -_light_from(some.base_rgb_srgb, normals, area, up))
+
+
+def _floor(
+    points: Float64[np.ndarray, "n 3"],
+    cosines: Float64[np.ndarray, " n"],
+    area: Float64[np.ndarray, " n"],
+    up: Float64[np.ndarray, "3"],
+    size: float,
+) -> tuple[Float64[np.ndarray, "s 3"], Float64[np.ndarray, "k 3"]]:
+    """Spots on the height at which most of the level surface lies, and the points that stand on it."""
+    heights = points @ up
+    level = cosines > LEVEL_COSINE
+    if not level.any():
+        level = np.ones(len(points), bool)
+    bins = np.linspace(heights.min(), heights.max() + 1e-9, 65)
+    counts = np.histogram(heights[level], bins, weights=area[level])[0]
+    peak = int(np.argmax(np.convolve(counts, [0.5, 1.0, 0.5], mode="same")))
+    height = (bins[peak] + bins[peak + 1]) / 2
+    on_floor = np.flatnonzero(level & (np.abs(heights - height) < 0.05 * size))
+    if len(on_floor) == 0:
+        on_floor = np.flatnonzero(level)
+    spots = points[on_floor[:: max(1, len(on_floor) // SPOTS)]]
+    spots = spots + (height - spots @ up)[:, None] * up
+    return spots, points[heights > height + 0.06 * size]
+
+
+def _light_from(
+    rgb_srgb: Float32[np.ndarray, "n 3"],
+    normals: Float64[np.ndarray, "n 3"],
+    area: Float64[np.ndarray, " n"],
+    up: Float64[np.ndarray, "3"],
+) -> Float64[np.ndarray, "3"]:
+    """The direction in which surfaces look that are brighter than others, no lower than 30 degrees."""
+    bright = rgb_srgb.astype(np.float64).mean(axis=1)
+    matrix = np.concatenate([np.ones((len(bright), 1)), normals], axis=1)
+    weights = np.sqrt(np.minimum(area, np.quantile(area, 0.95)))
+    towards = np.linalg.lstsq(matrix * weights[:, None], bright * weights, rcond=None)[0][1:]
+    level = towards - (towards @ up) * up
+    height = max(towards @ up, 0.6 * float(np.linalg.norm(level)), 1e-9)
+    towards = level + height * up
+    return np.asarray(towards / np.linalg.norm(towards))
+
+
+def _facts(
+    up: Float64[np.ndarray, "3"],
+    floor: Float64[np.ndarray, "3"],
+    size: float,
+    light: Float64[np.ndarray, "3"],
+) -> StageFacts:
+    def three(values: Float64[np.ndarray, "3"]) -> tuple[float, float, float]:
+        return float(values[0]), float(values[1]), float(values[2])
+
+    return StageFacts(three(up), three(floor), size, three(light))

@@ -1,0 +1,408 @@
+"""What a stage is: meshes, lights, an environment and Gaussian scenes that are rendered together.
+
+Positions and lengths are in world units, angles in degrees. Colours of materials and lights are display
+(sRGB-encoded) values in [0, 1] and turned into linear ones for the transport of light; strengths of lights
+are linear. Imports neither torch nor numba.
+"""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+MAX_MESHES = 1000
+MAX_LIGHTS = 1000
+MAX_SCENES = 100
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+Colour = tuple[Share, Share, Share]
+WHITE = (1.0, 1.0, 1.0)
+
+
+class Part(BaseModel):
+    """Base of everything in a stage: unknown keys are refused, and nothing changes afterwards."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Diffuse(Part):
+    """A matt surface that sends light evenly everywhere.
+
+    Attributes:
+        colour_srgb: share of the light that it sends back.
+        texture: image file of display colours, multiplied by the colour.
+    """
+
+    kind: Literal["diffuse"] = "diffuse"
+    colour_srgb: Colour = (0.8, 0.8, 0.8)
+    texture: str | None = None
+
+
+class Mirror(Part):
+    """A perfect mirror; white reflects everything."""
+
+    kind: Literal["mirror"] = "mirror"
+    colour_srgb: Colour = WHITE
+
+
+class Glass(Part):
+    """Smooth clear glass, for closed meshes.
+
+    Attributes:
+        ior: index of refraction; that of the surroundings is 1.
+        tint_srgb: colour that light takes at each surface that it passes.
+        absorption: what is absorbed inside in each linear channel, per world unit (Beer's law).
+    """
+
+    kind: Literal["glass"] = "glass"
+    ior: Annotated[float, Field(ge=1, le=4)] = 1.5
+    tint_srgb: Colour = WHITE
+    absorption: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
+
+
+class Metal(Part):
+    """Metal with a microfacet surface (GGX).
+
+    Attributes:
+        colour_srgb: colour of what it reflects head-on.
+        roughness: perceptual, GGX's alpha is its square.
+        multiple_scattering: light that facets throw at each other is kept, not lost.
+    """
+
+    kind: Literal["metal"] = "metal"
+    colour_srgb: Colour = (0.9, 0.9, 0.9)
+    roughness: Share = 0.2
+    multiple_scattering: bool = True
+
+
+class Dielectric(Part):
+    """A coloured ground under a clear coat with a microfacet surface, such as plastic or glaze.
+
+    Attributes:
+        colour_srgb: of the ground.
+        texture: image file of the ground's display colours, multiplied by the colour.
+        roughness: of the coat; perceptual, GGX's alpha is its square.
+        ior: index of refraction of the coat.
+    """
+
+    kind: Literal["dielectric"] = "dielectric"
+    colour_srgb: Colour = (0.8, 0.8, 0.8)
+    texture: str | None = None
+    roughness: Share = 0.3
+    ior: Annotated[float, Field(gt=1, le=4)] = 1.5
+
+
+class MetallicRoughness(Part):
+    """glTF's material: a mixture of a dielectric and a metal.
+
+    Attributes:
+        colour_srgb: of the dielectric's ground and of the metal.
+        texture: image file of display colours, multiplied by the colour.
+        metallic: share of the metal.
+        roughness: perceptual, GGX's alpha is its square.
+        metallic_roughness_texture: image file with roughness in green and metallic in blue, multiplied by
+            the two numbers.
+        ior: index of refraction of the dielectric.
+        diffuse: how the ground shares light with the coat: ``coupled`` keeps all energy, ``burley`` is the
+            diffuse term of Disney's principled material, which does not quite.
+        multiple_scattering: light that facets throw at each other is kept, not lost.
+    """
+
+    kind: Literal["metallic-roughness"] = "metallic-roughness"
+    colour_srgb: Colour = WHITE
+    texture: str | None = None
+    metallic: Share = 0.0
+    roughness: Share = 1.0
+    metallic_roughness_texture: str | None = None
+    ior: Annotated[float, Field(gt=1, le=4)] = 1.5
+    diffuse: Literal["coupled", "burley"] = "coupled"
+    multiple_scattering: bool = True
+
+
+class FileMaterial(Part):
+    """The metallic-roughness materials, with their textures, that a GLB brings along."""
+
+    kind: Literal["file"] = "file"
+
+
+Material = Annotated[
+    Diffuse | Mirror | Glass | Metal | Dielectric | MetallicRoughness | FileMaterial,
+    Field(discriminator="kind"),
+]
+
+
+class Placed(Part):
+    """Something with a place in the world: scaled first, then turned, then moved.
+
+    Attributes:
+        position: where its origin comes to lie.
+        rotation_degrees: about the world's x, then y, then z axis.
+        scale: one factor, or one for each axis.
+    """
+
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation_degrees: Vector = (0.0, 0.0, 0.0)
+    scale: Positive | tuple[Positive, Positive, Positive] = 1.0
+
+
+class Rest(Part):
+    """A place on a surface of the Gaussians on which a mesh comes to stand.
+
+    Either a pixel of a photograph or a ray; where it meets the scene (the distance at which half of the
+    light is gone), the mesh's lowest point comes to lie, its middle above it.
+
+    Attributes:
+        view: name of a photograph of the run.
+        pixel: column and row in the photograph at its full size, from its upper left corner.
+        origin: of a ray.
+        direction: of the ray.
+    """
+
+    view: str | None = None
+    pixel: tuple[Finite, Finite] | None = None
+    origin: Vector | None = None
+    direction: Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> "Rest":
+        photograph = (self.view is not None, self.pixel is not None)
+        ray = (self.origin is not None, self.direction is not None)
+        if {photograph, ray} != {(True, True), (False, False)}:
+            raise ValueError("give either view and pixel, or origin and direction")
+        if self.direction is not None and not any(self.direction):
+            raise ValueError("the direction has no length")
+        return self
+
+
+class StageMesh(Placed):
+    """A mesh from a file, or a simple shape.
+
+    Attributes:
+        file: OBJ, PLY or GLB.
+        shape: a ``sphere`` of radius 1, a ``cube`` from -1 to 1, or a ``plane`` from -1 to 1 across the
+            stage's up.
+        up_axis: which of the file's axes is turned to the stage's up; ``world`` leaves the file as it is.
+            By default y for GLB (glTF says so) and world for the others.
+        smooth_degrees: edges up to this angle are shaded as if they were round; 0 shows every facet.
+        material: what it is made of; by default the materials of a GLB, and grey for others.
+        on: a place in the scene on which it stands; its position counts from there.
+    """
+
+    file: str | None = None
+    shape: Literal["sphere", "cube", "plane"] | None = None
+    up_axis: Literal["world", "x", "-x", "y", "-y", "z", "-z"] | None = None
+    smooth_degrees: Annotated[float, Field(ge=0, le=180)] = 30.0
+    material: Material | None = None
+    on: Rest | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "StageMesh":
+        if (self.file is None) == (self.shape is None):
+            raise ValueError("give either a file or a shape")
+        if isinstance(self.material, FileMaterial) and not (self.file or "").lower().endswith(".glb"):
+            raise ValueError("only a GLB brings materials along; name another kind of material")
+        return self
+
+
+class PointLight(Part):
+    """Light from one point to everywhere.
+
+    Attributes:
+        intensity: linear radiant intensity; at distance d it gives the irradiance intensity / d squared.
+    """
+
+    kind: Literal["point"] = "point"
+    position: Vector
+    colour_srgb: Colour = WHITE
+    intensity: NotNegative
+
+
+class SpotLight(Part):
+    """Light from one point into a cone.
+
+    Attributes:
+        direction: of the cone's axis.
+        outer_degrees: angle from the axis at which the light ends.
+        inner_degrees: angle up to which it has its full intensity; between the two it falls off with the
+            square of a linear function of the cosine, as in glTF's KHR_lights_punctual.
+    """
+
+    kind: Literal["spot"] = "spot"
+    position: Vector
+    direction: Vector
+    colour_srgb: Colour = WHITE
+    intensity: NotNegative
+    outer_degrees: Annotated[float, Field(gt=0, lt=90)] = 30.0
+    inner_degrees: Annotated[float, Field(ge=0, lt=90)] = 20.0
+
+    @model_validator(mode="after")
+    def _cone(self) -> "SpotLight":
+        if not any(self.direction):
+            raise ValueError("the direction has no length")
+        if self.inner_degrees >= self.outer_degrees:
+            raise ValueError("inner_degrees must be less than outer_degrees")
+        return self
+
+
+class DirectionalLight(Part):
+    """Parallel light from infinitely far away.
+
+    Attributes:
+        direction: the way that the light goes.
+        irradiance: linear, on a surface that faces the light.
+    """
+
+    kind: Literal["directional"] = "directional"
+    direction: Vector
+    colour_srgb: Colour = WHITE
+    irradiance: NotNegative
+
+    @model_validator(mode="after")
+    def _length(self) -> "DirectionalLight":
+        if not any(self.direction):
+            raise ValueError("the direction has no length")
+        return self
+
+
+class RectangleLight(Part):
+    """A shining rectangle; its back is black.
+
+    Attributes:
+        position: its centre.
+        direction: the way that it faces.
+        width: along the side that is level with the stage's up.
+        height: along the other side.
+        radiance: linear, the same in all directions in front.
+        visible: whether cameras, mirrors and glass see the rectangle, and other lights its shadow.
+    """
+
+    kind: Literal["rectangle"] = "rectangle"
+    position: Vector
+    direction: Vector
+    width: Positive
+    height: Positive
+    colour_srgb: Colour = WHITE
+    radiance: NotNegative
+    visible: bool = True
+
+    @model_validator(mode="after")
+    def _length(self) -> "RectangleLight":
+        if not any(self.direction):
+            raise ValueError("the direction has no length")
+        return self
+
+
+Light = Annotated[PointLight | SpotLight | DirectionalLight | RectangleLight, Field(discriminator="kind")]
+
+
+class Environment(Part):
+    """Light from all around.
+
+    Attributes:
+        file: equirectangular HDR or EXR image of linear radiance, the stage's up at its top.
+        rotation_degrees: turns the image about the stage's up.
+        strength: factor.
+        visible: whether the camera sees it; otherwise it only lights, and shows in mirrors and glass.
+    """
+
+    file: str
+    rotation_degrees: Finite = 0.0
+    strength: NotNegative = 1.0
+    visible: bool = True
+
+
+class StageGaussians(Placed):
+    """A scene of Gaussians and how it takes part in the light.
+
+    Attributes:
+        file: splat file of any format; None for the scene that is rendered. Its scale is one number.
+        light: ``emissive`` shows the trained colours as they are; ``shadowed`` takes from them what the
+            meshes keep off of the stage's lights; ``relit`` takes them as the albedo of a matt surface with
+            the octagons' normals that the stage's lights shine on.
+        ambient: share of the trained colour that is there without the stage's lights (shadowed, relit).
+        shadows_on_meshes: whether they keep light off the meshes.
+        shadows_on_gaussians: whether they keep light off the Gaussians. Trained colours hold the scene's
+            own shadows already.
+        shadow_bias: Gaussians nearer than this to a lit point cast no shadow on it, world units; None takes
+            3 % of the scene's size.
+    """
+
+    file: str | None = None
+    light: Literal["emissive", "shadowed", "relit"] = "shadowed"
+    ambient: Share = 0.4
+    shadows_on_meshes: bool = True
+    shadows_on_gaussians: bool = False
+    shadow_bias: NotNegative | None = None
+
+    @model_validator(mode="after")
+    def _one_scale(self) -> "StageGaussians":
+        if isinstance(self.scale, tuple):
+            raise ValueError("Gaussians have one scale; give one number")
+        return self
+
+
+class Integrator(Part):
+    """How the picture is computed.
+
+    Attributes:
+        samples: paths a pixel.
+        max_depth: most surfaces that a path meets.
+        roulette_depth: from this surface on paths may end by chance (russian roulette).
+        seed: of the random numbers.
+        anti_aliasing: paths begin all over the pixel rather than at its centre.
+        clamp: most linear radiance that one path brings by way of a matt or rough surface; None for no
+            limit. A limit makes the picture a little darker and takes away bright specks.
+        exposure: factor of the linear picture, in stops (2 to the power of it).
+        tone: curve from linear values to what is shown: ``none`` clips at 1.
+        aperture: diameter of the lens in world units; 0 shows everything sharp.
+        focus_distance: along the camera's axis, world units; what is there is sharp.
+    """
+
+    samples: Annotated[int, Field(ge=1, le=65536)] = 16
+    max_depth: Annotated[int, Field(ge=1, le=64)] = 8
+    roulette_depth: Annotated[int, Field(ge=1, le=64)] = 4
+    seed: Annotated[int, Field(ge=0, lt=1 << 31)] = 0
+    anti_aliasing: bool = True
+    clamp: Positive | None = None
+    exposure: Annotated[float, Field(ge=-20, le=20)] = 0.0
+    tone: Literal["none", "reinhard", "filmic"] = "none"
+    aperture: NotNegative = 0.0
+    focus_distance: Positive | None = None
+
+    @model_validator(mode="after")
+    def _focus(self) -> "Integrator":
+        if self.aperture > 0 and self.focus_distance is None:
+            raise ValueError("an aperture needs a focus_distance")
+        return self
+
+
+class Stage(Part):
+    """Everything that is rendered together.
+
+    Attributes:
+        version: of the format.
+        up: the direction that is up in the world.
+        gaussians: Gaussian scenes; by default the one that is rendered.
+        meshes: things put among them.
+        lights: new lights.
+        environment: light from all around.
+        integrator: how the picture is computed.
+    """
+
+    version: Literal[1] = 1
+    up: Vector = (0.0, -1.0, 0.0)
+    gaussians: Annotated[tuple[StageGaussians, ...], Field(max_length=MAX_SCENES)] = (StageGaussians(),)
+    meshes: Annotated[tuple[StageMesh, ...], Field(max_length=MAX_MESHES)] = ()
+    lights: Annotated[tuple[Light, ...], Field(max_length=MAX_LIGHTS)] = ()
+    environment: Environment | None = None
+    integrator: Integrator = Integrator()
+
+    @model_validator(mode="after")
+    def _up_has_a_length(self) -> "Stage":
+        if not math.hypot(*self.up) > 1e-6:
+            raise ValueError("up has no length")
+        return self

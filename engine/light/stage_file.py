@@ -1,0 +1,203 @@
+"""Stage files: TOML read and checked, and a commented one written. Imports neither torch nor numba."""
+
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from engine.errors import ConfigError
+from engine.light.stage import Dielectric, Diffuse, MetallicRoughness, Stage
+from engine.writing import write_text
+
+MAX_STAGE_BYTES = 16 << 20
+
+
+def read_stage(path: Path) -> Stage:
+    """The stage of a TOML file, with the names of its files made relative to the file's folder.
+
+    Raises:
+        ConfigError: no such file, no TOML, an unknown key, a value out of range, or a file that it names
+            and that is not there.
+    """
+    try:
+        if path.stat().st_size > MAX_STAGE_BYTES:
+            raise ConfigError(f"{path}: is larger than {MAX_STAGE_BYTES >> 20} MB, which no stage needs.")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: the stage cannot be read ({error}).") from None
+    stage = parse_stage(text, str(path))
+    for key, name in named_files(stage):
+        if not (path.parent / name).is_file():
+            raise ConfigError(f"{path}: {key}: there is no file {path.parent / name}.")
+    return stage
+
+
+def parse_stage(text: str, name: str) -> Stage:
+    """The stage of a TOML text; ``name`` is what errors call it.
+
+    Raises:
+        ConfigError: no TOML, an unknown key, or a value out of range.
+    """
+    try:
+        return Stage.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{name}: is no TOML: {error}.") from None
+    except ValidationError as error:
+        raise ConfigError(f"{name}: {_complaint(error)}") from None
+
+
+def named_files(stage: Stage) -> Iterator[tuple[str, str]]:
+    """The key and the name of every file that a stage names."""
+    if stage.environment is not None:
+        yield "environment.file", stage.environment.file
+    for number, scene in enumerate(stage.gaussians):
+        if scene.file is not None:
+            yield f"gaussians[{number}].file", scene.file
+    for number, mesh in enumerate(stage.meshes):
+        if mesh.file is not None:
+            yield f"meshes[{number}].file", mesh.file
+        material = mesh.material
+        if isinstance(material, Diffuse | Dielectric | MetallicRoughness) and material.texture is not None:
+            yield f"meshes[{number}].material.texture", material.texture
+        if isinstance(material, MetallicRoughness) and material.metallic_roughness_texture is not None:
+            key = f"meshes[{number}].material.metallic_roughness_texture"
+            yield key, material.metallic_roughness_texture
+
+
+@dataclass(frozen=True)
+class StageFacts:
+    """What a first stage of a scene is fitted to.
+
+    Attributes:
+        up: the direction that is up, a unit vector.
+        floor: a point on what the scene stands on.
+        size: about as large as what the cameras look at, world units.
+        light_direction: the way that the scene's light seems to go.
+    """
+
+    up: tuple[float, float, float]
+    floor: tuple[float, float, float]
+    size: float
+    light_direction: tuple[float, float, float]
+
+
+def write_first_stage(path: Path, facts: StageFacts) -> None:
+    """Write a commented stage for a scene: a ball on the floor, a light, and more to uncomment.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    radius = 0.12 * facts.size
+    centre = tuple(p + radius * u for p, u in zip(facts.floor, facts.up, strict=True))
+    lamp = tuple(p - 2.0 * facts.size * d for p, d in zip(facts.floor, facts.light_direction, strict=True))
+    write_text(
+        path,
+        _TEMPLATE.format(
+            up=_vector(facts.up),
+            centre=_vector(centre),
+            floor=_vector(facts.floor),
+            light=_vector(facts.light_direction),
+            lamp=_vector(lamp),
+            radius=f"{radius:.4g}",
+            half=f"{facts.size:.4g}",
+            intensity=f"{4.0 * facts.size**2:.4g}",
+        ),
+    )
+
+
+def _vector(values: tuple[float, ...]) -> str:
+    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+
+
+def _complaint(error: ValidationError) -> str:
+    """The first thing that is wrong, with the key as one would look for it in the file."""
+    first = error.errors()[0]
+    key = ""
+    for part in first["loc"]:
+        if isinstance(part, int):
+            key += f"[{part}]"
+        # The kinds of a union stand in the location too, but are no keys of the file.
+        elif not (key and part in _KINDS):
+            key += f".{part}" if key else str(part)
+    if first["type"] == "extra_forbidden":
+        return f"there is no key {key}; see docs/light.md for those that there are."
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] in ("too_long", "missing", "value_error"):
+        return f"{key or 'the stage'}: {message}."
+    return f"{key}: {message} (it is {str(first.get('input'))[:60]})."
+
+
+_KINDS = (
+    "diffuse", "mirror", "glass", "metal", "dielectric", "metallic-roughness", "file", "point", "spot",
+    "directional", "rectangle", "float", "constrained-float",
+)  # fmt: skip
+
+_TEMPLATE = """\
+# A stage: things, lights and how the scene takes part. Lengths are in the scene's units, colours are
+# display values from 0 to 1, files are relative to this one. Everything that can be set: docs/light.md.
+version = 1
+up = {up}
+
+# How the scene takes light. emissive: as trained; shadowed: darker where a new thing keeps light off;
+# relit: its colours lit by nothing but the lights below and the ambient share.
+[[gaussians]]
+light = "shadowed"
+ambient = 0.4                    # what is left of the colour in full shadow
+shadows_on_meshes = true
+
+# A ball on what seems to be the floor, at {floor}.
+[[meshes]]
+shape = "sphere"                 # or: file = "thing.glb"
+position = {centre}
+scale = {radius}
+smooth_degrees = 180
+material = {{ kind = "glass", ior = 1.5 }}
+# material = {{ kind = "mirror" }}
+# material = {{ kind = "metal", colour_srgb = [0.95, 0.8, 0.5], roughness = 0.25 }}
+# material = {{ kind = "dielectric", colour_srgb = [0.7, 0.1, 0.1], roughness = 0.2 }}
+# To stand on what a pixel of a photograph shows (its position then counts from there):
+# on = {{ view = "0001.jpg", pixel = [200, 300] }}
+
+# A mirror for a floor.
+# [[meshes]]
+# shape = "plane"
+# position = {floor}
+# scale = {half}
+# material = {{ kind = "mirror", colour_srgb = [0.9, 0.9, 0.9] }}
+
+# The light, from where it seems to come in the photographs.
+[[lights]]
+kind = "directional"
+direction = {light}
+irradiance = 2.0
+
+# A lamp that is a rectangle casts soft shadows.
+# [[lights]]
+# kind = "rectangle"
+# position = {lamp}
+# direction = {light}
+# width = {half}
+# height = {half}
+# radiance = 8.0
+# visible = false
+
+# [[lights]]
+# kind = "point"
+# position = {lamp}
+# intensity = {intensity}
+
+# [environment]
+# file = "studio.hdr"
+# rotation_degrees = 0
+# strength = 1.0
+# visible = false                # the camera sees the scene's own background
+
+[integrator]
+samples = 16                     # a pixel; more is smoother and slower
+max_depth = 8
+clamp = 20.0                     # keeps single paths from leaving bright specks
+exposure = 0.0                   # stops
+tone = "none"                    # or "reinhard", "filmic"
+"""

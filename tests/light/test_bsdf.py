@@ -1,0 +1,123 @@
+"""Materials against closed forms: Fresnel, Snell, energy, densities and the samples that follow them."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from engine.light.bsdf import OpaqueMaterial, albedo_table, fresnel
+
+
+def directions(cosines: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    across = np.sqrt(1 - cosines**2)
+    return np.stack([across * np.cos(angles), across * np.sin(angles), cosines], axis=-1)
+
+
+def hemisphere(rows: int, columns: int) -> tuple[np.ndarray, float]:
+    """Midpoints of equal patches in (cosine, angle), and their solid angle."""
+    cosines, angles = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns)
+    return directions(cosines.ravel(), 2 * np.pi * angles.ravel()), 2 * np.pi / (rows * columns)
+
+
+def material(
+    n: int, *, metallic: float, roughness: float, colour: float = 1.0, **more: object
+) -> OpaqueMaterial:
+    return OpaqueMaterial(
+        np.full((n, 3), colour),
+        np.full(n, metallic),
+        np.full(n, roughness),
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def towards(cosine: float, n: int) -> np.ndarray:
+    return np.tile(directions(np.array([cosine]), np.array([0.3])), (n, 1))
+
+
+def test_fresnel_head_on_at_brewster_and_beyond_the_critical_angle() -> None:
+    brewster = np.cos(np.arctan(1.5))
+    reflected, cos_t = fresnel(np.array([1.0, brewster, 1e-9]), 1.5)
+    # At Brewster's angle only light across the plane of incidence is reflected.
+    across = (brewster - 1.5 * cos_t[1]) / (brewster + 1.5 * cos_t[1])
+    np.testing.assert_allclose(reflected, [0.04, 0.5 * across**2, 1.0], atol=1e-6)
+    # From inside: all is reflected beyond asin(1 / 1.5), and Snell's law holds before.
+    angles = np.radians([10.0, 30.0, 41.7, 41.9, 80.0])
+    reflected, cos_t = fresnel(np.cos(angles), 1 / 1.5)
+    assert (reflected[3:] == 1.0).all() and (cos_t[3:] == 0.0).all() and (reflected[:3] < 1.0).all()
+    np.testing.assert_allclose(np.sqrt(1 - cos_t[:3] ** 2), 1.5 * np.sin(angles[:3]), rtol=1e-12)
+
+
+def test_index_one_reflects_nothing() -> None:
+    reflected, cos_t = fresnel(np.linspace(0.01, 1.0, 50), 1.0)
+    np.testing.assert_allclose(reflected, 0.0, atol=1e-20)
+    np.testing.assert_allclose(cos_t, np.linspace(0.01, 1.0, 50))
+
+
+@pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
+def test_a_white_furnace_keeps_its_energy(metallic: float, roughness: float) -> None:
+    # By the material's own samples: value over density is what each of them carries.
+    n = 1 << 15
+    k = np.arange(n)
+    golden = np.stack([(k + 0.5) / n, (k * 0.6180339887498949) % 1, (k * 0.7548776662466927) % 1], axis=1)
+    for cosine in (0.15, 0.5, 0.95):
+        white, seen = material(n, metallic=metallic, roughness=roughness), towards(cosine, n)
+        lit = white.sample(seen, golden)
+        values, pdf = white.evaluate(seen, lit)
+        kept = np.where(pdf > 0, values[:, 0] / np.maximum(pdf, 1e-30), 0.0).mean()
+        assert abs(kept - 1.0) < 0.01, (cosine, kept)
+
+
+@pytest.mark.parametrize("roughness", [0.35, 0.7])
+@pytest.mark.parametrize("metallic", [0.0, 0.4, 1.0])
+def test_densities_integrate_to_what_stays_above_the_surface(metallic: float, roughness: float) -> None:
+    lit, patch = hemisphere(1500, 700)
+    n = 1 << 15
+    rng = np.random.default_rng(2)
+    for cosine in (0.3, 0.8):
+        some = material(len(lit), metallic=metallic, roughness=roughness, colour=0.5)
+        total = some.evaluate(towards(cosine, len(lit)), lit)[1].sum() * patch
+        few = material(n, metallic=metallic, roughness=roughness, colour=0.5)
+        above = (few.sample(towards(cosine, n), rng.random((n, 3)))[:, 2] > 0).mean()
+        assert abs(total - above) < 4 * np.sqrt(0.25 / n) + 1e-3
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_samples_follow_their_density(metallic: float) -> None:
+    n, rows, columns, fine = 200_000, 8, 16, 12
+    rng = np.random.default_rng(3)
+    some = material(n, metallic=metallic, roughness=0.6, colour=0.5)
+    lit = some.sample(towards(0.7, n), rng.random((n, 3)))
+    lit = lit[lit[:, 2] > 0]
+    angle = np.arctan2(lit[:, 1], lit[:, 0]) / (2 * np.pi) % 1
+    counted = np.histogram2d(lit[:, 2], angle, bins=(rows, columns), range=((0, 1), (0, 1)))[0]
+    cosines, angles = np.meshgrid(
+        (np.arange(rows * fine) + 0.5) / (rows * fine), (np.arange(columns * fine) + 0.5) / (columns * fine),
+        indexing="ij",
+    )  # fmt: skip
+    grid = directions(cosines.ravel(), 2 * np.pi * angles.ravel())
+    pdf = material(len(grid), metallic=metallic, roughness=0.6, colour=0.5).evaluate(
+        towards(0.7, len(grid)), grid
+    )[1]
+    patch = 2 * np.pi / len(grid)
+    expected = n * patch * pdf.reshape(rows, fine, columns, fine).sum(axis=(1, 3))
+    used = expected > 10
+    statistic = ((counted - expected) ** 2 / np.maximum(expected, 1e-9))[used].sum()
+    assert statistic < chi2.ppf(0.9999, used.sum())
+
+
+def test_values_do_not_change_when_light_and_viewer_are_swapped() -> None:
+    rng = np.random.default_rng(4)
+    a = directions(rng.uniform(0.1, 1, 500), rng.uniform(0, 7, 500))
+    b = directions(rng.uniform(0.1, 1, 500), rng.uniform(0, 7, 500))
+    some = OpaqueMaterial(
+        rng.random((500, 3)), rng.random(500), rng.uniform(0.2, 1, 500), multiple_scattering=False
+    )
+    there = some.evaluate(a, b)[0] / b[:, 2:]
+    back = some.evaluate(b, a)[0] / a[:, 2:]
+    np.testing.assert_allclose(there, back, rtol=1e-9)
+
+
+def test_a_smooth_coat_reflects_what_fresnel_says() -> None:
+    table = albedo_table(1.5).by_cosine[0]
+    cosines = np.linspace(0, 1, len(table))[2:]
+    np.testing.assert_allclose(table[2:], fresnel(cosines, 1.5)[0], atol=2e-3)

@@ -1,0 +1,152 @@
+"""Lights against closed forms: form factor, inverse square, cones, environments and their sampling."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from engine.errors import ConfigError
+from engine.light.environment import EnvironmentMap, environment_frame, read_environment
+from engine.light.lights import light_arrays, look_up_environment, sample_lights
+from engine.light.stage import DirectionalLight, PointLight, RectangleLight, SpotLight
+from engine.render.images import write_exr
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def irradiance(samples, normal=UP):  # type: ignore[no-untyped-def]
+    cosine = np.maximum(samples.directions_world @ normal, 0.0)[:, None]
+    density = np.where(samples.density > 0, samples.density, 1.0)[:, None]
+    return (samples.radiance_linear * cosine / density).mean(axis=0)
+
+
+def stratified(side: int) -> np.ndarray:
+    u, v = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
+    rng = np.random.default_rng(0)
+    return np.stack([rng.permutation(side * side) / side**2, u.ravel(), v.ravel()], axis=1)
+
+
+def test_a_parallel_rectangle_lights_by_its_form_factor() -> None:
+    # A corner of a rectangle of sides a, b over a point at distance 1 has this form factor; there are four.
+    a, b = 0.7, 1.2
+    corner = (
+        a / np.hypot(1, a) * np.arctan(b / np.hypot(1, a))
+        + b / np.hypot(1, b) * np.arctan(a / np.hypot(1, b))
+    ) / (2 * np.pi)
+    light = RectangleLight(position=(0, 0, 1), direction=(0, 0, -1), width=2 * a, height=2 * b, radiance=3.0)
+    samples = sample_lights(
+        light_arrays((light,), np.array([0.0, 1.0, 0.0])), np.zeros((1 << 14, 3)), stratified(128)
+    )
+    # Which side is the level one follows from the up direction that the stage names.
+    np.testing.assert_allclose(irradiance(samples), 4 * corner * np.pi * 3.0, rtol=2e-3)
+
+
+def test_a_rectangle_is_black_behind() -> None:
+    light = RectangleLight(position=(0, 0, 1), direction=(0, 0, 1), width=1, height=1, radiance=3.0)
+    assert (
+        irradiance(sample_lights(light_arrays((light,), UP), np.zeros((16, 3)), stratified(4))) == 0
+    ).all()
+
+
+def test_points_fall_off_with_the_square_and_directional_lights_not() -> None:
+    point = light_arrays((PointLight(position=(0, 0, 2), intensity=8.0),), UP)
+    sun = light_arrays((DirectionalLight(direction=(1, 0, -1), irradiance=2.0),), UP)
+    np.testing.assert_allclose(irradiance(sample_lights(point, np.zeros((4, 3)), stratified(2))), 2.0)
+    np.testing.assert_allclose(
+        irradiance(sample_lights(sun, np.full((4, 3), 9.0), stratified(2))), np.sqrt(2)
+    )
+
+
+def test_a_spot_shines_into_its_cone() -> None:
+    spot = SpotLight(
+        position=(0, 0, 1), direction=(0, 0, -1), intensity=1.0, outer_degrees=30, inner_degrees=10
+    )
+    angles = np.radians([0.0, 9.0, 20.0, 31.0])
+    points = np.stack([np.tan(angles), 0 * angles, 0 * angles], axis=1)
+    seen = sample_lights(light_arrays((spot,), UP), points, np.zeros((4, 3))).radiance_linear[:, 0]
+    outer, inner = np.cos(np.radians([30, 10]))
+    falloff = [1.0, 1.0, ((np.cos(angles[2]) - outer) / (inner - outer)) ** 2, 0.0]
+    np.testing.assert_allclose(seen, falloff * np.cos(angles) ** 2, rtol=1e-12)
+
+
+def test_several_lights_add_up() -> None:
+    lights = (
+        PointLight(position=(0, 0, 1), intensity=1.0),
+        PointLight(position=(3, 0, 1), intensity=20.0, colour_srgb=(1, 0, 0)),
+        DirectionalLight(direction=(0, 0, -1), irradiance=0.5),
+        RectangleLight(position=(0, 0, -1), direction=(0, 0, -1), width=1, height=1, radiance=9.0),
+    )
+    samples = sample_lights(light_arrays(lights, UP), np.zeros((1 << 14, 3)), stratified(128))
+    expected = np.array([1.5 + 20 / 10**1.5, 1.5, 1.5])
+    np.testing.assert_allclose(irradiance(samples), expected, rtol=5e-3)
+    assert 3 not in samples.lights
+
+
+def patchy() -> np.ndarray:
+    radiance = np.full((16, 32, 3), 0.1, np.float32)
+    radiance[3:5, 20:22] = 40.0
+    radiance[9, 0] = (5.0, 1.0, 0.2)
+    return radiance
+
+
+def test_an_environments_density_integrates_to_one_and_its_samples_follow_it() -> None:
+    frame = environment_frame(np.array([0.2, -1.0, 0.1]), 37.0)
+    lights = light_arrays((), UP, EnvironmentMap(patchy(), frame))
+    rows, columns = 256, 512
+    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+    local = np.stack(
+        [
+            np.sin(np.pi * v) * np.sin(2 * np.pi * (u - 0.5)),
+            np.cos(np.pi * v),
+            np.sin(np.pi * v) * np.cos(2 * np.pi * (u - 0.5)),
+        ],
+        axis=-1,
+    )
+    patches = 2 * np.pi**2 * np.sin(np.pi * v) / v.size
+    radiance, density = look_up_environment(lights, (local @ frame).reshape(-1, 3))
+    assert abs((density * patches.ravel()).sum() - 1) < 1e-3
+    n = 100_000
+    samples = sample_lights(lights, np.zeros((n, 3)), np.random.default_rng(1).random((n, 3)))
+    again, density_there = look_up_environment(lights, samples.directions_world)
+    np.testing.assert_allclose(samples.density, density_there, rtol=1e-6)
+    np.testing.assert_allclose(samples.radiance_linear, again, rtol=1e-6)
+    back = samples.directions_world @ frame.T
+    polar = np.arccos(np.clip(back[:, 1], -1, 1)) / np.pi
+    around = 0.5 + np.arctan2(back[:, 0], back[:, 2]) / (2 * np.pi)
+    counted = np.histogram2d(polar, around, bins=(16, 32), range=((0, 1), (0, 1)))[0]
+    expected = n * (density * patches.ravel()).reshape(16, 16, 32, 16).sum(axis=(1, 3))
+    used = expected > 10
+    assert (((counted - expected) ** 2 / expected)[used]).sum() < chi2.ppf(0.9999, used.sum())
+    # The light that falls on a surface, by its samples and by a sum over the sphere.
+    normal = np.array([0.0, -0.6, 0.8])
+    summed = (
+        radiance * np.maximum((local @ frame).reshape(-1, 3) @ normal, 0)[:, None] * patches.reshape(-1, 1)
+    ).sum(axis=0)
+    np.testing.assert_allclose(irradiance(samples, normal), summed, rtol=0.02)
+
+
+def test_which_way_an_environment_is_turned() -> None:
+    radiance = np.zeros((64, 128, 3), np.float32)
+    radiance[31:33, 63:65] = 1.0  # the middle
+    radiance[:4] = 0.5  # the top
+    colmap = light_arrays((), UP, EnvironmentMap(radiance, environment_frame(np.array([0.0, -1.0, 0.0]))))
+    assert look_up_environment(colmap, np.array([[0.0, 0.0, 1.0]]))[0][0, 0] == 1.0
+    assert look_up_environment(colmap, np.array([[0.0, -1.0, 0.0]]))[0][0, 0] == 0.5
+    level = light_arrays((), UP, EnvironmentMap(radiance, environment_frame(UP)))
+    assert look_up_environment(level, np.array([[1.0, 0.0, 0.0]]))[0][0, 0] == 1.0
+    turned = light_arrays((), UP, EnvironmentMap(radiance, environment_frame(UP, 90.0)))
+    assert look_up_environment(turned, np.array([[0.0, 1.0, 0.0]]))[0][0, 0] == pytest.approx(1.0)
+
+
+def test_an_environment_that_is_no_picture_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "not.hdr").write_bytes(b"#?RADIANCE nonsense")
+    with pytest.raises(ConfigError, match=r"not\.hdr"):
+        read_environment(tmp_path / "not.hdr")
+    with pytest.raises(ConfigError, match="HDR or EXR"):
+        read_environment(tmp_path / "sky.png")
+    bad = np.ones((4, 8), np.float32)
+    bad[1, 1] = np.nan
+    write_exr(tmp_path / "bad.exr", {"R": bad, "G": bad, "B": bad})
+    with pytest.raises(ConfigError, match="not finite"):
+        read_environment(tmp_path / "bad.exr")

@@ -1,0 +1,132 @@
+"""Stage files: what is refused and in which words, and the first stage that is written."""
+
+from pathlib import Path
+
+import pytest
+
+from engine.errors import ConfigError
+from engine.light.stage import Glass, MetallicRoughness, PointLight, RectangleLight, Stage
+from engine.light.stage_file import StageFacts, parse_stage, read_stage, write_first_stage
+
+BALL = '[[meshes]]\nshape = "sphere"\n'
+
+
+def test_a_stage_is_read_with_everything_in_it(tmp_path: Path) -> None:
+    for name in ("a.glb", "b.png", "c.hdr", "d.ply"):
+        (tmp_path / name).write_bytes(b"?")
+    (tmp_path / "stage.toml").write_text(
+        """
+        up = [0, 0, 1]
+        [[gaussians]]
+        light = "relit"
+        [[gaussians]]
+        file = "d.ply"
+        scale = 2
+        [[meshes]]
+        file = "a.glb"
+        on = { view = "0001.jpg", pixel = [10.5, 20] }
+        material = { kind = "metallic-roughness", texture = "b.png" }
+        [[meshes]]
+        shape = "cube"
+        scale = [1, 2, 3]
+        material = { kind = "glass", ior = 1.33, absorption = [1, 0, 0] }
+        [[lights]]
+        kind = "point"
+        position = [1, 2, 3]
+        intensity = 5
+        [environment]
+        file = "c.hdr"
+        [integrator]
+        samples = 4
+        """
+    )
+    stage = read_stage(tmp_path / "stage.toml")
+    assert [scene.light for scene in stage.gaussians] == ["relit", "shadowed"]
+    assert isinstance(stage.meshes[0].material, MetallicRoughness)
+    assert stage.meshes[1].material == Glass(ior=1.33, absorption=(1, 0, 0))
+    assert isinstance(stage.lights[0], PointLight) and stage.integrator.samples == 4
+    assert stage.environment is not None and stage.up == (0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("up = [0, 1", "no TOML"),
+        ("colour = 3", "no key colour"),
+        (BALL + "colour = 3", r"no key meshes\[0\]\.colour"),
+        (BALL + 'material = { kind = "glass", roughness = 0.5 }', r"no key meshes\[0\]\.material\.roughness"),
+        (BALL + 'material = { kind = "velvet" }', r"meshes\[0\]\.material"),
+        (BALL + "position = [0, nan, 0]", r"meshes\[0\]\.position\[1\].*finite"),
+        (BALL + "scale = inf", r"meshes\[0\]\.scale"),
+        (BALL + "scale = 0", r"meshes\[0\]\.scale"),
+        (BALL + 'file = "x.ply"', "either a file or a shape"),
+        (BALL + 'on = { view = "a.jpg" }', "either view and pixel, or origin and direction"),
+        (BALL + 'material = { kind = "file" }', "only a GLB brings materials"),
+        ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]', r"lights\[0\].*intensity"),
+        ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = -1', r"lights\[0\]\.intensity"),
+        ('[[lights]]\nkind = "directional"\ndirection = [0, 0, 0]\nirradiance = 1', "has no length"),
+        ("up = [0, 0, 0]", "up has no length"),
+        ("[integrator]\naperture = 0.1", "needs a focus_distance"),
+        ("[integrator]\nsamples = 0", r"integrator\.samples"),
+        ("[[gaussians]]\nscale = [1, 2, 3]", "one scale"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_sentence_with_its_key(text: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        parse_stage(text, "my.toml")
+    assert str(caught.value).startswith("my.toml: ") and "\n" not in str(caught.value)
+
+
+def test_a_million_lights_are_refused() -> None:
+    light = '[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = 1\n'
+    with pytest.raises(ConfigError, match=r"my\.toml: lights: .*at most 1000"):
+        parse_stage(light * 1001, "my.toml")
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.toml: the stage cannot be read"):
+        read_stage(tmp_path / "none.toml")
+    path = tmp_path / "stage.toml"
+    for text, key in (
+        ('[[meshes]]\nfile = "gone.glb"', r"meshes\[0\]\.file"),
+        (BALL + 'material = { kind = "diffuse", texture = "gone.png" }', r"meshes\[0\]\.material\.texture"),
+        ('[environment]\nfile = "gone.hdr"', r"environment\.file"),
+        ('[[gaussians]]\nfile = "gone.ply"', r"gaussians\[0\]\.file"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=rf"stage\.toml: {key}: there is no file .*gone"):
+            read_stage(path)
+
+
+def test_the_first_stage_can_be_read_and_so_can_all_that_it_suggests(tmp_path: Path) -> None:
+    path = tmp_path / "stage.toml"
+    write_first_stage(path, StageFacts((0, -1, 0), (0, 0.5, 0), 2.0, (0.6, 0.8, 0)))
+    stage = read_stage(path)
+    assert stage.meshes[0].position == (0.0, 0.26, 0.0)
+    assert isinstance(stage.meshes[0].material, Glass)
+    # Uncommented from the mirror on, everything is still a stage.
+    text = path.read_text()
+    start = text.index("# A mirror for a floor.")
+    lines = [
+        line.removeprefix("# ")
+        if (line.startswith(("# [", "# ")) and "=" in line) or line.startswith("# [")
+        else line
+        for line in text[start:].splitlines()
+    ]
+    (tmp_path / "studio.hdr").write_bytes(b"?")
+    path.write_text(text[:start] + "\n".join(lines))
+    full = read_stage(path)
+    assert len(full.meshes) == 2 and len(full.lights) == 3 and full.environment is not None
+    assert isinstance(full.lights[1], RectangleLight)
+
+
+def test_reading_stages_needs_neither_torch_nor_numba() -> None:
+    import subprocess
+    import sys
+
+    code = "import engine.light.stage_file, sys; assert not {'torch', 'numba'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_stage_has_the_scene_as_trained_colours_in_shadow_by_default() -> None:
+    assert Stage().gaussians[0].light == "shadowed"

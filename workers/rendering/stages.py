@@ -1,0 +1,139 @@
+"""Scenes on a stage: rendered, and the first stage of a scene."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from engine.colour import srgb_to_linear
+from engine.errors import ConfigError, OutputError
+from engine.events import Listener
+from engine.gaussians.model import FlatGaussians
+from engine.light.integrator import LitScene, PathTracer
+from engine.light.layers import stage_layers
+from engine.light.placing import rested, scene_facts
+from engine.light.rendering import render_preview, render_stage_images, render_stage_video
+from engine.light.stage import Stage
+from engine.light.stage_file import StageFacts, write_first_stage
+from engine.light.staging import stage_meshes
+from engine.render.jobs import Shot, gaussian_turntable, scene_turntable
+from engine.render.paths import Turntable
+from engine.scene.model import Viewpoints
+from engine.stages import counted_stage
+from engine.trace.make import make_tracer
+from engine.trace.protocol import TraceSettings
+
+SIZE_OF_RADIUS = 0.4
+"""What the cameras look at is about this share of their distance from the axis they turn about."""
+CAMERAS_ASKED = 12
+"""Of so many cameras the first stage asks what they see."""
+
+
+@dataclass(frozen=True)
+class StagePlace:
+    """The scene in which a stage is set.
+
+    Attributes:
+        gaussians: of the scene.
+        settings: where rays are cut off.
+        photographs: of a run, at their full size; None for a bare file.
+        folder: where the stage's files are relative to.
+        read: reads a file of Gaussians.
+        background_srgb: display colour behind everything.
+        threads: to use; 0 takes all.
+    """
+
+    gaussians: FlatGaussians
+    settings: TraceSettings
+    photographs: Viewpoints | None
+    folder: Path
+    read: Callable[[Path], FlatGaussians]
+    background_srgb: Float32[np.ndarray, "3"]
+    threads: int
+
+    def turntable(self, up_world: Float64[np.ndarray, "3"] | None = None) -> Turntable:
+        """A circle round what the scene shows."""
+        if self.photographs is None:
+            return gaussian_turntable(self.gaussians, up_world=up_world)
+        return scene_turntable(self.photographs)
+
+    def ray_of_pixel(
+        self, name: str, pixel: tuple[float, float]
+    ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """The ray through a pixel of a photograph at its full size.
+
+        Raises:
+            ConfigError: there is no such photograph, or it has no such pixel.
+        """
+        if self.photographs is None:
+            raise ConfigError(f"{name}: a file of Gaussians has no photographs; give origin and direction.")
+        names = [view.name for view in self.photographs.views]
+        if name not in names:
+            raise ConfigError(f"{name}: the run has no photograph of this name.")
+        view = self.photographs.views[names.index(name)]
+        at = np.array(pixel)
+        direction = self.photographs.cameras[view.camera_index].directions_cam(at[None])[0]
+        inside = (at >= 0).all() and at[0] <= view.width_px and at[1] <= view.height_px
+        if not (inside and np.isfinite(direction).all()):
+            raise ConfigError(f"{name}: has no pixel {pixel[0]:g}, {pixel[1]:g}.")
+        return view.origin_world, direction @ view.rotation_cam_from_world
+
+
+def render_stage(
+    stage: Stage,
+    place: StagePlace,
+    shots: Sequence[Shot],
+    output: Path,
+    file_of: Callable[[int, Shot], Path] | None,
+    fps: float | None,
+    listener: Listener,
+) -> tuple[Path, ...]:
+    """Render a stage: images, a film where ``fps`` is given, or a preview where ``file_of`` is None.
+
+    Raises:
+        OctasplatError: something of the stage cannot be used, or the output not written.
+    """
+    up = np.array(stage.up)
+    layers = stage_layers(
+        stage, place.gaussians, place.read, place.folder, place.settings,
+        size=SIZE_OF_RADIUS * place.turntable(up).radius, threads=place.threads,
+    )  # fmt: skip
+    stage = rested(stage, None if layers is None else layers.tracer, place.ray_of_pixel, place.folder)
+    meshes = stage_meshes(stage, place.folder, threads=place.threads)
+    background = srgb_to_linear(place.background_srgb.astype(np.float64))
+    tracer = PathTracer(LitScene(meshes, layers, background), stage.integrator, threads=place.threads)
+    with counted_stage("render", listener) as progress:
+        if file_of is None:
+            render_preview(tracer, meshes, stage.integrator, shots[0], output, progress)
+            return (output,)
+        if fps is not None:
+            render_stage_video(tracer, meshes, stage.integrator, shots, output, fps, progress)
+            return (output,)
+        return render_stage_images(tracer, meshes, stage.integrator, shots, file_of, progress)
+
+
+def first_stage(place: StagePlace, up_world: Float64[np.ndarray, "3"] | None, path: Path) -> StageFacts:
+    """Write a commented stage that fits a scene; returns what it was fitted to.
+
+    Raises:
+        OutputError: there is such a file already, or it cannot be written.
+    """
+    if path.exists():
+        raise OutputError(f"{path} is there already; name another file, or remove it.")
+    table = place.turntable(up_world)
+    if place.photographs is None:
+        cameras = table.poses(CAMERAS_ASKED)[:, :3, 3]
+    else:
+        views = place.photographs.views
+        cameras = np.stack([view.origin_world for view in views[:: -(-len(views) // CAMERAS_ASKED)]])
+    tracer = make_tracer(place.settings, threads=place.threads)
+    tracer.build(place.gaussians)
+    size = SIZE_OF_RADIUS * table.radius
+    facts = scene_facts(place.gaussians, tracer, table.up_world, table.centre_world, size, cameras)
+    try:
+        write_first_stage(path, facts)
+    except OSError as error:
+        raise OutputError(f"Cannot write {path}: {error.strerror or error}.") from error
+    return facts
