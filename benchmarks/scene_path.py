@@ -1,0 +1,70 @@
+"""The way of one scene through the main job: the rooms that the pipeline asks, in order, and its returns.
+
+    python -m benchmarks.scene_path                     # this tree
+    python -m benchmarks.scene_path --root ELSEWHERE    # another checkout
+
+A small generated scene is reconstructed while every call that ``engine/pipeline.py`` makes into another
+folder of the engine is noted. A return is a visit to a folder that was left before.
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+PIPELINE = "engine.pipeline"
+SETTINGS = {
+    "iterations": "30", "rays": "256", "max_gaussians": "400", "initial_points": "300", "probe_rays": "256",
+}  # fmt: skip
+
+
+class Visits:
+    """A profiler that notes calls out of the pipeline."""
+
+    def __init__(self) -> None:
+        self.rooms: list[str] = []
+
+    def __call__(self, frame: FrameType, event: str, _argument: Any) -> None:
+        """Note ``frame`` if the pipeline has called it."""
+        if event != "call" or frame.f_back is None:
+            return
+        caller, callee = (f.f_globals.get("__name__", "") for f in (frame.f_back, frame))
+        if caller == PIPELINE and callee.startswith("engine.") and callee != PIPELINE:
+            room = callee.split(".")[1]
+            if not self.rooms or self.rooms[-1] != room:
+                self.rooms.append(room)
+
+
+def main() -> None:
+    """Reconstruct and tell."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent)
+    sys.path.insert(0, str(parser.parse_args().root.resolve()))
+    from engine.config import resolve_config
+    from engine.pipeline import reconstruct
+    from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+
+    with tempfile.TemporaryDirectory() as folder:
+        scene, output = Path(folder) / "scene", Path(folder) / "output"
+        config = GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=200)
+        write_generated_scene(scene, config)
+        settings = resolve_config("fast", assignments=[f"{name}={value}" for name, value in SETTINGS.items()])
+        visits = Visits()
+        sys.setprofile(visits)
+        try:
+            reconstruct(scene, output, settings, threads=1)
+        finally:
+            sys.setprofile(None)
+    everywhere = {"errors", "events", "stages", "threads", "writing", "files_atomic", "versions", "config"}
+    rooms = [room for room in visits.rooms if room not in everywhere]
+    path = [room for place, room in enumerate(rooms) if place == 0 or rooms[place - 1] != room]
+    print(" -> ".join(path))
+    print(f"{len(set(path))} rooms, {len(path)} visits, {len(path) - len(set(path))} returns")
+
+
+if __name__ == "__main__":
+    main()
