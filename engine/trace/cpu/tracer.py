@@ -77,7 +77,6 @@ class CpuTracer:
         self._gaussians = gaussians
         self._features = np.empty((count, 0), np.float32) if features is None else features
         write_records(self._records, *Parameters.of(gaussians), self.settings.q)
-        write_boxes(self._boxes, *Parameters.of(gaussians), self.settings.q, self._padding)
         self._packets.build(self._records)
         self._built_singles = False
         self._build = object()
@@ -91,7 +90,7 @@ class CpuTracer:
         parameters, q = Parameters.of(self._gaussians), self.settings.q
         refresh_records(self._records, ids, *parameters, q)
         self._packets.refresh(self._records, ids)
-        if outgrown_boxes(self._boxes, ids, *parameters, q, self._padding):
+        if self._built_singles and outgrown_boxes(self._boxes, ids, *parameters, q, self._padding):
             self._built_singles = False
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
@@ -147,6 +146,8 @@ class CpuTracer:
         use_threads(self.threads)
         packets, alone = find_packets(rays, self._ways)
         if len(alone) and not self._built_singles:
+            assert self._gaussians is not None, "build first"
+            write_boxes(self._boxes, *Parameters.of(self._gaussians), self.settings.q, self._padding)
             self._singles.build(self._boxes)
             self._built_singles = True
         return packets, alone
