@@ -61,7 +61,7 @@ def test_a_stage_is_read_with_everything_in_it(tmp_path: Path) -> None:
         (BALL + "scale = 0", r"meshes\[0\]\.scale"),
         (BALL + 'file = "x.ply"', "either a file or a shape"),
         (BALL + 'on = { view = "a.jpg" }', "either view and pixel, or origin and direction"),
-        (BALL + 'material = { kind = "file" }', "only a GLB brings materials"),
+        ('[[meshes]]\nfile = "a.glb"', "materials of a GLB are not read"),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]', r"lights\[0\].*intensity"),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = -1', r"lights\[0\]\.intensity"),
         ('[[lights]]\nkind = "directional"\ndirection = [0, 0, 0]\nirradiance = 1', "has no length"),
