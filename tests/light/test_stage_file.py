@@ -130,3 +130,9 @@ def test_reading_stages_needs_neither_torch_nor_numba() -> None:
 
 def test_a_stage_has_the_scene_as_trained_colours_in_shadow_by_default() -> None:
     assert Stage().gaussians[0].light == "shadowed"
+
+
+def test_the_examples_are_stages() -> None:
+    folder = Path(__file__).resolve().parents[2] / "examples" / "light"
+    stages = [read_stage(path) for path in sorted(folder.glob("*.toml"))]
+    assert [stage.gaussians[0].light for stage in stages] == ["shadowed", "emissive", "relit"]
