@@ -88,7 +88,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         read_stage(tmp_path / "none.toml")
     path = tmp_path / "stage.toml"
     for text, key in (
-        ('[[meshes]]\nfile = "gone.glb"', r"meshes\[0\]\.file"),
+        ('[[meshes]]\nfile = "gone.obj"', r"meshes\[0\]\.file"),
         (BALL + 'material = { kind = "diffuse", texture = "gone.png" }', r"meshes\[0\]\.material\.texture"),
         ('[environment]\nfile = "gone.hdr"', r"environment\.file"),
         ('[[gaussians]]\nfile = "gone.ply"', r"gaussians\[0\]\.file"),
