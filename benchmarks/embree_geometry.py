@@ -26,13 +26,16 @@ from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_radii
 from engine.gaussians.order import morton_order
 from engine.importers import read_scene
+from engine.rays import RayBatch
+from engine.trace.cpu.bundles import Forward, Hits, Limits, Parameters, Rays, Scene
 from engine.trace.cpu.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon
 from engine.trace.cpu.kernels_records import write_boxes, write_records
-from engine.trace.cpu.memory import aligned_empty
+from engine.trace.cpu.memory import Pool, aligned_empty, empty_result, outputs
 from engine.trace.cpu.packets import PacketTracer, find_packets
 from engine.trace.cpu.single_rays import SingleRayTracer
 from engine.trace.embree_library import Handle
 from engine.trace.kernels_native import int32_pointer
+from engine.trace.protocol import TraceResult
 
 THREADS, REPEATS = 2, 7
 INSTANCE, REFIT, FLOAT3X4_COLUMN_MAJOR = 121, 3, 0x9234
@@ -61,14 +64,30 @@ class Boxes:
 
 def prepare(gaussians: FlatGaussians) -> Boxes:
     """Records and boxes of the Gaussians."""
-    parameters = (
-        gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales, gaussians.opacity_logits,
-    )  # fmt: skip
+    parameters = Parameters.of(gaussians)
     records = aligned_empty((len(gaussians), RECORD_WORDS))
     boxes = np.empty((len(gaussians), 6), np.float32)
     write_records(records, *parameters, SETTINGS.q)
     write_boxes(boxes, *parameters, SETTINGS.q, 0.0)
     return Boxes(gaussians, records, boxes)
+
+
+def prepared(
+    scene: Boxes, harmonics: np.ndarray, origins: np.ndarray, directions: np.ndarray
+) -> tuple[TraceResult, Forward]:
+    """Room for the outputs of the rays, and a pass that records nothing."""
+    count = len(origins)
+    result = empty_result(count, 0)
+    no_hits = Hits(
+        np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0, np.float32), np.empty(0, np.float32),
+        np.empty((0, 3), np.float32),
+    )  # fmt: skip
+    features = np.empty((len(scene.gaussians), 0), np.float32)
+    forward = Forward(
+        Rays.of(RayBatch(origins, directions)), Scene(scene.records, harmonics, features),
+        Limits.of(SETTINGS), outputs(result), no_hits, False,
+    )  # fmt: skip
+    return result, forward
 
 
 class Instances(SingleRayTracer):
@@ -135,9 +154,8 @@ def resident_mb() -> float:
 def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
     """Boxes against instances; a new hierarchy against a refitted one."""
     count = len(scene.gaussians)
-    none = np.empty((count, 0), np.float32)
-    boxes = SingleRayTracer(SETTINGS, threads=THREADS, build_quality=1)
-    instances = Instances(SETTINGS, threads=THREADS, build_quality=1)
+    boxes = SingleRayTracer(Limits.of(SETTINGS), threads=THREADS, build_quality=1)
+    instances = Instances(Limits.of(SETTINGS), threads=THREADS, build_quality=1)
     gc.collect()
     before = resident_mb()
     build_boxes = 1e3 * seconds(lambda: boxes.build(scene.boxes))
@@ -145,11 +163,17 @@ def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
     build_instances = 1e3 * seconds(lambda: instances.build_instances(scene.gaussians))
     after = resident_mb()
 
-    def trace(tracer: SingleRayTracer) -> Callable[[], object]:
-        return lambda: tracer.trace(origins, directions, scene.records, scene.gaussians, none, record=False)
+    everything = np.arange(len(origins))
 
-    same = boxes.trace(origins, directions, scene.records, scene.gaussians, none, record=False)
-    other = instances.trace(origins, directions, scene.records, scene.gaussians, none, record=False)
+    def trace(tracer: SingleRayTracer) -> Callable[[], TraceResult]:
+        def work() -> TraceResult:
+            result, forward = prepared(scene, scene.gaussians.sh, origins, directions)
+            tracer.trace(forward, everything)
+            return result
+
+        return work
+
+    same, other = trace(boxes)(), trace(instances)()
     apart = float(np.abs(same.rgb_srgb - other.rgb_srgb).max())
     print(f"{count} Gaussians, {same.hit_counts.mean():.1f} hits a ray; pictures apart by {apart:.1e}")
     took = medians({"boxes": trace(boxes), "instances": trace(instances)})
@@ -172,7 +196,7 @@ def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
 
     rng = np.random.default_rng(0)
     size = np.exp(scene.gaussians.log_scales).mean()
-    anew = SingleRayTracer(SETTINGS, threads=THREADS, build_quality=1)
+    anew = SingleRayTracer(Limits.of(SETTINGS), threads=THREADS, build_quality=1)
     for moved in (0.1, 0.5, 2.0):
         scene.gaussians.means_world += moved * size * rng.normal(size=(count, 3)).astype(np.float32)
         fresh = prepare(scene.gaussians)
@@ -195,15 +219,13 @@ def storage(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
     sh = (0.1 * rng.normal(size=(len(g), 9, 3))).astype(np.float32)
     sh[:, 0] = g.sh[:, 0]
     small = np.round(sh / SH_STEP).astype(np.int16)
-    tracer = PacketTracer(SETTINGS, threads=THREADS)
-    tracer.build(scene.records, 0.0)
-    packets = find_packets(origins, directions)
-    none = np.empty((len(g), 0), np.float32)
+    tracer = PacketTracer(Limits.of(SETTINGS), threads=THREADS, pool=Pool())
+    tracer.build(scene.records)
+    packets, _ = find_packets(RayBatch(origins, directions), "always")
+    kept = tracer.room(packets, len(origins), recording=False)
 
     def trace(harmonics: np.ndarray) -> Callable[[], object]:
-        held = FlatGaussians(g.means_world, g.quats_wxyz, g.log_scales, g.opacity_logits, sh)
-        held.sh = harmonics
-        return lambda: tracer.trace(origins, directions, packets, scene.records, held, none, record=False)
+        return lambda: tracer.trace(prepared(scene, harmonics, origins, directions)[1], packets, kept)
 
     took = medians({"float32": trace(sh), "int16": trace(small)})
     print(f"  packets, harmonics as float32 {took['float32']:.1f} ms, as 16 bits {took['int16']:.1f} ms")

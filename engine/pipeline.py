@@ -100,7 +100,7 @@ def reconstruct(
         if not (output / SCENE).exists():
             with _stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)):
                 gaussians = _train(dataset, output, config.train, threads, tell, should_stop)
-                write_gaussian_ply(gaussians, output / SCENE)
+                write_gaussian_ply(gaussians, output / SCENE, near_world=dataset.near_world)
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
             with _stage("evaluate", tell, len(dataset.test_indices)):
                 _evaluate(dataset, output, config, threads, tell)

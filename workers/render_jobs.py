@@ -12,7 +12,7 @@ from engine.config import read_config
 from engine.errors import OutputError
 from engine.events import Listener
 from engine.gaussians.model import FlatGaussians
-from engine.gaussians.ply import read_gaussian_ply
+from engine.gaussians.ply import read_gaussian_ply, read_near_world
 from engine.light.stage_file import read_stage
 from engine.pipeline import CONFIG, SCENE, run_scene
 from engine.render.cameras import RenderCamera
@@ -144,7 +144,9 @@ def _read_run(options: dict[str, Any]) -> _Source:
 
 
 def _read_file(options: dict[str, Any]) -> _Source:
-    return _Source(open_scene(options["source"], quiet=options["quiet"]), TraceSettings())
+    path: Path = options["source"]
+    gaussians = open_scene(path, quiet=options["quiet"])
+    return _Source(gaussians, TraceSettings(), read_near_world(path))
 
 
 def stage_place(

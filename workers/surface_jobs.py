@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from engine.config import read_config
 from engine.errors import ConfigError, DatasetError, OutputError
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.ply import read_near_world
 from engine.pipeline import CONFIG, SCENE, run_scene
 from engine.render.cameras import RenderCamera
 from engine.scene import load_scene, scene_extent, split_views
@@ -96,7 +97,8 @@ def _cameras(
         settings = config.train.trace
     elif scene is not None:
         photographs = load_scene(scene)
-        indices, settings, near_world = np.arange(len(photographs.views)), TraceSettings(), 0.0
+        indices, settings = np.arange(len(photographs.views)), TraceSettings()
+        near_world = read_near_world(source)
     else:
         return cameras_around(gaussians, options.depth_side), TraceSettings()
     if len(indices) == 0:

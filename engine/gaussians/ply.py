@@ -3,7 +3,8 @@
 One element ``vertex``, all float32: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``, ``f_rest_*``
 channel-major (all red, then green, then blue), ``opacity`` (logit), ``scale_0..2`` (ln of the standard
 deviations) and ``rot_0..3`` (w, x, y, z). The flat axis, the normal r1, is axis 0 with scale ln 1e-5, so that
-every viewer of 3DGS files shows the scene.
+every viewer of 3DGS files shows the scene. A comment ``near_world`` gives the distance from a camera at which
+it begins to be seen, as in training, so that one file is one picture.
 """
 
 from collections.abc import Iterator
@@ -26,13 +27,16 @@ from engine.gaussians.ply_format import (
 
 MAX_SH_DEGREE = 3
 ROWS_AT_ONCE = 65536
+_NEAR = "near_world"
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 
-def write_gaussian_ply(gaussians: FlatGaussians, path: Path, *, sh_pad_degree: int | None = None) -> None:
+def write_gaussian_ply(
+    gaussians: FlatGaussians, path: Path, *, sh_pad_degree: int | None = None, near_world: float = 0.0
+) -> None:
     """Write ``gaussians`` as a 3DGS PLY, atomically and in blocks.
 
     Args:
@@ -40,6 +44,7 @@ def write_gaussian_ply(gaussians: FlatGaussians, path: Path, *, sh_pad_degree: i
         path: the file, replaced if it exists.
         sh_pad_degree: write at least this degree of spherical harmonics, the missing ones zero; some
             importers accept only degree 3.
+        near_world: the distance from a camera at which the scene begins to be seen, kept as a comment.
 
     Raises:
         SceneFileError: nothing to write, a parameter is not finite, or the file cannot be written.
@@ -54,7 +59,27 @@ def write_gaussian_ply(gaussians: FlatGaussians, path: Path, *, sh_pad_degree: i
     names = [*_POSITION, *_NORMAL, *_SH_DC, *_rest_names(degree), "opacity", *_scale_names(3), *_ROTATION]
     dtype = np.dtype([(name, "<f4") for name in names])
     element = PlyWriteElement("vertex", len(gaussians), dtype, _row_blocks(gaussians, degree, dtype))
-    write_ply(path, [element])
+    write_ply(path, [element], [f"{_NEAR} {near_world!r}"] if near_world > 0 else ())
+
+
+def read_near_world(path: Path) -> float:
+    """The distance from a camera at which the scene in a file begins to be seen; 0 where nothing says so.
+
+    Raises:
+        SceneFileError: a PLY is damaged.
+    """
+    if path.suffix.lower() != ".ply":
+        return 0.0
+    for comment in read_ply_header(path).comments:
+        name, _, value = comment.partition(" ")
+        if name == _NEAR:
+            try:
+                return max(float(value), 0.0)
+            except ValueError:
+                raise SceneFileError(
+                    f"{path}: its comment {_NEAR} is {value!r}, which is no number."
+                ) from None
+    return 0.0
 
 
 def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void]) -> Iterator[np.ndarray]:

@@ -1,8 +1,20 @@
-"""Numba intrinsics: raw memory, a native function by its address, and a shared counter."""
+"""Numba's tools: kernels that count no references, raw memory, native functions, and a shared counter."""
+
+from collections.abc import Callable
+from typing import Any
 
 import llvmlite.ir as ir
-from numba import types
+from numba import njit, types
 from numba.extending import intrinsic
+
+
+def lean(**options: Any) -> Callable[[Any], Any]:
+    """Njit for functions that make no arrays: nothing counts references to those that they use.
+
+    Else every use of a field of a named tuple counts one up and down again, one by one for all threads, which
+    takes longer than the work of a hit.
+    """
+    return njit(_nrt=False, error_model="numpy", **options)
 
 
 def _pointer_cast(element):

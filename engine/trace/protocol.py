@@ -174,8 +174,8 @@ class Tracer(Protocol):
     def refresh(self, ids: Int32[np.ndarray, " u"] | None = None) -> None:
         """Read the changed parameters of the Gaussians ``ids`` (None: all) without rebuilding.
 
-        Hits are evaluated from the new parameters; a Gaussian that has left the box it was built with is
-        seen only inside that box until the next :meth:`build`.
+        What is seen afterwards is what would be after :meth:`build`, however far Gaussians have moved; only
+        the time that it takes may grow.
         """
         ...
 

@@ -139,10 +139,10 @@ def test_opaque_stacks_with_clamped_alpha(rng: np.random.Generator, second_phase
 
 def test_clamped_alpha_has_no_gradient() -> None:
     opaque = facing_z([0.0, 0.0, 0.0], opacities=0.999)
-    rays = f32([[0.0, 0.0, -2.0], [0.0, 0.5, -2.0]]), f32([[0.0, 0.0, 1.0]] * 2)
+    rays = RayBatch(f32([[0.0, 0.0, -2.0], [0.0, 0.5, -2.0]]), f32([[0.0, 0.0, 1.0]] * 2))
     for ray, clamped in ((0, True), (1, False)):
         tracer = make_tracer(opaque, alpha_max=0.95)
-        seen = tracer.trace(rays[0][ray : ray + 1], rays[1][ray : ray + 1], record=True)
+        seen = tracer.trace(rays[ray : ray + 1], record=True)
         assert bool(seen.transmittance[0] == pytest.approx(0.05, rel=1e-5)) is clamped
         assert seen.hits is not None
         gradients = tracer.backward(seen.hits, TraceGradients(f32([[1.0, 1.0, 1.0]])))
@@ -200,7 +200,7 @@ def test_opaque_gaussian_behind_many_faint_ones(rng: np.random.Generator) -> Non
     scene = facing_z(centres, opacities=opacities, rgb_srgb=rng.random((300, 3)))
     origins = f32(np.tile([0.0, 0.0, 4.0], (40, 1)))
     directions = f32(unit(0.3 * rng.normal(size=(40, 3)) - origins))
-    ours, _ = assert_like_twin(scene, origins, directions)
+    ours, _ = assert_like_twin(scene, RayBatch(origins, directions))
     assert ours.hit_counts.max() > 3 * K
     assert ours.transmittance.min() < 1e-3
 

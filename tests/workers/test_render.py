@@ -7,6 +7,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from engine.gaussians.ply import read_gaussian_ply, read_near_world, write_gaussian_ply
 from engine.render.images import read_channels, read_image
 
 SIZE = ("--width", 32, "--height", 24)
@@ -67,6 +68,35 @@ def test_exr_has_depth_and_normals(run, octasplat, tmp_path):
     assert (layers["Z"][seen] > 0).all()
     length = np.sqrt(sum(layers[f"N.{axis}"] ** 2 for axis in "xyz"))
     np.testing.assert_allclose(length[seen], 1, atol=1e-3)
+
+
+def test_a_run_and_its_file_give_one_picture(run, octasplat, tmp_path):
+    gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
+    near = read_near_world(run.output / "scene.ply")
+    assert near > 0
+    # Right before the largest thing: what is nearer than the training saw is not to be seen in either.
+    nearest = int(np.argmax(gaussians.opacities * gaussians.scales.prod(axis=1)))
+    pose = np.eye(4)
+    pose[:3, 3] = gaussians.means_world[nearest] - [0, 0, 0.5 * near]
+    path = write_path(tmp_path / "cameras.json", pose)
+    shown = []
+    for source in (run.output, run.output / "scene.ply"):
+        pattern = tmp_path / source.name / "%d.png"
+        result = octasplat("render", source, "-o", pattern, "--path", path, "--background", "white")
+        assert result.exit_code == 0, result.output
+        shown.append(read_image(pattern.with_name("0.png")))
+    np.testing.assert_array_equal(*shown)
+    bare = tmp_path / "bare.ply"
+    write_gaussian_ply(gaussians, bare)
+    assert (
+        octasplat(
+            "render", bare, "-o", tmp_path / "%d.png", "--path", path, "--background", "white"
+        ).exit_code
+        == 0
+    )
+    assert np.abs(read_image(tmp_path / "0.png") - shown[0]).max() > 0.05, (
+        "nothing lay before the near distance"
+    )
 
 
 def test_background(run, octasplat, tmp_path):

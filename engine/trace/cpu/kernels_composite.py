@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from engine.trace.cpu.kernels_sh import colour
+from engine.trace.kernels_native import lean
 
 
 class Front(NamedTuple):
@@ -41,7 +41,7 @@ class Hit(NamedTuple):
     normal_z: float
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def begin(forward, r, place):
     """Ray ``r`` before its first hit; its hits will be stored from ``place`` on."""
     for f in range(forward.scene.features.shape[1]):
@@ -51,7 +51,7 @@ def begin(forward, r, place):
     return Front(1.0, 1.0, False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.float32(0.0), 0, place)
 
 
-@njit(forceinline=True, fastmath={"contract"}, error_model="numpy")
+@lean(forceinline=True, fastmath={"contract"})
 def composite(front, hit, forward, r, direction, basis):
     """The ray ``r`` behind ``hit``, and whether it ends there.
 
@@ -98,7 +98,7 @@ def composite(front, hit, forward, r, direction, basis):
     return behind, ends
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def finish(front, forward, r):
     """Write the outputs of ray ``r``."""
     out = forward.out

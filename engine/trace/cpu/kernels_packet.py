@@ -48,6 +48,7 @@ from engine.trace.cpu.kernels_simd import (
     prefetch,
 )
 from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
+from engine.trace.kernels_native import lean
 
 STACK = 1024
 """Words for the nodes that wait, two each; a walk goes down at once, so that seven wait on each level."""
@@ -199,7 +200,7 @@ def packet_starts(origins, directions, most, least_cosine, starts):
     return packets
 
 
-@njit(error_model="numpy")
+@lean()
 def write_pyramid(directions, first, last, pyramid):
     """The pyramid around rays ``first`` to ``last``."""
     planes, frame = pyramid.planes, pyramid.frame
@@ -244,7 +245,7 @@ def write_pyramid(directions, first, last, pyramid):
     write_bins(directions, first, last, frame, pyramid.below)
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@lean(fastmath={"contract"})
 def gather_candidates(tree, pyramid, origin, farthest, walk, candidates):
     """The Gaussians whose ellipse a ray of the pyramid may meet before ``farthest``; returns how many.
 
@@ -317,7 +318,7 @@ def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
     return candidates, count
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@lean(fastmath={"contract"})
 def sort_candidates(candidates, count, order, histogram):
     """Order the candidates in chunks by distance, within a chunk by the rays that may meet them."""
     keys, bounds, cells, near = candidates.keys, candidates.bounds, candidates.cells, candidates.near
@@ -349,7 +350,7 @@ def sort_candidates(candidates, count, order, histogram):
             block_rays[place // WIDTH] |= candidates.masks[which]
 
 
-@njit(error_model="numpy")
+@lean()
 def keep_candidates(candidates, count, order):
     """Leave the candidates in the order in which they were found, where none is needed."""
     for b in range((count + WIDTH - 1) // WIDTH):
@@ -359,7 +360,7 @@ def keep_candidates(candidates, count, order):
         candidates.block_rays[k // WIDTH] |= candidates.masks[k]
 
 
-@njit
+@lean()
 def insertion_sort(keys, count):
     """Sort a few keys in place."""
     for i in range(1, count):
@@ -371,7 +372,7 @@ def insertion_sort(keys, count):
         keys[j] = key
 
 
-@njit
+@lean()
 def sort_keys(keys, scratch, count, histogram):
     """Sort in place by the upper bits of the keys' distances, then by the rest.
 
@@ -406,7 +407,7 @@ def sort_keys(keys, scratch, count, histogram):
     insertion_sort(keys, count)
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@lean(fastmath={"contract"})
 def write_rows(candidates, count, scene, origin, coloured):
     """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit.
 
@@ -460,7 +461,7 @@ def write_rows(candidates, count, scene, origin, coloured):
         block[ALPHA_0, lane] = record[OPACITY]
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@lean(forceinline=True, fastmath={"contract"})
 def meet_blocks(candidates, ray, first, last, direction):
     """Candidates of blocks ``first`` to ``last`` whose octagon the packet's ray ``ray`` meets; how many.
 

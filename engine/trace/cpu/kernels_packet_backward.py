@@ -22,7 +22,7 @@ from engine.trace.cpu.kernels_records import rotation_columns
 from engine.trace.cpu.kernels_sh import write_basis
 from engine.trace.cpu.kernels_simd import prefetch
 from engine.trace.cpu.kernels_single_backward import Moments, write_gradients
-from engine.trace.kernels_native import next_from_counter
+from engine.trace.kernels_native import lean, next_from_counter
 
 # --- sums of a packet's rays for one of its Gaussians, float64 scratch ---
 H, HU, HV, HUU, HUV, HVV = range(6)
@@ -33,6 +33,8 @@ MOMENTS = 19
 # --- row that a packet hands on, float32, one cache line: tau takes the third moments' place ---
 TAU, TAU_U, TAU_V = range(6, 9)
 ROW_WORDS = 16
+START_SLOTS = 256
+"""Gaussians of a packet that a thread has room for at first."""
 
 
 class Rows(NamedTuple):
@@ -45,161 +47,170 @@ class Rows(NamedTuple):
     features: Float32[np.ndarray, "e f"]
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
-def replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows):
-    """Write the rows of packets, each the rays ``packets[p, 0]`` to ``packets[p, 1]``, one by one.
+@lean(fastmath={"contract"})
+def replay_packet(packet, memory, rays, packets, hits, kept, counts, parameters, features, limits, g, rows):
+    """Write the rows of one packet, the rays ``packets[packet, 0]`` to ``packets[packet, 1]``.
 
-    dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> for every channel, the
-    part behind summed from the back in float64: as a difference of sums it would drown behind opaque
-    surfaces.
+    dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> for every channel, the part behind summed from
+    the back in float64: as a difference of sums it would drown behind opaque surfaces.
     """
+    basis, g_basis, through, sums = memory
+    first, last, slots = packets[packet, 0], packets[packet, 1], kept.slot_counts[packet]
     basis_count = rows.sh.shape[1]
     feature_count = features.shape[1]
     max_hits, alpha_limit = limits.max_hits, np.float32(limits.alpha_max)
     means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
     means_at, quats_at, log_scales_at = means.ctypes.data, quats.ctypes.data, log_scales.ctypes.data
+    base = rows.firsts[packet]
+    for slot in range(slots):
+        for column in range(MOMENTS):
+            sums[slot, column] = 0.0
+        for j in range(basis_count):
+            for channel in range(3):
+                rows.sh[base + slot, j, channel] = np.float32(0.0)
+        for f in range(feature_count):
+            rows.features[base + slot, f] = np.float32(0.0)
+    for r in range(first, last):
+        count = counts[r]
+        start = hits.starts[r]
+        t = 1.0
+        median = -1
+        for k in range(count):
+            through[k] = t
+            left = t * (1.0 - np.float64(hits.alphas[start + k]))
+            if t > 0.5 and left <= 0.5:
+                median = k
+            t = left
+        g0, g1, g2 = np.float64(g.rgb[r, 0]), np.float64(g.rgb[r, 1]), np.float64(g.rgb[r, 2])
+        gn0 = gn1 = gn2 = gd = gm = 0.0
+        d0, d1, d2 = ray_direction(rays, r)
+        if g.with_geometry:
+            gd, gm = np.float64(g.depth_sum[r]), np.float64(g.depth_median[r])
+            gn0, gn1, gn2 = (
+                np.float64(g.normal[r, 0]),
+                np.float64(g.normal[r, 1]),
+                np.float64(g.normal[r, 2]),
+            )
+        error = np.float64(g.ray_errors[r])
+        write_basis(basis, basis_count, d0, d1, d2)
+        for j in range(basis_count):
+            b = np.float32(basis[j])
+            g_basis[j, 0], g_basis[j, 1], g_basis[j, 2] = (
+                b * g.rgb[r, 0],
+                b * g.rgb[r, 1],
+                b * g.rgb[r, 2],
+            )
+        behind = np.float64(g.transmittance[r]) * t
+        for k in range(count - 1, -1, -1):
+            e = start + k
+            slot = kept.slots[e]
+            row = base + slot
+            alpha = np.float64(hits.alphas[e])
+            weight = alpha * through[k]
+            value = g0 * hits.rgb[e, 0] + g1 * hits.rgb[e, 1] + g2 * hits.rgb[e, 2]
+            u, v = np.float64(kept.us[e]), np.float64(kept.vs[e])
+            if g.with_geometry:
+                i = kept.slot_ids[first * max_hits + slot]
+                value += gd * hits.distances[e]
+                r1, _r2, _r3 = rotation_columns(
+                    np.float64(quats[i, 0]), np.float64(quats[i, 1]),
+                    np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+                )  # fmt: skip
+                along = gn0 * r1[0] + gn1 * r1[1] + gn2 * r1[2]
+                # the normal is turned towards the viewer
+                side = -1.0 if d0 * r1[0] + d1 * r1[1] + d2 * r1[2] > 0.0 else 1.0
+                facing = side * weight
+                value += side * along
+                gt = (gd * weight + (gm if k == median else 0.0)) * hits.distances[e]
+                sums[slot, GT] += gt
+                sums[slot, GTU] += gt * u
+                sums[slot, GTV] += gt * v
+                sums[slot, N_0] += facing * gn0
+                sums[slot, N_1] += facing * gn1
+                sums[slot, N_2] += facing * gn2
+            for f in range(feature_count):
+                i = kept.slot_ids[first * max_hits + slot]
+                value += np.float64(g.features[r, f]) * features[i, f]
+                rows.features[row, f] += np.float32(weight * g.features[r, f])
+            g_alpha = through[k] * value - behind / (1.0 - alpha)
+            behind += weight * value
+            h = 0.0 if hits.alphas[e] >= alpha_limit else g_alpha * alpha
+            hu, hv = h * u, h * v
+            sums[slot, H] += h
+            sums[slot, HU] += hu
+            sums[slot, HV] += hv
+            huu, huv, hvv = hu * u, hu * v, hv * v
+            sums[slot, HUU] += huu
+            sums[slot, HUV] += huv
+            sums[slot, HVV] += hvv
+            sums[slot, HUUU] += huu * u
+            sums[slot, HUUV] += huu * v
+            sums[slot, HUVV] += hvv * u
+            sums[slot, HVVV] += hvv * v
+            sums[slot, W] += weight
+            sums[slot, ERROR] += weight * error
+            sums[slot, COUNT] += 1.0
+            # a colour clamped at zero gets no gradient
+            w = np.float32(weight)
+            wr = w if hits.rgb[e, 0] > 0.0 else np.float32(0.0)
+            wg = w if hits.rgb[e, 1] > 0.0 else np.float32(0.0)
+            wb = w if hits.rgb[e, 2] > 0.0 else np.float32(0.0)
+            for j in range(basis_count):
+                rows.sh[row, j, 0] += wr * g_basis[j, 0]
+                rows.sh[row, j, 1] += wg * g_basis[j, 1]
+                rows.sh[row, j, 2] += wb * g_basis[j, 2]
+    ox, oy, oz = ray_origin(rays, first)
+    for slot in range(slots):
+        if slot + AHEAD < slots:
+            ahead = kept.slot_ids[first * max_hits + slot + AHEAD]
+            prefetch(means_at + ahead * 12)
+            prefetch(quats_at + ahead * 16)
+            prefetch(log_scales_at + ahead * 8)
+        i = kept.slot_ids[first * max_hits + slot]
+        row = base + slot
+        rows.ids[row] = i
+        # The frame in float64 from the raw parameters: float32 axes would cost needles digits.
+        r1, r2, r3 = rotation_columns(
+            np.float64(quats[i, 0]), np.float64(quats[i, 1]),
+            np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+        )  # fmt: skip
+        x, y, z = (
+            np.float64(means[i, 0]) - ox,
+            np.float64(means[i, 1]) - oy,
+            np.float64(means[i, 2]) - oz,
+        )
+        inverse = 1.0 / (x * r1[0] + y * r1[1] + z * r1[2])
+        xa = (x * r2[0] + y * r2[1] + z * r2[2]) * exponential(-np.float64(log_scales[i, 0]))
+        xb = (x * r3[0] + y * r3[1] + z * r3[2]) * exponential(-np.float64(log_scales[i, 1]))
+        hu, hv = sums[slot, HU], sums[slot, HV]
+        huu, huv, hvv = sums[slot, HUU], sums[slot, HUV], sums[slot, HVV]
+        tau = sums[slot, GT] - huu - xa * hu - hvv - xb * hv
+        tau_u = sums[slot, GTU] - sums[slot, HUUU] - xa * huu - sums[slot, HUVV] - xb * huv
+        tau_v = sums[slot, GTV] - sums[slot, HUUV] - xa * huv - sums[slot, HVVV] - xb * hvv
+        for column in range(ROW_WORDS):
+            rows.sums[row, column] = sums[slot, column]
+        rows.sums[row, TAU], rows.sums[row, TAU_U] = tau * inverse, tau_u * inverse
+        rows.sums[row, TAU_V] = tau_v * inverse
+
+
+@njit(error_model="numpy")
+def replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows):
+    """Replay packets until the ``counter`` has passed the last."""
     basis = np.empty(16, np.float64)
     g_basis = np.empty((16, 3), np.float32)
-    through = np.empty(max_hits, np.float64)
-    sums = np.empty((256, MOMENTS), np.float64)
+    through = np.empty(limits.max_hits, np.float64)
+    sums = np.empty((START_SLOTS, MOMENTS), np.float64)
     while True:
         packet = next_from_counter(counter.ctypes.data)
         if packet >= len(packets):
             break
-        first, last = packets[packet, 0], packets[packet, 1]
         slots = kept.slot_counts[packet]
         if slots > len(sums):
             sums = np.empty((slots * 5 // 4, MOMENTS), np.float64)
-        base = rows.firsts[packet]
-        for slot in range(slots):
-            for column in range(MOMENTS):
-                sums[slot, column] = 0.0
-            for j in range(basis_count):
-                for channel in range(3):
-                    rows.sh[base + slot, j, channel] = np.float32(0.0)
-            for f in range(feature_count):
-                rows.features[base + slot, f] = np.float32(0.0)
-        for r in range(first, last):
-            count = counts[r]
-            start = hits.starts[r]
-            t = 1.0
-            median = -1
-            for k in range(count):
-                through[k] = t
-                left = t * (1.0 - np.float64(hits.alphas[start + k]))
-                if t > 0.5 and left <= 0.5:
-                    median = k
-                t = left
-            g0, g1, g2 = np.float64(g.rgb[r, 0]), np.float64(g.rgb[r, 1]), np.float64(g.rgb[r, 2])
-            gn0 = gn1 = gn2 = gd = gm = 0.0
-            d0, d1, d2 = ray_direction(rays, r)
-            if g.with_geometry:
-                gd, gm = np.float64(g.depth_sum[r]), np.float64(g.depth_median[r])
-                gn0, gn1, gn2 = (
-                    np.float64(g.normal[r, 0]),
-                    np.float64(g.normal[r, 1]),
-                    np.float64(g.normal[r, 2]),
-                )
-            error = np.float64(g.ray_errors[r])
-            write_basis(basis, basis_count, d0, d1, d2)
-            for j in range(basis_count):
-                b = np.float32(basis[j])
-                g_basis[j, 0], g_basis[j, 1], g_basis[j, 2] = (
-                    b * g.rgb[r, 0],
-                    b * g.rgb[r, 1],
-                    b * g.rgb[r, 2],
-                )
-            behind = np.float64(g.transmittance[r]) * t
-            for k in range(count - 1, -1, -1):
-                e = start + k
-                slot = kept.slots[e]
-                row = base + slot
-                alpha = np.float64(hits.alphas[e])
-                weight = alpha * through[k]
-                value = g0 * hits.rgb[e, 0] + g1 * hits.rgb[e, 1] + g2 * hits.rgb[e, 2]
-                u, v = np.float64(kept.us[e]), np.float64(kept.vs[e])
-                if g.with_geometry:
-                    i = kept.slot_ids[first * max_hits + slot]
-                    value += gd * hits.distances[e]
-                    r1, _r2, _r3 = rotation_columns(
-                        np.float64(quats[i, 0]), np.float64(quats[i, 1]),
-                        np.float64(quats[i, 2]), np.float64(quats[i, 3]),
-                    )  # fmt: skip
-                    along = gn0 * r1[0] + gn1 * r1[1] + gn2 * r1[2]
-                    # the normal is turned towards the viewer
-                    side = -1.0 if d0 * r1[0] + d1 * r1[1] + d2 * r1[2] > 0.0 else 1.0
-                    facing = side * weight
-                    value += side * along
-                    gt = (gd * weight + (gm if k == median else 0.0)) * hits.distances[e]
-                    sums[slot, GT] += gt
-                    sums[slot, GTU] += gt * u
-                    sums[slot, GTV] += gt * v
-                    sums[slot, N_0] += facing * gn0
-                    sums[slot, N_1] += facing * gn1
-                    sums[slot, N_2] += facing * gn2
-                for f in range(feature_count):
-                    i = kept.slot_ids[first * max_hits + slot]
-                    value += np.float64(g.features[r, f]) * features[i, f]
-                    rows.features[row, f] += np.float32(weight * g.features[r, f])
-                g_alpha = through[k] * value - behind / (1.0 - alpha)
-                behind += weight * value
-                h = 0.0 if hits.alphas[e] >= alpha_limit else g_alpha * alpha
-                hu, hv = h * u, h * v
-                sums[slot, H] += h
-                sums[slot, HU] += hu
-                sums[slot, HV] += hv
-                huu, huv, hvv = hu * u, hu * v, hv * v
-                sums[slot, HUU] += huu
-                sums[slot, HUV] += huv
-                sums[slot, HVV] += hvv
-                sums[slot, HUUU] += huu * u
-                sums[slot, HUUV] += huu * v
-                sums[slot, HUVV] += hvv * u
-                sums[slot, HVVV] += hvv * v
-                sums[slot, W] += weight
-                sums[slot, ERROR] += weight * error
-                sums[slot, COUNT] += 1.0
-                # a colour clamped at zero gets no gradient
-                w = np.float32(weight)
-                wr = w if hits.rgb[e, 0] > 0.0 else np.float32(0.0)
-                wg = w if hits.rgb[e, 1] > 0.0 else np.float32(0.0)
-                wb = w if hits.rgb[e, 2] > 0.0 else np.float32(0.0)
-                for j in range(basis_count):
-                    rows.sh[row, j, 0] += wr * g_basis[j, 0]
-                    rows.sh[row, j, 1] += wg * g_basis[j, 1]
-                    rows.sh[row, j, 2] += wb * g_basis[j, 2]
-        ox, oy, oz = ray_origin(rays, first)
-        for slot in range(slots):
-            if slot + AHEAD < slots:
-                ahead = kept.slot_ids[first * max_hits + slot + AHEAD]
-                prefetch(means_at + ahead * 12)
-                prefetch(quats_at + ahead * 16)
-                prefetch(log_scales_at + ahead * 8)
-            i = kept.slot_ids[first * max_hits + slot]
-            row = base + slot
-            rows.ids[row] = i
-            # The frame in float64 from the raw parameters: float32 axes would cost needles digits.
-            r1, r2, r3 = rotation_columns(
-                np.float64(quats[i, 0]), np.float64(quats[i, 1]),
-                np.float64(quats[i, 2]), np.float64(quats[i, 3]),
-            )  # fmt: skip
-            x, y, z = (
-                np.float64(means[i, 0]) - ox,
-                np.float64(means[i, 1]) - oy,
-                np.float64(means[i, 2]) - oz,
-            )
-            inverse = 1.0 / (x * r1[0] + y * r1[1] + z * r1[2])
-            xa = (x * r2[0] + y * r2[1] + z * r2[2]) * exponential(-np.float64(log_scales[i, 0]))
-            xb = (x * r3[0] + y * r3[1] + z * r3[2]) * exponential(-np.float64(log_scales[i, 1]))
-            hu, hv = sums[slot, HU], sums[slot, HV]
-            huu, huv, hvv = sums[slot, HUU], sums[slot, HUV], sums[slot, HVV]
-            tau = sums[slot, GT] - huu - xa * hu - hvv - xb * hv
-            tau_u = sums[slot, GTU] - sums[slot, HUUU] - xa * huu - sums[slot, HUVV] - xb * huv
-            tau_v = sums[slot, GTV] - sums[slot, HUUV] - xa * huv - sums[slot, HVVV] - xb * hvv
-            for column in range(ROW_WORDS):
-                rows.sums[row, column] = sums[slot, column]
-            rows.sums[row, TAU], rows.sums[row, TAU_U] = tau * inverse, tau_u * inverse
-            rows.sums[row, TAU_V] = tau_v * inverse
+        memory = basis, g_basis, through, sums
+        replay_packet(
+            packet, memory, rays, packets, hits, kept, counts, parameters, features, limits, g, rows
+        )
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -211,13 +222,15 @@ def replay_packets(
         replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows)
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
-def sum_chunk(first, last, parameters, records, by_gaussian, rows, out):
-    """Sum the rows of the Gaussians ``first`` to ``last`` in packet order; the sums become gradients."""
+@lean(fastmath={"contract"})
+def sum_chunk(first, last, parameters, records, by_gaussian, rows, out, sums):
+    """Sum the rows of the Gaussians ``first`` to ``last`` in packet order; the sums become gradients.
+
+    ``sums`` is room for one row.
+    """
     order, starts = by_gaussian.order, by_gaussian.starts
     basis_count = out.sh.shape[1]
     feature_count = out.features.shape[1]
-    sums = np.empty(ROW_WORDS, np.float64)
     for segment in range(first, last):
         i = by_gaussian.ids[starts[segment]]
         for column in range(ROW_WORDS):
@@ -256,4 +269,4 @@ def sum_packets(parameters, records, by_gaussian, rows, chunks, out):
     per_chunk = (segments + chunks - 1) // chunks
     for chunk in prange(chunks):
         first, last = chunk * per_chunk, min(segments, (chunk + 1) * per_chunk)
-        sum_chunk(first, last, parameters, records, by_gaussian, rows, out)
+        sum_chunk(first, last, parameters, records, by_gaussian, rows, out, np.empty(ROW_WORDS, np.float64))

@@ -1,17 +1,18 @@
 """Single rays out of a bundle, where one origin or limit may stand for all."""
 
 import numpy as np
-from numba import njit
+
+from engine.trace.kernels_native import lean
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def ray_origin(rays, r):
     """Origin of ray ``r`` in float64."""
     o = r if len(rays.origins) > 1 else 0
     return np.float64(rays.origins[o, 0]), np.float64(rays.origins[o, 1]), np.float64(rays.origins[o, 2])
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def ray_direction(rays, r):
     """Direction of ray ``r`` in float64."""
     return (
@@ -21,7 +22,7 @@ def ray_direction(rays, r):
     )
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def ray_limits(rays, r):
     """Between which distances ray ``r`` sees; a single limit stands for all rays."""
     return rays.t_min[r if len(rays.t_min) > 1 else 0], rays.t_max[r if len(rays.t_max) > 1 else 0]

@@ -64,24 +64,55 @@ def write_records(records, means, quats, log_scales, logits, q):
         write_record(records, i, means, quats, log_scales, logits, q)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def write_boxes(boxes, means, quats, log_scales, logits, q, padding):
-    """Boxes of the octagons' ellipses enlarged by the fraction ``padding``.
+@njit(error_model="numpy")
+def write_box(box, i, means, quats, log_scales, logits, q, padding):
+    """Box of one octagon's ellipse enlarged by the fraction ``padding`` of its size.
 
     A Gaussian without an octagon gets a box turned inside out, which Embree leaves out of its hierarchy.
     """
+    a, b, r2, r3 = legs(i, quats, log_scales, logits, q)
+    reach = padding * max(a, b)
+    for axis in range(3):
+        half = math.sqrt((a * r2[axis]) ** 2 + (b * r3[axis]) ** 2)
+        centre = np.float64(means[i, axis])
+        # Room for float32 rounding in the box test, and for changes to come.
+        half += reach + 4e-6 * (abs(centre) + half)
+        if a <= 0.0 or not math.isfinite(half):
+            box[axis], box[3 + axis] = np.inf, -np.inf
+        else:
+            box[axis], box[3 + axis] = centre - half, centre + half
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def write_boxes(boxes, means, quats, log_scales, logits, q, padding):
+    """Boxes of all octagons, see :func:`write_box`."""
     for i in prange(len(means)):
-        a, b, r2, r3 = legs(i, quats, log_scales, logits, q)
-        reach = padding * max(a, b)
+        write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def outgrown_boxes(boxes, ids, means, quats, log_scales, logits, q, padding):
+    """Give those of ``ids`` that have left their box a new one; returns how many had.
+
+    The new box is larger by ``padding`` and by four times what the Gaussian stuck out, so that one that goes
+    on moving as fast does not need the next one at once.
+    """
+    left = 0
+    for k in prange(len(ids)):
+        i = ids[k]
+        now = np.empty(6, np.float32)
+        write_box(now, i, means, quats, log_scales, logits, q, 0.0)
+        out = np.float32(0.0)
         for axis in range(3):
-            half = math.sqrt((a * r2[axis]) ** 2 + (b * r3[axis]) ** 2)
-            centre = np.float64(means[i, axis])
-            # Room for float32 rounding in the box test, and for changes until the next build.
-            half += reach + 4e-6 * (abs(centre) + half)
-            if a <= 0.0 or not math.isfinite(half):
-                boxes[i, axis], boxes[i, 3 + axis] = np.inf, -np.inf
-            else:
-                boxes[i, axis], boxes[i, 3 + axis] = centre - half, centre + half
+            out = max(out, boxes[i, axis] - now[axis], now[3 + axis] - boxes[i, 3 + axis])
+        if out > 0.0 and now[0] <= now[3]:
+            left += 1
+            write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
+            if out < np.inf:
+                for axis in range(3):
+                    boxes[i, axis] -= 4 * out
+                    boxes[i, 3 + axis] += 4 * out
+    return left
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

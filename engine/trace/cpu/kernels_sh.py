@@ -1,7 +1,8 @@
 """Real spherical harmonics of degree 0 to 3 in the sign and order of the 3DGS family."""
 
 import numpy as np
-from numba import njit
+
+from engine.trace.kernels_native import lean
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -12,7 +13,7 @@ C3 = (
 )  # fmt: skip
 
 
-@njit
+@lean()
 def write_basis(basis, count, x, y, z):
     """Values of the first ``count`` (1, 4, 9 or 16) harmonics at the unit direction (x, y, z)."""
     basis[0] = C0
@@ -37,7 +38,7 @@ def write_basis(basis, count, x, y, z):
             basis[15] = C3[6] * x * (xx - 3.0 * yy)
 
 
-@njit(forceinline=True)
+@lean(forceinline=True)
 def colour(sh, i, basis):
     """Display colour max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
     red = green = blue = 0.5

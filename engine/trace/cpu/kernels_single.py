@@ -28,7 +28,7 @@ from engine.trace.cpu.kernels_hit import (
 )
 from engine.trace.cpu.kernels_rays import ray_direction, ray_limits, ray_origin
 from engine.trace.cpu.kernels_sh import write_basis
-from engine.trace.kernels_native import call_with_three_pointers, next_from_counter
+from engine.trace.kernels_native import call_with_three_pointers, lean, next_from_counter
 
 INT32_MAX = 2**31 - 1
 BEFORE, BEHIND = np.float32(0.999999), np.float32(1.000001)
@@ -47,7 +47,7 @@ class Embree(NamedTuple):
     arguments: UInt64[np.ndarray, "c 8"]
 
 
-@njit(error_model="numpy")
+@lean()
 def context_of(embree, chunk):
     """The ray of a chunk and its context, as words of each type."""
     ray = embree.scratch[chunk]
@@ -55,7 +55,7 @@ def context_of(embree, chunk):
     return ray, ray.view(np.int32), context, context.view(np.int32), context.view(np.float64)
 
 
-@njit(error_model="numpy")
+@lean()
 def write_query(ray, ray_i32, context_i32, origin, direction, t_near, t_far):
     """The ray and the start of its context as Embree wants them."""
     for axis in range(3):
@@ -67,19 +67,19 @@ def write_query(ray, ray_i32, context_i32, origin, direction, t_near, t_far):
     context_i32[0], context_i32[1] = -1, -1
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
-def trace_from_counter(embree, forward, which, rays_per_chunk, counter):
+@lean(fastmath={"contract"})
+def trace_from_counter(embree, forward, which, rays_per_chunk, counter, basis):
     """Trace the rays ``which``, in ascending order, until the ``counter`` has passed the last chunk.
 
     The hits of ray r are stored from r * max_hits on, or behind those of ray r - 1 where its chunk has it. A
-    ray's result depends on nothing but the ray, so it is the same for every number of threads.
+    ray's result depends on nothing but the ray, so it is the same for every number of threads. ``basis`` has
+    room for the harmonics.
     """
     rays, scene, limits = forward.rays, forward.scene, forward.limits
     chunk_count = (len(which) + rays_per_chunk - 1) // rays_per_chunk
     # Certainly behind the stop: T2 <= T / (eps1 (1 - alpha_max)), and the margin covers rounding.
     last_phase = limits.eps2 * (1.0 - limits.alpha_max) if limits.eps2 <= 1.0 else 1.0
     prune_below = 0.999 * limits.eps1 * last_phase
-    basis = np.empty(16, np.float64)
     while True:
         chunk = next_from_counter(counter.ctypes.data)
         if chunk >= chunk_count:
@@ -141,10 +141,10 @@ def trace_rays(embree, rays, scene, limits, out, hits, recording, which, rays_pe
     """
     for _worker in prange(workers):
         forward = Forward(rays, scene, limits, out, hits, recording)
-        trace_from_counter(embree, forward, which, rays_per_chunk, counter)
+        trace_from_counter(embree, forward, which, rays_per_chunk, counter, np.empty(16, np.float64))
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@lean(fastmath={"contract"})
 def absorb_from_counter(embree, rays, scene, limits, which, rays_per_chunk, counter, transmittance):
     """The transmittance alone of the rays ``which``, 0 where it falls below eps1."""
     chunk_count = (len(which) + rays_per_chunk - 1) // rays_per_chunk

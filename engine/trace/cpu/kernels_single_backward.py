@@ -16,7 +16,7 @@ from engine.trace.cpu.kernels_hit import NORMAL, OPACITY
 from engine.trace.cpu.kernels_rays import ray_direction, ray_origin
 from engine.trace.cpu.kernels_records import rotation_columns
 from engine.trace.cpu.kernels_sh import write_basis
-from engine.trace.kernels_native import next_from_counter
+from engine.trace.kernels_native import lean, next_from_counter
 
 RED_OFF, GREEN_OFF, BLUE_OFF = 1 << 28, 1 << 29, 1 << 30
 """Bits of a hit's ray number: this channel's colour was clamped at zero and gets no gradient."""
@@ -56,7 +56,7 @@ class Moments(NamedTuple):
     n2: float
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@lean(forceinline=True, fastmath={"contract"})
 def replay_ray(r, first, rays, hits, counts, scene, limits, g, shares):
     """dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> of the hits of ray ``r``, for every channel.
 
@@ -124,7 +124,7 @@ def replay_rays(rays, which, offsets, hits, counts, scene, limits, g, shares):
         replay_ray(which[s], offsets[s], rays, hits, counts, scene, limits, g, shares)
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@lean(forceinline=True, fastmath={"contract"})
 def write_gradients(segment, i, parameters, records, sums, out):
     """Gradients of one Gaussian's raw geometry from its sums over rays.
 
@@ -160,7 +160,7 @@ def write_gradients(segment, i, parameters, records, sums, out):
     out.logits[segment] = sums.h * (1.0 - np.float64(records[i, OPACITY]))
 
 
-@njit(fastmath={"contract"}, error_model="numpy")
+@lean(fastmath={"contract"})
 def gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, shares, g, out):
     """Gradients of the Gaussians ``first`` to ``last`` of the sorted hits.
 

@@ -20,8 +20,10 @@ LEAF_ROWS = 9
 """Rows of a block: mean x, y, z and the ellipse's legs R s2 r2 and R s3 r3 of its eight Gaussians."""
 MARGIN = 1.0 + 1e-5
 """Legs are this much longer than the octagon's corners, which covers their rounding to float32."""
+ROUNDING = 4e-6
+"""Boxes are this much larger, as a fraction of what they are computed from: room for float32."""
 LEFT_OUT = np.uint64(0xFFFFFFFFFFFFFFFF)
-"""Key of a Gaussian that has no octagon, or is not finite."""
+"""Key of a Gaussian that is not finite."""
 _CURVE_BITS = 19
 TOP_CELL = (1 << _CURVE_BITS) - 1
 _CLASSES = 32
@@ -41,17 +43,18 @@ def _spread(x):
 def curve_keys(records, low, inverse_cell, keys):
     """Keys along a Z-order curve, by size class first: factors of four, the large ones in front.
 
-    Without the classes one large Gaussian would blow up its small neighbours' box.
+    Without the classes one large Gaussian would blow up its small neighbours' box. One that has no octagon
+    may get one before the next build, so it has a place, too; one that is no number has none.
     """
     for i in prange(len(records)):
-        radius = np.float64(records[i, INNER_RADIUS]) / COS_22
+        radius = max(np.float64(records[i, INNER_RADIUS]), 0.0) / COS_22
         u2 = v2 = total = 0.0
         for axis in range(3):
             u2 += np.float64(records[i, AXIS_U + axis]) ** 2
             v2 += np.float64(records[i, AXIS_V + axis]) ** 2
             total += records[i, MEAN + axis]
         size = radius / math.sqrt(min(u2, v2))
-        if not (radius > 0.0 and size < 1e30 and math.isfinite(total)):
+        if not (size < 1e30 and math.isfinite(total)):
             keys[i] = LEFT_OUT
             continue
         level = min(int(0.5 * math.log2(max(size * inverse_cell, 1.0))), _CLASSES - 1)
@@ -80,69 +83,91 @@ def write_leaf(blocks, slot, records, i):
         blocks[block, 6 + axis, lane] = records[i, AXIS_V + axis] * scale_v
 
 
+@njit(error_model="numpy")
+def write_block_box(blocks, b, nodes):
+    """The box of block ``b`` at level 0, around the ellipses that have not vanished."""
+    lo0 = lo1 = lo2 = np.inf
+    hi0 = hi1 = hi2 = -np.inf
+    for lane in range(WIDTH):
+        if math.isnan(blocks[b, 3, lane]):
+            continue
+        u0, u1, u2 = (
+            np.float64(blocks[b, 3, lane]),
+            np.float64(blocks[b, 4, lane]),
+            np.float64(blocks[b, 5, lane]),
+        )
+        v0, v1, v2 = (
+            np.float64(blocks[b, 6, lane]),
+            np.float64(blocks[b, 7, lane]),
+            np.float64(blocks[b, 8, lane]),
+        )
+        h0 = math.sqrt(u0 * u0 + v0 * v0)
+        h1 = math.sqrt(u1 * u1 + v1 * v1)
+        h2 = math.sqrt(u2 * u2 + v2 * v2)
+        m0, m1, m2 = (
+            np.float64(blocks[b, 0, lane]),
+            np.float64(blocks[b, 1, lane]),
+            np.float64(blocks[b, 2, lane]),
+        )
+        h0 += ROUNDING * (abs(m0) + h0)
+        h1 += ROUNDING * (abs(m1) + h1)
+        h2 += ROUNDING * (abs(m2) + h2)
+        lo0, lo1, lo2 = min(lo0, m0 - h0), min(lo1, m1 - h1), min(lo2, m2 - h2)
+        hi0, hi1, hi2 = max(hi0, m0 + h0), max(hi1, m1 + h1), max(hi2, m2 + h2)
+    node, lane = b // WIDTH, b % WIDTH
+    nodes[node, 0, lane], nodes[node, 1, lane], nodes[node, 2, lane] = lo0, lo1, lo2
+    nodes[node, 3, lane], nodes[node, 4, lane], nodes[node, 5, lane] = hi0, hi1, hi2
+
+
 @njit(cache=True, parallel=True, error_model="numpy")
-def write_leaves(blocks, slots, records, order, padding, boxes):
+def write_leaves(blocks, slots, records, order, nodes):
     """Blocks in curve order, each Gaussian's place in them, and the boxes of the blocks (level 0)."""
     count = len(order)
     for b in prange(len(blocks)):
-        lo0 = lo1 = lo2 = np.inf
-        hi0 = hi1 = hi2 = -np.inf
         for lane in range(WIDTH):
             k = b * WIDTH + lane
             if k >= count:
                 for row in range(LEAF_ROWS):
                     blocks[b, row, lane] = np.nan
                 continue
-            i = order[k]
-            slots[i] = k
-            write_leaf(blocks, k, records, i)
-            u0, u1, u2 = (
-                np.float64(blocks[b, 3, lane]),
-                np.float64(blocks[b, 4, lane]),
-                np.float64(blocks[b, 5, lane]),
-            )
-            v0, v1, v2 = (
-                np.float64(blocks[b, 6, lane]),
-                np.float64(blocks[b, 7, lane]),
-                np.float64(blocks[b, 8, lane]),
-            )
-            reach = padding * math.sqrt(max(u0 * u0 + u1 * u1 + u2 * u2, v0 * v0 + v1 * v1 + v2 * v2))
-            h0 = math.sqrt(u0 * u0 + v0 * v0) + reach
-            h1 = math.sqrt(u1 * u1 + v1 * v1) + reach
-            h2 = math.sqrt(u2 * u2 + v2 * v2) + reach
-            m0, m1, m2 = (
-                np.float64(blocks[b, 0, lane]),
-                np.float64(blocks[b, 1, lane]),
-                np.float64(blocks[b, 2, lane]),
-            )
-            h0 += 4e-6 * (abs(m0) + h0)
-            h1 += 4e-6 * (abs(m1) + h1)
-            h2 += 4e-6 * (abs(m2) + h2)
-            lo0, lo1, lo2 = min(lo0, m0 - h0), min(lo1, m1 - h1), min(lo2, m2 - h2)
-            hi0, hi1, hi2 = max(hi0, m0 + h0), max(hi1, m1 + h1), max(hi2, m2 + h2)
-        node, lane = b // WIDTH, b % WIDTH
-        boxes[node, 0, lane], boxes[node, 1, lane], boxes[node, 2, lane] = lo0, lo1, lo2
-        boxes[node, 3, lane], boxes[node, 4, lane], boxes[node, 5, lane] = hi0, hi1, hi2
+            slots[order[k]] = k
+            write_leaf(blocks, k, records, order[k])
+        write_block_box(blocks, b, nodes)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
+def write_box_of_node(nodes, child, parent, lane):
+    """Box ``lane`` of ``parent``, around the eight boxes of ``child``."""
+    for row in range(3):
+        low, high = nodes[child, row, 0], nodes[child, 3 + row, 0]
+        for other in range(1, WIDTH):
+            low, high = min(low, nodes[child, row, other]), max(high, nodes[child, 3 + row, other])
+        nodes[parent, row, lane], nodes[parent, 3 + row, lane] = low, high
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
 def write_upper_levels(nodes, level_starts):
     """Boxes of every level above the first; node k of a level bounds box k of the next."""
     for level in range(1, len(level_starts) - 1):
         below, here = level_starts[level - 1], level_starts[level]
-        for k in range(level_starts[level] - below):
-            child, parent, lane = below + k, here + k // WIDTH, k % WIDTH
-            for row in range(3):
-                low, high = nodes[child, row, 0], nodes[child, 3 + row, 0]
-                for other in range(1, WIDTH):
-                    low, high = min(low, nodes[child, row, other]), max(high, nodes[child, 3 + row, other])
-                nodes[parent, row, lane], nodes[parent, 3 + row, lane] = low, high
+        for k in prange(here - below):
+            write_box_of_node(nodes, below + k, here + k // WIDTH, k % WIDTH)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def refresh_leaves(blocks, slots, records, ids):
-    """Rewrite the lanes of Gaussians whose records changed; boxes stay."""
+def refresh_leaves(blocks, slots, records, ids, touched):
+    """Rewrite the lanes of Gaussians whose records changed, and note the blocks that they lie in."""
     for k in prange(len(ids)):
         slot = slots[ids[k]]
         if slot >= 0:
             write_leaf(blocks, slot, records, ids[k])
+            touched[slot // WIDTH] = True
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def refit_blocks(blocks, touched, nodes):
+    """The boxes of the blocks that were touched, and of no others."""
+    for b in prange(len(blocks)):
+        if touched[b]:
+            write_block_box(blocks, b, nodes)
+            touched[b] = False

@@ -11,6 +11,7 @@ from engine.trace.cpu.kernels_tree import (
     TOP_CELL,
     WIDTH,
     curve_keys,
+    refit_blocks,
     refresh_leaves,
     write_leaves,
     write_upper_levels,
@@ -23,9 +24,7 @@ class PacketTree:
     """Eight boxes a node over blocks of eight Gaussians along a Z-order curve.
 
     Args:
-        records: of all Gaussians; those without an octagon are left out.
-        padding: fraction of its size by which each Gaussian's box is enlarged, so that it may move until the
-            next build.
+        records: of all Gaussians; those that are not finite are left out.
 
     Attributes:
         arrays: the hierarchy as kernels take it.
@@ -33,7 +32,7 @@ class PacketTree:
 
     arrays: Tree
 
-    def __init__(self, records: Float32[np.ndarray, "n 16"], padding: float) -> None:
+    def __init__(self, records: Float32[np.ndarray, "n 16"]) -> None:
         count = len(records)
         keys = np.empty(count, np.uint64)
         low, cell = _grid(records[:, :3])
@@ -49,12 +48,19 @@ class PacketTree:
         nodes[:, 3:] = -np.inf  # boxes turned inside out are in no pyramid
         self.arrays = Tree(nodes, level_starts, np.empty((blocks, LEAF_ROWS, WIDTH), np.float32), order)
         self._slots = np.full(count, -1, np.int32)
-        write_leaves(self.arrays.blocks, self._slots, records, order, padding, nodes)
+        write_leaves(self.arrays.blocks, self._slots, records, order, nodes)
         write_upper_levels(nodes, level_starts)
+        self._touched = np.zeros(blocks, np.bool_)
 
     def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
-        """Take the changed records of ``ids`` over; boxes stay."""
-        refresh_leaves(self.arrays.blocks, self._slots, records, ids)
+        """Take the changed records of ``ids`` over, and refit the boxes around them.
+
+        The boxes are then those of a new build along the old curve.
+        """
+        nodes, level_starts, blocks, _order = self.arrays
+        refresh_leaves(blocks, self._slots, records, ids, self._touched)
+        refit_blocks(blocks, self._touched, nodes)
+        write_upper_levels(nodes, level_starts)
 
 
 def _grid(means_world: Float32[np.ndarray, "n 3"]) -> tuple[np.ndarray, float]:

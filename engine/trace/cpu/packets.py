@@ -83,12 +83,12 @@ class PacketTracer:
         self._pool = pool
         self._tree: PacketTree | None = None
 
-    def build(self, records: Float32[np.ndarray, "n 16"], padding: float) -> None:
+    def build(self, records: Float32[np.ndarray, "n 16"]) -> None:
         """Build the hierarchy."""
-        self._tree = PacketTree(records, padding)
+        self._tree = PacketTree(records)
 
     def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
-        """Take changed records over."""
+        """Take changed records over, and refit the hierarchy."""
         assert self._tree is not None, "build first"
         self._tree.refresh(records, ids)
 

@@ -9,7 +9,7 @@ from engine.rays import RayBatch
 from engine.threads import use_threads
 from engine.trace.cpu.bundles import Forward, Hits, Limits, Parameters, Rays, Scene
 from engine.trace.cpu.kernels_hit import RECORD_WORDS
-from engine.trace.cpu.kernels_records import refresh_records, write_boxes, write_records
+from engine.trace.cpu.kernels_records import outgrown_boxes, refresh_records, write_boxes, write_records
 from engine.trace.cpu.memory import Pool, aligned_empty, empty_result, output_gradients, outputs
 from engine.trace.cpu.merging import added
 from engine.trace.cpu.packets import PacketTracer, Ways, find_packets
@@ -37,7 +37,8 @@ class CpuTracer:
     Args:
         settings: where rays are cut off.
         threads: threads for building and tracing; 0 takes all that numba has.
-        box_padding: fraction by which boxes are enlarged, so that parameters may change between builds.
+        box_padding: fraction of its size by which a Gaussian's box for single rays is enlarged; Embree's
+            hierarchy has to be built anew when one leaves it. The packets' boxes are refitted.
         build_quality: Embree's: 0 low, 1 medium, 2 high.
         packets: whether rays go in packets: "auto" decides by what is faster.
     """
@@ -76,9 +77,7 @@ class CpuTracer:
         self._gaussians = gaussians
         self._features = np.empty((count, 0), np.float32) if features is None else features
         write_records(self._records, *Parameters.of(gaussians), self.settings.q)
-        # Boxes are those of this moment, whenever single rays come: what was traced before must not matter.
-        write_boxes(self._boxes, *Parameters.of(gaussians), self.settings.q, self._padding)
-        self._packets.build(self._records, self._padding)
+        self._packets.build(self._records)
         self._built_singles = False
         self._build = object()
 
@@ -88,8 +87,11 @@ class CpuTracer:
         use_threads(self.threads)
         if ids is None:
             ids = np.arange(len(self._gaussians), dtype=np.int32)
-        refresh_records(self._records, ids, *Parameters.of(self._gaussians), self.settings.q)
+        parameters, q = Parameters.of(self._gaussians), self.settings.q
+        refresh_records(self._records, ids, *parameters, q)
         self._packets.refresh(self._records, ids)
+        if self._built_singles and outgrown_boxes(self._boxes, ids, *parameters, q, self._padding):
+            self._built_singles = False
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Follow rays; see the protocol. Directions must have unit length."""
@@ -143,6 +145,8 @@ class CpuTracer:
         use_threads(self.threads)
         packets, alone = find_packets(rays, self._ways)
         if len(alone) and not self._built_singles:
+            assert self._gaussians is not None, "build first"
+            write_boxes(self._boxes, *Parameters.of(self._gaussians), self.settings.q, self._padding)
             self._singles.build(self._boxes)
             self._built_singles = True
         return packets, alone
