@@ -20,9 +20,9 @@ from engine.rays import ImageRays, RayBatch
 from engine.render.renderer import tile_order
 from engine.threads import use_threads
 
-PATHS_AT_ONCE = 1 << 17
+PATHS_AT_ONCE = 1 << 18
 LEAST_TILE = 64
-LEAST_ROWS = 2048
+LEAST_ROWS = 8192
 
 Progress = Callable[[int, int], None]
 
@@ -196,7 +196,7 @@ class PathTracer:
 
     def _share(self, kernel: Callable[..., None], rows: int, *arguments: object) -> None:
         """Let all threads work on the rows of a kernel. Numba's own loops cannot write to named tuples."""
-        parts = max(1, min(4 * self._threads, rows // LEAST_ROWS))
+        parts = max(1, min(self._threads, rows // LEAST_ROWS))
         cuts = [rows * part // parts for part in range(parts + 1)]
         if parts == 1:
             kernel(0, rows, *arguments)

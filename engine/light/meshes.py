@@ -50,12 +50,20 @@ def read_shape(path: Path) -> Shape:
     if len(mesh.triangles) == 0:
         raise ConfigError(f"{path}: holds no triangles, so that light has nothing to fall on.")
     uv = None
-    if mesh.uv is not None:
+    if mesh.uv is not None and not _has_seams(path):
         uv = np.nan_to_num(mesh.uv)
         if path.suffix.lower() != ".glb":
             uv = uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)  # from the lower left
         uv = uv[mesh.triangles].astype(np.float32)
     return Shape(mesh.vertices, mesh.triangles, uv)
+
+
+def _has_seams(path: Path) -> bool:
+    """Whether an OBJ gives some vertices several texture coordinates, of which the reader keeps one."""
+    if path.suffix.lower() != ".obj":
+        return False
+    content = path.read_bytes()
+    return content.count(b"\nvt ") > content.count(b"\nv ") + content.startswith(b"v ")
 
 
 def rotation_matrix(degrees: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:

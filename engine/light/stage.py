@@ -123,14 +123,8 @@ class MetallicRoughness(Part):
     multiple_scattering: bool = True
 
 
-class FileMaterial(Part):
-    """The metallic-roughness materials, with their textures, that a GLB brings along."""
-
-    kind: Literal["file"] = "file"
-
-
 Material = Annotated[
-    Diffuse | Mirror | Glass | Metal | Dielectric | MetallicRoughness | FileMaterial,
+    Diffuse | Mirror | Glass | Metal | Dielectric | MetallicRoughness,
     Field(discriminator="kind"),
 ]
 
@@ -188,7 +182,7 @@ class StageMesh(Placed):
         up_axis: which of the file's axes is turned to the stage's up; ``world`` leaves the file as it is.
             By default y for GLB (glTF says so) and world for the others.
         smooth_degrees: edges up to this angle are shaded as if they were round; 0 shows every facet.
-        material: what it is made of; by default the materials of a GLB, and grey for others.
+        material: what it is made of; a matt grey by default. A GLB needs one, as its own are not read.
         on: a place in the scene on which it stands; its position counts from there.
     """
 
@@ -203,8 +197,8 @@ class StageMesh(Placed):
     def _one_source(self) -> "StageMesh":
         if (self.file is None) == (self.shape is None):
             raise ValueError("give either a file or a shape")
-        if isinstance(self.material, FileMaterial) and not (self.file or "").lower().endswith(".glb"):
-            raise ValueError("only a GLB brings materials along; name another kind of material")
+        if self.material is None and (self.file or "").lower().endswith(".glb"):
+            raise ValueError("the materials of a GLB are not read; give one here")
         return self
 
 

@@ -130,7 +130,7 @@ def _complaint(error: ValidationError) -> str:
 
 
 _KINDS = (
-    "diffuse", "mirror", "glass", "metal", "dielectric", "metallic-roughness", "file", "point", "spot",
+    "diffuse", "mirror", "glass", "metal", "dielectric", "metallic-roughness", "point", "spot",
     "directional", "rectangle", "float", "constrained-float",
 )  # fmt: skip
 
@@ -149,7 +149,7 @@ shadows_on_meshes = true
 
 # A ball on what seems to be the floor, at {floor}.
 [[meshes]]
-shape = "sphere"                 # or: file = "thing.glb"
+shape = "sphere"                 # or: file = "thing.obj"
 position = {centre}
 scale = {radius}
 smooth_degrees = 180

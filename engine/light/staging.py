@@ -18,7 +18,6 @@ from engine.light.meshes import Shape, corner_normals, open_edges, placed, read_
 from engine.light.stage import (
     Dielectric,
     Diffuse,
-    FileMaterial,
     Glass,
     Material,
     Metal,
@@ -83,10 +82,6 @@ def stage_meshes(stage: Stage, folder: Path, *, threads: int = 0) -> LitMeshes:
         normals.append(corner_normals(at, mesh.smooth_degrees))
         uvs.append(shape.corner_uv if shape.corner_uv is not None else np.zeros((len(at), 3, 2), np.float32))
         material = mesh.material or Diffuse()
-        if isinstance(material, FileMaterial):
-            raise ConfigError(
-                f"meshes[{number}].material: materials of files are not read yet; name another kind."
-            )
         rows.append(np.full(len(at), table.add(material, shape.corner_uv is not None, number), np.int32))
     for number, light in enumerate(stage.lights):
         if isinstance(light, RectangleLight) and light.visible:
@@ -215,7 +210,6 @@ class _MaterialTable:
 
     def add(self, material: Material, has_uv: bool, number: int) -> int:
         """The row of a material of mesh ``number``."""
-        assert not isinstance(material, FileMaterial)
         row: dict[str, object] = {}
         if isinstance(material, Glass):
             colour = material.tint_srgb
@@ -282,7 +276,8 @@ class _MaterialTable:
         path = self._folder / name
         if not has_uv:
             raise ConfigError(
-                f"meshes[{number}].material: {path} needs texture coordinates, which the mesh lacks."
+                f"meshes[{number}].material: {path} needs texture coordinates, which the mesh lacks; of an "
+                "OBJ with seams, whose vertices have several each, none are read: save it as GLB."
             )
         key = (name, display)
         if key not in self._textures:

@@ -35,7 +35,8 @@ pytestmark = pytest.mark.heavy
 
 SIZE = (40, 30)
 BOUNCES = 6
-VIEW = camera((0, -1.6, -5), (0, -0.7, 0), SIZE, 40)
+EYE = ((0.0, -1.6, -5.0), (0.0, -0.7, 0.0))
+VIEW = camera(*EYE, SIZE, 40)
 LAMP = RectangleLight(
     position=(-1.0, -3.5, -1.0), direction=(0.25, 1, 0.25), width=1.5, height=1.5, radiance=9
 )
@@ -73,17 +74,26 @@ def environment(folder: Path) -> np.ndarray:
     return sky
 
 
-def mitsuba_scene(stage: Stage, folder: Path, bsdfs: list[dict[str, Any]], emitters: dict[str, Any]) -> Any:
-    mi.set_variant("scalar_rgb")
+def mitsuba_scene(
+    stage: Stage,
+    folder: Path,
+    bsdfs: list[dict[str, Any]],
+    emitters: dict[str, Any],
+    variant: str = "scalar_rgb",
+    size: tuple[int, int] = SIZE,
+    eye: tuple[tuple[float, ...], tuple[float, ...]] = EYE,
+    depth: int = BOUNCES,
+) -> Any:
+    mi.set_variant(variant)
     surfaces = stage_meshes(stage, folder, threads=2).surfaces
     t = mi.ScalarTransform4f
     scene: dict[str, Any] = {
         "type": "scene",
-        "integrator": {"type": "path", "max_depth": BOUNCES + 1, "rr_depth": 100, "hide_emitters": False},
+        "integrator": {"type": "path", "max_depth": depth + 1, "rr_depth": 100, "hide_emitters": False},
         "sensor": {
             "type": "perspective", "fov": 40, "fov_axis": "y",
-            "to_world": t().look_at(origin=[0, -1.6, -5], target=[0, -0.7, 0], up=[0, -1, 0]),
-            "film": {"type": "hdrfilm", "width": SIZE[0], "height": SIZE[1], "rfilter": {"type": "box"}},
+            "to_world": t().look_at(origin=list(eye[0]), target=list(eye[1]), up=[0, -1, 0]),
+            "film": {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}},
             "sampler": {"type": "independent"},
         },
         **emitters,

@@ -61,7 +61,7 @@ def test_a_stage_is_read_with_everything_in_it(tmp_path: Path) -> None:
         (BALL + "scale = 0", r"meshes\[0\]\.scale"),
         (BALL + 'file = "x.ply"', "either a file or a shape"),
         (BALL + 'on = { view = "a.jpg" }', "either view and pixel, or origin and direction"),
-        (BALL + 'material = { kind = "file" }', "only a GLB brings materials"),
+        ('[[meshes]]\nfile = "a.glb"', "materials of a GLB are not read"),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]', r"lights\[0\].*intensity"),
         ('[[lights]]\nkind = "point"\nposition = [0, 0, 0]\nintensity = -1', r"lights\[0\]\.intensity"),
         ('[[lights]]\nkind = "directional"\ndirection = [0, 0, 0]\nirradiance = 1', "has no length"),
@@ -88,7 +88,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         read_stage(tmp_path / "none.toml")
     path = tmp_path / "stage.toml"
     for text, key in (
-        ('[[meshes]]\nfile = "gone.glb"', r"meshes\[0\]\.file"),
+        ('[[meshes]]\nfile = "gone.obj"', r"meshes\[0\]\.file"),
         (BALL + 'material = { kind = "diffuse", texture = "gone.png" }', r"meshes\[0\]\.material\.texture"),
         ('[environment]\nfile = "gone.hdr"', r"environment\.file"),
         ('[[gaussians]]\nfile = "gone.ply"', r"gaussians\[0\]\.file"),
@@ -130,3 +130,9 @@ def test_reading_stages_needs_neither_torch_nor_numba() -> None:
 
 def test_a_stage_has_the_scene_as_trained_colours_in_shadow_by_default() -> None:
     assert Stage().gaussians[0].light == "shadowed"
+
+
+def test_the_examples_are_stages() -> None:
+    folder = Path(__file__).resolve().parents[2] / "examples" / "light"
+    stages = [read_stage(path) for path in sorted(folder.glob("*.toml"))]
+    assert [stage.gaussians[0].light for stage in stages] == ["shadowed", "emissive", "relit"]
