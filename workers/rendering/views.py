@@ -14,7 +14,6 @@ from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
 from engine.light.stage_file import read_stage
-from engine.pipeline import CONFIG, SCENE
 from engine.render.cameras import RenderCamera
 from engine.render.jobs import (
     DEFAULT_FOV_Y_DEGREES,
