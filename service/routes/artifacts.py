@@ -11,7 +11,7 @@ from service.downloads import send_blob
 from service.problems import not_found
 from service.routes import problems
 from service.routes.jobs import owned_job, read_job
-from service.schemas import ArtifactList, ArtifactView
+from service.schemas.artifacts import ArtifactList, ArtifactView
 from service.state import ServiceDep
 from workers.queue.jobs import artifacts_of, get_artifact
 

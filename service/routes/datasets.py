@@ -18,7 +18,7 @@ from service.intake.receive import parse_digest, receive_archive, receive_file
 from service.paging import Cursor, Limit, link_next, read_cursor, read_id_cursor, write_cursor
 from service.problems import Problem, not_found
 from service.routes import problems
-from service.schemas import (
+from service.schemas.datasets import (
     ArchiveView,
     DatasetChange,
     DatasetPage,

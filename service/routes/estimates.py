@@ -8,7 +8,7 @@ from service.problems import Problem
 from service.queue_facts import workers_of
 from service.routes import problems
 from service.routes.jobs import accepted_kind, resolved
-from service.schemas import EstimateView, NewEstimate
+from service.schemas.estimates import EstimateView, NewEstimate
 from service.state import ServiceDep
 from workers.queue.jobs import get_job
 from workers.records.database import Connection

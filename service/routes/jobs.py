@@ -17,7 +17,7 @@ from service.paging import Cursor, Limit, link_next, read_id_cursor, write_curso
 from service.problems import Problem, not_found, refused_options
 from service.queue_facts import check_writable, waiting_notes, workers_of
 from service.routes import problems
-from service.schemas import JobChange, JobPage, JobView, NewJob, RetryRequest
+from service.schemas.jobs import JobChange, JobPage, JobView, NewJob, RetryRequest
 from service.state import Service, ServiceDep
 from service.webhook_addresses import check_address
 from workers.queue import jobs as rows

@@ -14,7 +14,7 @@ from service.auth import Principal, Reader
 from service.problems import Problem, not_found
 from service.routes import problems
 from service.routes.jobs import read_job
-from service.schemas import EventPage, EventView, LogLineView, LogPage
+from service.schemas.journal import EventPage, EventView, LogLineView, LogPage
 from service.state import Service, ServiceDep
 from workers.queue.jobs import get_job
 from workers.records.database import Connection

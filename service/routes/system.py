@@ -12,20 +12,17 @@ from service.auth import Admin, Reader
 from service.limits import ceilings_by_path
 from service.problems import not_found
 from service.routes import problems
-from service.schemas import (
+from service.schemas.system import (
     FormatView,
     Health,
     InfoView,
     KindList,
     KindView,
-    MadeToken,
-    NewToken,
     QueueList,
     QueueView,
-    TokenList,
-    TokenView,
     WorkerView,
 )
+from service.schemas.tokens import MadeToken, NewToken, TokenList, TokenView
 from service.state import Service, ServiceDep
 from workers.queue.jobs import queue_depths, running_by_queue
 from workers.records.migrate import missing_steps

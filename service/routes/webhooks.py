@@ -10,9 +10,7 @@ from service.paging import Cursor, Limit, link_next, read_id_cursor, write_curso
 from service.problems import Problem, not_found
 from service.routes import problems
 from service.routes.jobs import owned_job
-from service.state import ServiceDep
-from service.webhook_addresses import check_address
-from service.webhook_views import (
+from service.schemas.webhooks import (
     DeliveryList,
     DeliveryView,
     MadeWebhook,
@@ -21,6 +19,8 @@ from service.webhook_views import (
     WebhookPage,
     WebhookView,
 )
+from service.state import ServiceDep
+from service.webhook_addresses import check_address
 from workers.records.database import Connection
 from workers.upkeep.webhooks import rows
 from workers.upkeep.webhooks.signing import new_secret

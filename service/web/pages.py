@@ -16,7 +16,7 @@ from service.paging import read_id_cursor, write_cursor
 from service.problems import not_found
 from service.queue_facts import unwritable_formats
 from service.routes import jobs as api
-from service.schemas import JobChange, RetryRequest
+from service.schemas.jobs import JobChange, RetryRequest
 from service.state import Service, ServiceDep
 from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
 from service.web.forms import options_form

@@ -10,7 +10,7 @@ from psycopg.rows import class_row
 
 from service.auth import Principal
 from service.routes.jobs import job_view, owned_job, stages_of
-from service.schemas import JobView
+from service.schemas.jobs import JobView
 from service.state import Service
 from service.web.results import METRICS, mean_psnr, read_json
 from service.web.templating import short_id
