@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from service.schemas.base import Strict
+from workers.records.rows import Token
 
 
 class NewToken(Strict):
@@ -27,6 +28,11 @@ class TokenView(BaseModel):
     created_at: datetime
     expires_at: datetime | None
     revoked_at: datetime | None
+
+    @classmethod
+    def of(cls, row: Token) -> "TokenView":
+        """From its row."""
+        return cls.model_validate(row, from_attributes=True)
 
 
 class MadeToken(TokenView):
