@@ -8,7 +8,7 @@ from typing import TypeVar
 from service.actions.access import open_dataset, owned_dataset, refuse_while_draining, sought
 from service.actions.parts import Part, cut
 from service.auth import Principal
-from service.intake.dataset import check_file_name
+from service.intake.names import check_file_name
 from service.intake.receive import ReceivedArchive, ReceivedFile, receive_archive, receive_file
 from service.problems import not_found
 from service.state import Service
