@@ -4,24 +4,11 @@ import hashlib
 import json
 import uuid
 from collections.abc import Awaitable, Callable
-from typing import Annotated, Any
-
-from fastapi import Header
+from typing import Any
 
 from service.auth import Principal
 from service.problems import Problem
 from workers.records.database import Connection
-
-IdempotencyKey = Annotated[
-    str | None,
-    Header(
-        alias="Idempotency-Key",
-        min_length=1,
-        max_length=255,
-        pattern=r"^[\x21-\x7e]+$",
-        description="A text of your choice; the same request sent again with it makes nothing new.",
-    ),
-]
 
 
 def fingerprint(*parts: Any) -> str:
@@ -43,7 +30,7 @@ async def once(
     Args:
         connection: of the caller's transaction.
         who: asks.
-        key: the header; without one it is always made.
+        key: names the request; without one it is always made.
         request: fingerprint of the request.
         make: makes it and returns its id.
 

@@ -45,7 +45,10 @@ def read_id_cursor(cursor: str | None) -> uuid.UUID | None:
         raise Problem(422, "cursor", "The cursor is none that this service gave out.") from None
 
 
-def link_next(request: Request, response: Response, cursor: str | None) -> None:
-    """Say where the next part is."""
-    if cursor is not None:
-        response.headers["Link"] = f'<{request.url.include_query_params(cursor=cursor)}>; rel="next"'
+def next_cursor(request: Request, response: Response, following: str | None) -> str | None:
+    """The cursor of the next part, which the header ``Link`` names as well; None at the end."""
+    if following is None:
+        return None
+    cursor = write_cursor(following)
+    response.headers["Link"] = f'<{request.url.include_query_params(cursor=cursor)}>; rel="next"'
+    return cursor

@@ -67,6 +67,7 @@ class Problem(Exception):
         detail: one sentence for the user.
         errors: single faults, each with a JSON pointer.
         headers: of the answer.
+        retry_seconds: when to try again, told in ``Retry-After``.
     """
 
     def __init__(
@@ -77,13 +78,16 @@ class Problem(Exception):
         *,
         errors: Sequence[Mapping[str, Any]] | None = None,
         headers: Mapping[str, str] | None = None,
+        retry_seconds: int | None = None,
     ) -> None:
         super().__init__(detail)
         self.status = status
         self.code = code
         self.detail = detail
         self.errors = errors
-        self.headers = headers
+        self.headers = dict(headers or {})
+        if retry_seconds is not None:
+            self.headers["Retry-After"] = str(retry_seconds)
 
     def response(self) -> JSONResponse:
         """The answer."""
@@ -95,9 +99,7 @@ class Problem(Exception):
         }
         if self.errors is not None:
             content["errors"] = [dict(error) for error in self.errors]
-        return JSONResponse(
-            content, status_code=self.status, headers=dict(self.headers or {}), media_type=MEDIA_TYPE
-        )
+        return JSONResponse(content, status_code=self.status, headers=self.headers, media_type=MEDIA_TYPE)
 
 
 def not_found(what: str) -> Problem:
@@ -129,19 +131,18 @@ def add_problem_handlers(app: FastAPI) -> None:
 
 def problem_of(error: OctasplatError) -> Problem:
     """How an error of ours is answered."""
-    detail = str(error)
-    again = {"Retry-After": str(RETRY_SECONDS)}
+    detail, again = str(error), RETRY_SECONDS
     if isinstance(error, IntakeRefused):
         status = 408 if error.code == "upload-stalled" else 422
         return Problem(status, error.code, detail, errors=[fault.as_dict() for fault in error.faults])
     if isinstance(error, QuotaExceeded):
         # Bytes come back by deleting only, the others also by waiting.
         status = 413 if error.of == "bytes" else 429
-        return Problem(status, f"quota-{error.of}", detail, headers=again if status == 429 else None)
+        return Problem(status, f"quota-{error.of}", detail, retry_seconds=again if status == 429 else None)
     if isinstance(error, Conflict):
         return Problem(409, "conflict", detail)
     if isinstance(error, StorageFull):
-        return Problem(507, "storage-full", without_paths(detail), headers=again)
+        return Problem(507, "storage-full", without_paths(detail), retry_seconds=again)
     if isinstance(error, TooLarge):
         return Problem(413, "too-large", detail)
     if isinstance(error, DigestMismatch):
@@ -150,7 +151,7 @@ def problem_of(error: OctasplatError) -> Problem:
         return Problem(410, "content-gone", "The content is not in the store any more.")
     if isinstance(error, StorageUnavailable | StorageError):
         logger.warning("the store: %s", error)
-        return Problem(503, "storage", "The store does not answer; try again later.", headers=again)
+        return Problem(503, "storage", "The store does not answer; try again later.", retry_seconds=again)
     return Problem(422, "refused", without_paths(detail))
 
 
@@ -189,7 +190,7 @@ async def _on_database_error(_request: Request, error: Exception) -> JSONRespons
         503,
         "database",
         "The database does not answer; try again in a moment.",
-        headers={"Retry-After": str(RETRY_SECONDS)},
+        retry_seconds=RETRY_SECONDS,
     ).response()
 
 

@@ -45,6 +45,10 @@ class Service:
     draining: bool = False
     started: float = field(default_factory=time.monotonic)
 
+    def forget_tokens(self) -> None:
+        """Look for tokens anew at the next request."""
+        self.tokens_seen = -1e9
+
 
 def service_of(request: Request) -> Service:
     """The service that a request has reached."""

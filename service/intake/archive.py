@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from service.intake.faults import Fault, IntakeRefused
 from service.intake.layout import Part, common_folder, is_clutter, part_of
+from service.intake.names import FileNames
 from service.intake.zip_records import DEFLATED, IS_ENCRYPTED, IS_STRONG, STORED, Record, read_records, refuse
-from workers.store.names import NameRefused, NameSet, check_name, shown_name
+from workers.store.names import shown_name
 from workers.store.protocol import Blob, BlobWriter
 
 _PIECE_BYTES = 1 << 20
@@ -106,16 +106,10 @@ def list_archive(file: BinaryIO, limits: ArchiveLimits = ArchiveLimits()) -> Arc
     records = read_records(
         file, max_entries=limits.max_entries, max_directory_bytes=limits.max_directory_bytes
     )
-    names = NameSet()
+    names = FileNames()
     for record in records:
         _check_kind(record)
-        try:
-            if record.name.endswith("/"):
-                names.add_folder(record.name.removesuffix("/"))
-            else:
-                names.add(record.name)
-        except NameRefused as error:
-            raise IntakeRefused(Fault(error.code, str(error), record.name)) from None
+        names.add(record.name)
         _check_size(record, limits)
     total = sum(record.size_bytes for record in records)
     if total > limits.max_total_bytes:
@@ -208,7 +202,7 @@ def _listing(records: list[Record]) -> ArchiveListing:
     for record in records:
         name = record.name.removeprefix(folder)
         if record.name.startswith(folder) and part_of(name) is not Part.OTHER:
-            files.append(ArchiveFile(check_name(name), record))
+            files.append(ArchiveFile(name, record))
         else:
             left_out.append(record.name)
     if not files:

@@ -9,8 +9,9 @@ from service.intake.images import ImageHeader, ImageLimits, read_image_header
 from service.intake.layout import Part, model_files, part_of
 from service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
 from service.intake.model_child import ModelAnswer
+from service.intake.names import FileNames, scene_part
 from service.intake.whole import check_whole
-from workers.store.names import NameRefused, NameSet, check_name, shown_name
+from workers.store.names import shown_name
 from workers.store.protocol import Storage
 from workers.store.trees import TreeFile
 
@@ -80,40 +81,16 @@ class DatasetSummary:
     warnings: tuple[str, ...] = ()
 
 
-def check_file_name(name: str) -> Part:
-    """What a file of that name is in a dataset.
-
-    Raises:
-        IntakeRefused: the name is refused (``name-...``), or is that of no part of a scene
-            (``name-unexpected``).
-    """
-    try:
-        check_name(name)
-    except NameRefused as error:
-        raise IntakeRefused(Fault(error.code, str(error), name)) from None
-    part = part_of(name)
-    if part is Part.OTHER:
-        raise IntakeRefused(
-            Fault(
-                "name-unexpected",
-                f"{shown_name(name)} is no part of a scene; these are images/, masks/ and the COLMAP model "
-                "in sparse/0.",
-                name,
-            )
-        )
-    return part
-
-
 def check_file_content(
     storage: Storage, name: str, sha256: str, limits: ImageLimits = DEFAULT_IMAGE_LIMITS
 ) -> ImageHeader | None:
     """Check a stored file before it is entered into a dataset; the header of an image, else None.
 
     Raises:
-        IntakeRefused: the name or the header is refused, or the file was cut off.
+        IntakeRefused: the header is refused, or the file was cut off.
         StorageError: the content cannot be had.
     """
-    if check_file_name(name) is Part.MODEL:
+    if part_of(name) is Part.MODEL:
         return None
     with storage.open(sha256) as file:
         header = read_image_header(file, name, limits)
@@ -178,15 +155,13 @@ def check_dataset(
 
 
 def _check_names(files: Sequence[DatasetFile], faults: list[Fault]) -> None:
-    known = NameSet()
+    known = FileNames()
     for file in files:
         try:
-            check_file_name(file.path)
             known.add(file.path)
+            scene_part(file.path)
         except IntakeRefused as error:
             faults += error.faults
-        except NameRefused as error:
-            faults.append(Fault(error.code, str(error), file.path))
 
 
 def _image_sizes(

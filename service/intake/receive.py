@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
-from service.intake.dataset import DatasetLimits, check_file_content, check_file_name
+from service.intake.dataset import DatasetLimits, check_file_content
 from service.intake.faults import Fault, IntakeRefused
 from service.intake.images import ImageHeader
 from workers.store.counting import CountingWriter
@@ -153,7 +153,7 @@ async def receive_file(
 
     Args:
         storage: where to.
-        path: name in the dataset.
+        path: name in the dataset, which is checked.
         stream: the body.
         sha256: digest that was announced.
         size_bytes: length that was announced.
@@ -161,10 +161,9 @@ async def receive_file(
         max_bytes: a lower limit than that of ``limits``, e.g. what a quota leaves.
 
     Raises:
-        IntakeRefused: the name, the digest's form or the header of the image is refused.
+        IntakeRefused: the header of the image is refused, or nothing came for too long.
         StorageError: as by :func:`receive`.
     """
-    check_file_name(path)
     most = limits.max_file_bytes if max_bytes is None else min(limits.max_file_bytes, max_bytes)
     writer = await asyncio.to_thread(storage.begin, sha256=sha256, size_bytes=size_bytes, max_bytes=most)
     blob = await receive(stream, writer, idle_seconds=limits.idle_seconds)

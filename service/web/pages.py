@@ -9,18 +9,22 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 
+from service.actions import jobs as actions
+from service.actions.accepting import retry_job
+from service.actions.artifacts import get_artifact, list_artifacts
+from service.actions.datasets import list_datasets
+from service.actions.system import living_workers
 from service.auth import Principal, Reader, Writer
 from service.downloads import send_blob
+from service.intake.layout import model_files
 from service.limits import ceilings_by_path
 from service.paging import read_id_cursor, write_cursor
-from service.problems import not_found
 from service.queue_facts import unwritable_formats
-from service.routes import jobs as api
-from service.schemas import JobChange, RetryRequest
+from service.schemas.jobs import JobChange, RetryRequest
 from service.state import Service, ServiceDep
 from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
 from service.web.forms import options_form
-from service.web.reading import JobDetail, job_counts, job_detail, job_lines
+from service.web.reading import job_counts, job_detail, job_lines, photographs_of
 from service.web.results import (
     CONFIG,
     HELD_OUT,
@@ -34,11 +38,7 @@ from service.web.results import (
 )
 from service.web.routing import PageRoute, go_to, is_part
 from service.web.templating import page
-from workers.queue.jobs import artifacts_of, get_artifact
-from workers.records.database import Connection
-from workers.records.datasets import files_of, list_datasets
 from workers.records.rows import Artifact, DatasetFile
-from workers.records.workers import live_workers
 from workers.store.errors import StorageError
 from workers.work.kinds import job_kinds, kind_named
 
@@ -77,10 +77,9 @@ async def show_job_list(
 async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
     """A job: how it fares, and its result once it has one."""
     detail = await job_detail(service, who, job_id)
-    async with service.pool.connection() as connection:
-        artifacts = await artifacts_of(connection, job_id)
-        photographs = await _photographs(connection, detail)
-        unwritable = unwritable_formats(await live_workers(connection, service.settings.stale_seconds))
+    artifacts = await list_artifacts(service, who, job_id)
+    photographs = await photographs_of(service, who, job_id)
+    unwritable = unwritable_formats(await living_workers(service))
     by_name = {row.name: row for row in artifacts}
     metrics, config = await asyncio.to_thread(
         lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)]
@@ -114,11 +113,7 @@ async def show_job_status(request: Request, job_id: uuid.UUID, who: Reader, serv
 @router.get("/jobs/{job_id}/report")
 async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
     """The report of a job as a page."""
-    async with service.pool.connection() as connection:
-        await api.owned_job(connection, who, job_id)
-        row = await get_artifact(connection, job_id, REPORT)
-    if row is None:
-        raise not_found("report")
+    row = await get_artifact(service, who, job_id, REPORT, what="report")
     response = await asyncio.to_thread(
         lambda: send_blob(
             service, request, sha256=row.sha256, size_bytes=row.size_bytes, media_type="text/html",
@@ -132,10 +127,8 @@ async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service:
 @router.get("/jobs/{job_id}/cameras.json")
 async def get_cameras(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> JSONResponse:
     """Where the photographs of a job were taken, for the viewer."""
-    async with service.pool.connection() as connection:
-        job = await api.owned_job(connection, who, job_id)
-        artifacts = await artifacts_of(connection, job_id)
-        files = await files_of(connection, job.dataset_id) if job.dataset_id else []
+    artifacts = await list_artifacts(service, who, job_id)
+    files = await photographs_of(service, who, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
     content = await asyncio.to_thread(_cameras, service, artifacts, files, held_out)
     headers = {"Cache-Control": "private, max-age=300"}
@@ -148,15 +141,14 @@ async def show_new(
 ) -> Response:
     """Send photographs and queue their reconstruction."""
     kind = kind_named("reconstruct")
-    async with service.pool.connection() as connection:
-        datasets = await list_datasets(connection, owner=who.sees, limit=MAX_DATASETS)
-        workers = await live_workers(connection, service.settings.stale_seconds)
+    datasets = await list_datasets(service, who, limit=MAX_DATASETS)
+    workers = await living_workers(service)
     return page(
         request,
         "new.html",
         who,
         form=options_form(kind, unwritable_formats(workers), ceilings_by_path(kind, service.settings)),
-        datasets=[row for row in datasets if row.state == "committed"],
+        datasets=[row for row in datasets.rows if row.state == "committed"],
         chosen=dataset,
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),
         max_file_bytes=service.settings.max_upload_bytes,
@@ -167,7 +159,7 @@ async def show_new(
 @router.post("/jobs/{job_id}/cancel")
 async def cancel(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
     """Stop a job."""
-    await api.cancel_job(job_id, who, service, Response())
+    await actions.cancel_job(service, who, job_id)
     return await _after(request, job_id, who, service)
 
 
@@ -177,7 +169,7 @@ async def retry(
     start: Literal["checkpoint", "start"] = "checkpoint",
 ) -> Response:  # fmt: skip
     """Queue a job again."""
-    await api.retry_job(job_id, who, service, Response(), RetryRequest(start=start))
+    await retry_job(service, who, job_id, RetryRequest(start=start))
     return await _after(request, job_id, who, service)
 
 
@@ -186,14 +178,14 @@ async def pin(
     request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep, keep: bool = True
 ) -> Response:
     """Keep a job whatever its age, or no longer."""
-    await api.change_job(job_id, JobChange(pinned=keep), who, service, request)
+    await actions.change_job(service, who, job_id, JobChange(pinned=keep))
     return await _after(request, job_id, who, service)
 
 
 @router.post("/jobs/{job_id}/delete")
 async def delete(request: Request, job_id: uuid.UUID, who: Writer, service: ServiceDep) -> Response:
     """Delete a job with its results."""
-    await api.delete_job(job_id, who, service, Response())
+    await actions.delete_job(service, who, job_id)
     return go_to(request, "/")
 
 
@@ -210,18 +202,14 @@ async def _after(request: Request, job_id: uuid.UUID, who: Principal, service: S
 
 
 async def _list_values(service: Service, who: Principal, show: Shown, cursor: str | None) -> dict[str, Any]:
-    lines = await job_lines(service, who, show, read_id_cursor(cursor), PAGE_LENGTH + 1)
+    part = await job_lines(service, who, show, read_id_cursor(cursor), PAGE_LENGTH)
     return {
-        "lines": lines[:PAGE_LENGTH],
-        "next": write_cursor(str(lines[PAGE_LENGTH - 1].job.id)) if len(lines) > PAGE_LENGTH else None,
+        "lines": part.rows,
+        "next": None if part.following is None else write_cursor(part.following),
         "counts": await job_counts(service, who),
         "show": show,
         "cursor": cursor,
     }
-
-
-async def _photographs(connection: Connection, detail: JobDetail) -> list[DatasetFile]:
-    return await files_of(connection, detail.dataset.id) if detail.dataset is not None else []
 
 
 def _fits(source_files: tuple[str, ...], names: dict[str, Artifact]) -> bool:
@@ -260,7 +248,5 @@ def _cameras(
 
 
 def _model(files: list[DatasetFile]) -> dict[str, DatasetFile]:
-    from service.intake.layout import model_files
-
     by_path = {file.path: file for file in files}
     return {part: by_path[path] for part, path in model_files(list(by_path)).items()}

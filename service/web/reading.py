@@ -8,16 +8,18 @@ from typing import Any
 
 from psycopg.rows import class_row
 
+from service.actions.access import owned_job
+from service.actions.jobs import JobFilter, job_view, list_jobs, stages_of
+from service.actions.parts import Part
 from service.auth import Principal
-from service.routes.jobs import job_view, owned_job, stages_of
-from service.schemas import JobView
+from service.schemas.jobs import JobView
 from service.state import Service
 from service.web.results import METRICS, mean_psnr, read_json
 from service.web.templating import short_id
 from workers.queue import jobs as rows
 from workers.records.database import Connection
-from workers.records.datasets import get_dataset
-from workers.records.rows import Artifact, Dataset, Job, JobEvent, JobState
+from workers.records.datasets import files_of, get_dataset
+from workers.records.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
 
 ACTIVE: tuple[JobState, ...] = ("queued", "running", "canceling")
 SHOWN: dict[str, tuple[JobState, ...]] = {
@@ -70,13 +72,11 @@ class JobDetail:
 
 async def job_lines(
     service: Service, who: Principal, shown: str, before: uuid.UUID | None, limit: int
-) -> list[JobLine]:
+) -> Part[JobLine]:
     """The newest jobs, of one kind of state."""
+    part = await list_jobs(service, who, JobFilter(SHOWN[shown]), before=before, limit=limit)
     async with service.pool.connection() as connection:
-        found = await rows.list_jobs(
-            connection, owner=who.sees, states=SHOWN[shown], before=before, limit=limit
-        )
-        return await _lines(service, connection, found)
+        return Part(await _lines(service, connection, part.rows), part.following)
 
 
 async def job_counts(service: Service, who: Principal) -> dict[str, int]:
@@ -130,6 +130,17 @@ async def job_detail(service: Service, who: Principal, job_id: uuid.UUID) -> Job
         [event for event in events if event.kind in ("rescued", "handed_back", "resumed")],
         list(dict.fromkeys(warnings)),
     )
+
+
+async def photographs_of(service: Service, who: Principal, job_id: uuid.UUID) -> list[DatasetFile]:
+    """The files of the dataset that a job works on; none if it is gone.
+
+    Raises:
+        Problem: 404.
+    """
+    async with service.pool.connection() as connection:
+        job = await owned_job(connection, who, job_id)
+        return await files_of(connection, job.dataset_id) if job.dataset_id else []
 
 
 async def _lines(service: Service, connection: Connection, jobs: Sequence[Job]) -> list[JobLine]:

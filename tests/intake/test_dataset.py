@@ -12,10 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from model_builder import Cam, Img, Model, Pnt, photograph, photographs, stored, turned
 
-from service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset, check_file_name
+from service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset
 from service.intake.faults import Fault, IntakeRefused
 from service.intake.layout import Part
 from service.intake.model_check import ModelLimits, check_model, child_environment
+from service.intake.names import check_file_name
 from workers.store.local import LocalStorage
 from workers.store.trees import TreeFile
 
@@ -188,6 +189,8 @@ def test_names_of_single_files() -> None:
         ("images", "name-unexpected"),
         ("sparse/1/cameras.bin", "name-unexpected"),
         ("checkpoint.pkl", "name-unexpected"),
+        ("../evil.png", "name-traversal"),
+        ("images/evil.sh", "name-unexpected"),
         ("images/.hidden.jpg", "name-unexpected"),
     ):
         with pytest.raises(IntakeRefused) as caught:

@@ -1,4 +1,4 @@
-"""What the API takes and gives about webhooks, with examples."""
+"""Webhooks and their messages."""
 
 import uuid
 from datetime import datetime
@@ -6,12 +6,11 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME
 from workers.upkeep.webhooks.addresses import MAX_URL
 from workers.upkeep.webhooks.rows import ENDS, Delivery, DeliveryState, Endpoint, EventName
 from workers.upkeep.webhooks.signing import check_secret
 
-_ID = "01a1fcac-4f59-764b-97e6-1be68502c58f"
-_TIME = "2026-11-21T05:55:13.369313Z"
 _SECRET = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSwMfKQ9r8GKYo="  # noqa: S105 - an example
 
 Secret = Annotated[str, Field(max_length=200), AfterValidator(check_secret)]
@@ -63,13 +62,13 @@ class WebhookView(BaseModel):
         json_schema_extra={
             "examples": [
                 {
-                    "id": _ID,
+                    "id": EXAMPLE_ID,
                     "url": "https://example.org/hook",
                     "events": ["job.succeeded", "job.failed", "job.canceled"],
                     "job_id": None,
                     "enabled": True,
                     "disabled_reason": None,
-                    "created_at": _TIME,
+                    "created_at": EXAMPLE_TIME,
                 }
             ]
         }
@@ -109,14 +108,14 @@ class DeliveryView(BaseModel):
         json_schema_extra={
             "examples": [
                 {
-                    "id": _ID,
+                    "id": EXAMPLE_ID,
                     "message_id": "msg_01a1fcac4f59764b97e61be68502c58f",
                     "kind": "job.succeeded",
                     "payload": {
                         "type": "job.succeeded",
-                        "timestamp": _TIME,
+                        "timestamp": EXAMPLE_TIME,
                         "data": {
-                            "job_id": _ID,
+                            "job_id": EXAMPLE_ID,
                             "kind": "reconstruct",
                             "label": None,
                             "state": "succeeded",
@@ -128,8 +127,8 @@ class DeliveryView(BaseModel):
                     "due_at": None,
                     "status": 200,
                     "error": None,
-                    "created_at": _TIME,
-                    "tried_at": _TIME,
+                    "created_at": EXAMPLE_TIME,
+                    "tried_at": EXAMPLE_TIME,
                 }
             ]
         }

@@ -1,0 +1,93 @@
+"""Whose things they are, and whether anything is taken on now."""
+
+import uuid
+
+from service.auth import Principal
+from service.problems import Problem, not_found
+from service.state import Service
+from workers.queue.jobs import get_job
+from workers.records.database import Connection
+from workers.records.datasets import get_dataset
+from workers.records.errors import Conflict
+from workers.records.rows import Dataset, Job
+from workers.upkeep.webhooks.rows import Endpoint, get_endpoint
+
+_RETRY_SECONDS = 10
+
+
+async def owned_job(connection: Connection, who: Principal, job_id: uuid.UUID, *, lock: bool = False) -> Job:
+    """The job, if it is the asker's to see.
+
+    Raises:
+        Problem: 404.
+    """
+    job = await get_job(connection, job_id, lock=lock)
+    if job is None or not who.owns(job.owner):
+        raise not_found("job")
+    return job
+
+
+async def read_job(service: Service, who: Principal, job_id: uuid.UUID) -> Job:
+    """As :func:`owned_job`, on a connection of its own."""
+    async with service.pool.connection() as connection:
+        return await owned_job(connection, who, job_id)
+
+
+async def owned_dataset(
+    connection: Connection, who: Principal, dataset_id: uuid.UUID, *, lock: bool = False
+) -> Dataset:
+    """The dataset, if it is the asker's to see.
+
+    Raises:
+        Problem: 404.
+    """
+    dataset = await get_dataset(connection, dataset_id, lock=lock)
+    if dataset is None or not who.owns(dataset.owner):
+        raise not_found("dataset")
+    return dataset
+
+
+async def open_dataset(connection: Connection, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+    """The dataset, if it is the asker's and still takes files.
+
+    Raises:
+        Problem: 404.
+        Conflict: it is committed, or being checked.
+    """
+    dataset = await owned_dataset(connection, who, dataset_id)
+    if dataset.state != "open":
+        raise Conflict(f"The dataset is {dataset.state}, so its files do not change; make a new dataset.")
+    return dataset
+
+
+async def owned_webhook(connection: Connection, who: Principal, webhook_id: uuid.UUID) -> Endpoint:
+    """The webhook, if it is the asker's to see.
+
+    Raises:
+        Problem: 404.
+    """
+    endpoint = await get_endpoint(connection, webhook_id)
+    if endpoint is None or not who.owns(endpoint.owner):
+        raise not_found("webhook")
+    return endpoint
+
+
+def sought(name: str, what: str) -> str:
+    """A name to look for.
+
+    Raises:
+        Problem: 404, as nothing has a name that the database cannot hold.
+    """
+    if "\0" in name:
+        raise not_found(what)
+    return name
+
+
+def refuse_while_draining(service: Service) -> None:
+    """Take nothing on that may not be finished.
+
+    Raises:
+        Problem: 503.
+    """
+    if service.draining:
+        raise Problem(503, "draining", "The service is about to stop.", retry_seconds=_RETRY_SECONDS)

@@ -1,0 +1,52 @@
+"""Results of jobs, and pictures of scenes in the making."""
+
+import asyncio
+import uuid
+
+from service.actions.access import owned_job, read_job, sought
+from service.auth import Principal
+from service.problems import not_found
+from service.state import Service
+from workers.queue import jobs as rows
+from workers.records.rows import Artifact
+from workers.store.protocol import Blob
+
+
+async def list_artifacts(service: Service, who: Principal, job_id: uuid.UUID) -> list[Artifact]:
+    """The results of a job.
+
+    Raises:
+        Problem: 404.
+    """
+    async with service.pool.connection() as connection:
+        await owned_job(connection, who, job_id)
+        return await rows.artifacts_of(connection, job_id)
+
+
+async def get_artifact(
+    service: Service, who: Principal, job_id: uuid.UUID, name: str, *, what: str = "result"
+) -> Artifact:
+    """A result of a job; without one the problem says that there is no such ``what``.
+
+    Raises:
+        Problem: 404.
+    """
+    async with service.pool.connection() as connection:
+        await owned_job(connection, who, job_id)
+        row = await rows.get_artifact(connection, job_id, sought(name, what))
+    if row is None:
+        raise not_found(what)
+    return row
+
+
+async def get_preview(service: Service, who: Principal, job_id: uuid.UUID) -> Blob:
+    """The newest picture of the scene in the making, a PNG.
+
+    Raises:
+        Problem: 404.
+        StorageError: the store does not have it.
+    """
+    job = await read_job(service, who, job_id)
+    if job.preview is None:
+        raise not_found("picture yet")
+    return await asyncio.to_thread(service.storage.stat, job.preview["sha256"])

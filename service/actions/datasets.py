@@ -1,0 +1,133 @@
+"""Datasets: made, listed, changed, checked, deleted; their files are in ``uploads``."""
+
+import asyncio
+import uuid
+from dataclasses import asdict
+from typing import Any
+
+from service.actions.access import owned_dataset
+from service.actions.parts import Part, cut
+from service.auth import Principal
+from service.idempotency import fingerprint, once
+from service.intake.dataset import DatasetFile as IntakeFile
+from service.intake.dataset import DatasetSummary, check_dataset
+from service.schemas.datasets import DatasetChange, NewDataset
+from service.state import Service
+from workers.records import datasets as rows
+from workers.records.quotas import check_new_dataset
+from workers.records.rows import Dataset, DatasetFile
+
+
+async def create_dataset(
+    service: Service, who: Principal, new: NewDataset, *, key: str | None = None
+) -> Dataset:
+    """Make a dataset; the same request with the same ``key`` makes nothing new.
+
+    Raises:
+        Problem: 422 if the key was used for another request.
+        QuotaExceeded: the asker has too many.
+    """
+    async with service.pool.connection() as connection, connection.transaction():
+
+        async def make() -> uuid.UUID:
+            await check_new_dataset(connection, who.owner, service.settings.quota)
+            return (await rows.create_dataset(connection, who.owner, new.name)).id
+
+        request = fingerprint("dataset", new.model_dump())
+        dataset_id, _ = await once(connection, who, key, request, make)
+        return await owned_dataset(connection, who, dataset_id)
+
+
+async def list_datasets(
+    service: Service, who: Principal, *, before: uuid.UUID | None = None, limit: int
+) -> Part[Dataset]:
+    """Datasets that the asker may see, the newest first, those made before ``before``."""
+    async with service.pool.connection() as connection:
+        found = await rows.list_datasets(connection, owner=who.sees, before=before, limit=limit + 1)
+    return cut(found, limit, lambda dataset: dataset.id)
+
+
+async def get_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+    """A dataset.
+
+    Raises:
+        Problem: 404.
+    """
+    async with service.pool.connection() as connection:
+        return await owned_dataset(connection, who, dataset_id)
+
+
+async def change_dataset(
+    service: Service, who: Principal, dataset_id: uuid.UUID, change: DatasetChange
+) -> Dataset:
+    """Rename a dataset, or keep it whatever its age.
+
+    Raises:
+        Problem: 404.
+    """
+    async with service.pool.connection() as connection, connection.transaction():
+        dataset = await owned_dataset(connection, who, dataset_id, lock=True)
+        return await rows.change_dataset(
+            connection,
+            dataset_id,
+            name=dataset.name if change.name is None else change.name,
+            pinned=dataset.pinned if change.pinned is None else change.pinned,
+        )
+
+
+async def delete_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> None:
+    """Delete a dataset.
+
+    Raises:
+        Problem: 404.
+        Conflict: a job needs it.
+    """
+    async with service.pool.connection() as connection:
+        await owned_dataset(connection, who, dataset_id)
+        await rows.delete_dataset(connection, dataset_id)
+    service.room.after_deletion()
+
+
+async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+    """Check a dataset; one that is sound never changes again.
+
+    Raises:
+        Problem: 404.
+        Conflict: it is being checked.
+        IntakeRefused: it is not sound.
+    """
+    async with service.pool.connection() as connection:
+        await owned_dataset(connection, who, dataset_id)
+        before = await rows.begin_check(connection, dataset_id)
+        if before.state == "committed":
+            return before
+        files = await rows.files_of(connection, dataset_id)
+    summary: DatasetSummary | None = None
+    try:
+        summary = await asyncio.to_thread(check_dataset, service.storage, [_for_intake(f) for f in files])
+    finally:
+        # Whatever happens, the dataset must not stay closed.
+        dataset = await asyncio.shield(_end_check(service, dataset_id, summary))
+    return dataset
+
+
+async def _end_check(service: Service, dataset_id: uuid.UUID, summary: DatasetSummary | None) -> Dataset:
+    async with service.pool.connection() as connection:
+        if summary is None:
+            return await rows.end_check(connection, dataset_id, sound=False)
+        facts: dict[str, Any] = asdict(summary)
+        photographs, has_poses = facts.pop("photographs"), facts.pop("has_model")
+        return await rows.end_check(
+            connection, dataset_id, sound=True, has_poses=has_poses, photographs=photographs, facts=facts
+        )
+
+
+def _for_intake(row: DatasetFile) -> IntakeFile:
+    return IntakeFile(
+        row.path,
+        row.sha256,
+        row.size_bytes,
+        row.facts.get("width_px"),
+        row.facts.get("height_px"),
+        row.facts.get("warning"),
+    )

@@ -1,0 +1,45 @@
+"""What a job would take, before it is asked for."""
+
+from service.actions.asked import accepted_kind, input_problem, resolved
+from service.auth import Principal
+from service.limits import check_ceilings, estimate_job
+from service.queue_facts import workers_of
+from service.schemas.estimates import NewEstimate
+from service.state import Service
+from workers.queue.jobs import get_job
+from workers.records.database import Connection
+from workers.records.datasets import get_dataset, photograph_sizes
+from workers.records.sizes import Sizes
+from workers.work.kinds.estimates import Estimate
+
+
+async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estimate | None:
+    """What a job would take, checked as if it were made; None where nobody knows.
+
+    Raises:
+        Problem: 422.
+    """
+    kind = accepted_kind(new.kind)
+    options = resolved(kind, new.options)
+    async with service.pool.connection() as connection:
+        sizes = [Sizes(group.width_px, group.height_px, group.count) for group in new.photographs]
+        sizes += await _sizes_of(connection, who, new)
+        workers = await workers_of(connection, new.queue, service.settings.stale_seconds)
+    check_ceilings(kind, options, sizes, service.settings)
+    return estimate_job(kind, options, sizes, workers)
+
+
+async def _sizes_of(connection: Connection, who: Principal, new: NewEstimate) -> list[Sizes]:
+    """Sizes of the photographs of a dataset, or of the one that a job worked on."""
+    dataset_id = new.dataset_id
+    if new.source_id is not None:
+        job = await get_job(connection, new.source_id)
+        if job is None or not who.owns(job.owner):
+            raise input_problem("source_id", "There is no such job.")
+        dataset_id = dataset_id or job.dataset_id
+    if dataset_id is None:
+        return []
+    dataset = await get_dataset(connection, dataset_id)
+    if dataset is None or not who.owns(dataset.owner):
+        raise input_problem("dataset_id", "There is no such dataset.")
+    return await photograph_sizes(connection, dataset_id)

@@ -1,0 +1,193 @@
+"""Files of datasets: taken in one by one or as an archive, listed, found, taken out."""
+
+import uuid
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from service.actions.access import open_dataset, owned_dataset, refuse_while_draining, sought
+from service.actions.parts import Part, cut
+from service.auth import Principal
+from service.intake.names import check_file_name
+from service.intake.receive import ReceivedArchive, ReceivedFile, receive_archive, receive_file
+from service.problems import not_found
+from service.state import Service
+from workers.queue.storing import Note
+from workers.records import datasets as rows
+from workers.records.quotas import QuotaExceeded, bytes_left, check_bytes
+from workers.records.rows import Dataset, DatasetFile
+from workers.store.errors import TooLarge
+
+Received = TypeVar("Received")
+
+
+@dataclass(frozen=True)
+class Upload:
+    """Something that is being sent.
+
+    Attributes:
+        body: its bytes, as they come.
+        sha256: the digest that was announced.
+        size_bytes: the length that was announced.
+    """
+
+    body: AsyncIterator[bytes]
+    sha256: str | None = None
+    size_bytes: int | None = None
+
+
+@dataclass(frozen=True)
+class PutFile:
+    """A file of a dataset, and whether it was there already."""
+
+    row: DatasetFile
+    was_there: bool
+
+
+@dataclass(frozen=True)
+class PutArchive:
+    """Files that came out of an archive, and names of those that are no part of a scene."""
+
+    files: list[DatasetFile]
+    left_out: tuple[str, ...]
+
+
+async def list_files(
+    service: Service, who: Principal, dataset_id: uuid.UUID, *, after: str, limit: int
+) -> Part[DatasetFile]:
+    """The files that have arrived, by name, from the one after ``after``.
+
+    Raises:
+        Problem: 404.
+    """
+    async with service.pool.connection() as connection:
+        await owned_dataset(connection, who, dataset_id)
+        found = await rows.files_of(connection, dataset_id, after=after, limit=limit + 1)
+    return cut(found, limit, lambda file: file.path)
+
+
+async def get_file(service: Service, who: Principal, dataset_id: uuid.UUID, path: str) -> DatasetFile:
+    """A file of a dataset.
+
+    Raises:
+        Problem: 404.
+    """
+    async with service.pool.connection() as connection:
+        await owned_dataset(connection, who, dataset_id)
+        row = await rows.get_file(connection, dataset_id, sought(path, "file"))
+    if row is None:
+        raise not_found("file")
+    return row
+
+
+async def remove_file(service: Service, who: Principal, dataset_id: uuid.UUID, path: str) -> None:
+    """Take a file out of an open dataset.
+
+    Raises:
+        Problem: 404.
+        Conflict: the dataset is not open.
+    """
+    async with service.pool.connection() as connection:
+        await open_dataset(connection, who, dataset_id)
+        if not await rows.remove_file(connection, dataset_id, sought(path, "file")):
+            raise not_found("file")
+    service.room.after_deletion()
+
+
+async def put_file(
+    service: Service, who: Principal, dataset_id: uuid.UUID, path: str, upload: Upload
+) -> PutFile:
+    """Put a file into an open dataset. One that is there with the announced digest is not read.
+
+    Raises:
+        Problem: 404, or 503 if the service is about to stop.
+        Conflict: the dataset is not open.
+        IntakeRefused: the name or the content is refused.
+        QuotaExceeded: its owner may not store as much.
+        StorageError: it is not as announced, or there is no room.
+    """
+    check_file_name(path)
+    refuse_while_draining(service)
+    async with service.pool.connection() as connection:
+        dataset = await open_dataset(connection, who, dataset_id)
+        known = await rows.get_file(connection, dataset_id, path)
+        left = await bytes_left(connection, dataset.owner, service.settings.quota)
+    if known is not None and upload.sha256 == known.sha256:
+        return PutFile(known, was_there=True)
+    if left is not None and known is not None:
+        left += known.size_bytes  # it will be replaced
+
+    def receive() -> Awaitable[ReceivedFile]:
+        return receive_file(
+            service.storage,
+            path,
+            upload.body,
+            sha256=upload.sha256,
+            size_bytes=upload.size_bytes,
+            limits=service.settings.upload_limits(),
+            max_bytes=left,
+        )
+
+    async with service.room.upload(upload.size_bytes) as note:
+        received = await _within_quota(receive, left)
+        [row] = await _enter(service, dataset, note, [received])
+    return PutFile(row, was_there=False)
+
+
+async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, upload: Upload) -> PutArchive:
+    """Put the files of a ZIP file into an open dataset, beside those that are there.
+
+    Raises:
+        Problem: 404, or 503 if the service is about to stop.
+        Conflict: the dataset is not open.
+        IntakeRefused: the archive, or a name or a content in it, is refused.
+        QuotaExceeded: its owner may not store as much.
+        StorageError: it is not as announced, or there is no room.
+    """
+    refuse_while_draining(service)
+    async with service.pool.connection() as connection:
+        dataset = await open_dataset(connection, who, dataset_id)
+        left = await bytes_left(connection, dataset.owner, service.settings.quota)
+
+    def receive() -> Awaitable[ReceivedArchive]:
+        return receive_archive(
+            service.storage,
+            upload.body,
+            service.settings.work_folder / "archives",
+            sha256=upload.sha256,
+            size_bytes=upload.size_bytes,
+            limits=service.settings.upload_limits(),
+            max_bytes=left,
+        )
+
+    async with service.room.upload(upload.size_bytes) as note:
+        received = await _within_quota(receive, left)
+        files = await _enter(service, dataset, note, received.files)
+    return PutArchive(files, received.left_out)
+
+
+async def _within_quota(receive: Callable[[], Awaitable[Received]], left: int | None) -> Received:
+    """What an upload brings; ``left``, where that is what stopped it, is what its owner may still store."""
+    try:
+        return await receive()
+    except TooLarge as error:
+        if left is None or error.max_bytes != left:
+            raise
+        raise QuotaExceeded(
+            "bytes", f"{left} bytes are left of what you may store; delete datasets or jobs first."
+        ) from None
+
+
+async def _enter(
+    service: Service, dataset: Dataset, note: Note, received: Sequence[ReceivedFile]
+) -> list[DatasetFile]:
+    """Enter what is stored into the dataset, or none of it."""
+    service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received))
+    async with service.pool.connection() as connection, connection.transaction():
+        await note.confirm(connection)
+        files = [
+            await rows.put_file(connection, dataset.id, f.path, f.blob.sha256, f.blob.size_bytes, f.facts)
+            for f in received
+        ]
+        await check_bytes(connection, dataset.owner, service.settings.quota)
+    return files

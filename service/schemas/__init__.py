@@ -1,0 +1,1 @@
+"""What the API takes and gives, with examples; one module a subject."""

@@ -1,0 +1,116 @@
+"""Datasets and their files."""
+
+import uuid
+from datetime import datetime
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, Strict
+from workers.records.rows import Dataset, DatasetFile, DatasetState
+
+
+class NewDataset(Strict):
+    """A dataset to make."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"name": "fox"}]})
+
+    name: str = Field("", max_length=200, description="What you call it.")
+
+
+class DatasetChange(Strict):
+    """What may be changed of a dataset."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"pinned": True}]})
+
+    name: str | None = Field(None, max_length=200)
+    pinned: bool | None = Field(None, description="Keep it whatever its age.")
+
+
+class DatasetView(BaseModel):
+    """A dataset."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": EXAMPLE_ID,
+                    "name": "fox",
+                    "state": "committed",
+                    "has_poses": True,
+                    "photographs": 50,
+                    "facts": {"points": 8712, "camera_models": ["OPENCV"]},
+                    "pinned": False,
+                    "created_at": EXAMPLE_TIME,
+                    "committed_at": EXAMPLE_TIME,
+                    "expires_at": None,
+                }
+            ]
+        }
+    )
+
+    id: uuid.UUID
+    name: str
+    state: DatasetState = Field(description="`open` takes files, `committed` never changes again.")
+    has_poses: bool = Field(description="Whether it holds a COLMAP model; if not, ask for `poses: auto`.")
+    photographs: int
+    facts: dict[str, Any] = Field(description="What the check at commit found out.")
+    pinned: bool
+    created_at: datetime
+    committed_at: datetime | None
+    expires_at: datetime | None
+
+    @classmethod
+    def of(cls, row: Dataset) -> "DatasetView":
+        """From its row."""
+        return cls.model_validate(row, from_attributes=True)
+
+
+class DatasetPage(BaseModel):
+    """A part of the list of datasets."""
+
+    datasets: list[DatasetView]
+    next: str | None = Field(description="Cursor of the next part.")
+
+
+class FileView(BaseModel):
+    """A file that has arrived."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "path": "images/0001.jpg",
+                    "sha256": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855",
+                    "size_bytes": 123456,
+                    "facts": {"kind": "JPEG", "width_px": 1920, "height_px": 1080},
+                    "uploaded_at": EXAMPLE_TIME,
+                }
+            ]
+        }
+    )
+
+    path: str
+    sha256: str
+    size_bytes: int
+    facts: dict[str, Any]
+    uploaded_at: datetime
+
+    @classmethod
+    def of(cls, row: DatasetFile) -> "FileView":
+        """From its row."""
+        return cls.model_validate(row, from_attributes=True)
+
+
+class FilePage(BaseModel):
+    """A part of the list of files; comparing it with your own files is how an upload goes on."""
+
+    files: list[FileView]
+    next: str | None
+
+
+class ArchiveView(BaseModel):
+    """What came out of an archive."""
+
+    files: list[FileView]
+    left_out: list[str] = Field(description="Files that are no part of a scene.")

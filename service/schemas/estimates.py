@@ -1,0 +1,46 @@
+"""What a job would take."""
+
+import uuid
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.schemas.base import Strict
+from workers.work.kinds.estimates import Estimate
+
+
+class PhotographSizes(Strict):
+    """Photographs of one size."""
+
+    width_px: int = Field(ge=1, le=65_536)
+    height_px: int = Field(ge=1, le=65_536)
+    count: int = Field(1, ge=1, le=1_000_000)
+
+
+class NewEstimate(Strict):
+    """A job that might be asked for; of photographs that are not here yet their sizes are enough."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "options": {"preset": "fast"},
+                    "photographs": [{"width_px": 1920, "height_px": 1080, "count": 50}],
+                }
+            ]
+        },
+    )
+
+    kind: str = Field("reconstruct", max_length=40)
+    dataset_id: uuid.UUID | None = None
+    source_id: uuid.UUID | None = None
+    photographs: list[PhotographSizes] = Field(default_factory=list, max_length=1000)
+    options: dict[str, Any] = Field(default_factory=dict)
+    queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$")
+
+
+class EstimateView(BaseModel):
+    """What a job will take, within a factor of two; null where nobody knows."""
+
+    estimate: Estimate | None

@@ -1,0 +1,186 @@
+"""Jobs: what is asked for, and how they fare."""
+
+import uuid
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, Strict
+from service.schemas.webhooks import JobWebhook
+from workers.records.rows import Job, JobState
+from workers.work.kinds.estimates import Estimate
+
+
+class NewJob(Strict):
+    """A job to accept."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {"dataset_id": EXAMPLE_ID, "options": {"preset": "fast"}},
+                {"kind": "export", "source_id": EXAMPLE_ID, "options": {"files": ["scene.glb"]}},
+            ]
+        },
+    )
+
+    kind: str = Field("reconstruct", max_length=40, description="One of GET /v1/options.")
+    dataset_id: uuid.UUID | None = Field(None, description="A committed dataset, for kinds that need one.")
+    source_id: uuid.UUID | None = Field(None, description="A job that succeeded, for kinds that work on one.")
+    options: dict[str, Any] = Field(default_factory=dict, description="See GET /v1/options/{kind}.")
+    label: str | None = Field(None, max_length=200)
+    queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$", description="Workers that take this queue.")
+    priority: int = Field(
+        0, ge=-100, le=100, description="Higher goes first; high ones are for administrators."
+    )
+    webhook: JobWebhook | None = Field(None, description="Be told of this job; see POST /v1/webhooks.")
+
+
+class JobChange(Strict):
+    """What may be changed of a job."""
+
+    label: str | None = Field(None, max_length=200)
+    pinned: bool | None = Field(None, description="Keep it whatever its age.")
+
+
+class RetryRequest(Strict):
+    """Where a retried job begins, and what is to be different."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        populate_by_name=True,
+        json_schema_extra={
+            "examples": [{"from": "checkpoint"}, {"options": {"exports": ["mesh.glb"]}}],
+        },
+    )
+
+    start: Literal["checkpoint", "start"] = Field("checkpoint", alias="from")
+    options: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Settings in the place of the job's own. What changes the training needs `from: start`; "
+        "a reconstruction goes on with other `exports`.",
+    )
+
+
+class JobError(BaseModel):
+    """Why a job failed."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str
+    message: str
+
+
+class CheckpointView(BaseModel):
+    """The newest point from which the job can go on."""
+
+    stage: str
+    step: int
+
+
+class JobView(BaseModel):
+    """A job."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": EXAMPLE_ID,
+                    "kind": "reconstruct",
+                    "dataset_id": EXAMPLE_ID,
+                    "source_id": None,
+                    "label": "fox, first try",
+                    "options": {"preset": "fast"},
+                    "queue": "cpu",
+                    "priority": 0,
+                    "state": "running",
+                    "attempt": 1,
+                    "rescues": 0,
+                    "stage": "train",
+                    "stages": ["load", "train", "evaluate", "export"],
+                    "step": 400,
+                    "total_steps": 1500,
+                    "seconds_left": 41.2,
+                    "psnr": 24.6,
+                    "training_psnr": 25.1,
+                    "worker": "host-4711",
+                    "queue_position": None,
+                    "estimate": {
+                        "cpu_seconds": 88.0,
+                        "seconds": 50.9,
+                        "cores": 2,
+                        "memory_bytes": 930000000,
+                        "finds_poses": False,
+                        "text": "about 51 s on 2 cores and 0.9 GB of memory",
+                    },
+                    "notes": [],
+                    "error": None,
+                    "checkpoint": {"stage": "train", "step": 250},
+                    "preview": None,
+                    "pinned": False,
+                    "created_at": EXAMPLE_TIME,
+                    "queued_at": EXAMPLE_TIME,
+                    "started_at": EXAMPLE_TIME,
+                    "finished_at": None,
+                    "expires_at": None,
+                }
+            ]
+        }
+    )
+
+    id: uuid.UUID
+    kind: str
+    dataset_id: uuid.UUID | None
+    source_id: uuid.UUID | None
+    label: str | None
+    options: dict[str, Any] = Field(description="Every setting, resolved when the job was accepted.")
+    queue: str
+    priority: int
+    state: JobState
+    attempt: int = Field(description="Counts starts.")
+    rescues: int = Field(description="How often its worker was lost without a new checkpoint.")
+    stage: str | None
+    stages: list[str]
+    step: int | None
+    total_steps: int | None
+    seconds_left: float | None = Field(description="Of the stage.")
+    psnr: float | None = Field(
+        description="Of the held-out views, dB: of some of their rays while it trains, the mean over all of "
+        "them once they are measured."
+    )
+    training_psnr: float | None = Field(
+        None, description="Running value over the rays that are trained on, dB; higher than `psnr` as a rule."
+    )
+    worker: str | None
+    queue_position: int | None = Field(description="Jobs that go before it.")
+    estimate: Estimate | None = Field(description="What it was reckoned to take when it was accepted.")
+    notes: list[str] = Field(
+        description="What its owner should know while it waits, e.g. for want of a worker."
+    )
+    error: JobError | None
+    checkpoint: CheckpointView | None
+    preview: dict[str, Any] | None = Field(description="`step` and `view` of GET /v1/jobs/{id}/preview.")
+    pinned: bool
+    created_at: datetime
+    queued_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    expires_at: datetime | None
+
+    @classmethod
+    def of(
+        cls, row: Job, stages: list[str], queue_position: int | None = None, notes: Sequence[str] = ()
+    ) -> "JobView":
+        """From its row."""
+        names = {name for name in cls.model_fields if name not in ("stages", "queue_position", "notes")}
+        values = {name: getattr(row, name) for name in names}
+        return cls(**values, stages=stages, queue_position=queue_position, notes=list(notes))
+
+
+class JobPage(BaseModel):
+    """A part of the list of jobs, the newest first."""
+
+    jobs: list[JobView]
+    next: str | None

@@ -1,0 +1,78 @@
+"""What the service is and how it fares: kinds of jobs, formats, queues, health."""
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field
+
+
+class KindView(BaseModel):
+    """A kind of job."""
+
+    name: str
+    title: str
+    needs: Literal["dataset", "result"]
+    options: dict[str, Any] = Field(description="JSON Schema of its options.")
+    ceilings: dict[str, int] = Field(description="What options may ask for at most here, by their path.")
+
+
+class KindList(BaseModel):
+    """The kinds of jobs."""
+
+    kinds: list[KindView]
+
+
+class FormatView(BaseModel):
+    """A format to export to."""
+
+    name: str
+    patterns: list[str]
+    description: str
+
+
+class InfoView(BaseModel):
+    """What this service is."""
+
+    version: str
+    kinds: list[str]
+    formats: list[FormatView]
+    max_upload_bytes: int
+    max_archive_bytes: int
+    needs_token: bool
+    owner: str
+    scopes: list[str]
+
+
+class QueueView(BaseModel):
+    """A queue and its workers."""
+
+    queue: str
+    waiting: int
+    oldest_seconds: float | None
+    running: int
+    slots: int
+
+
+class WorkerView(BaseModel):
+    """A worker that lives."""
+
+    name: str
+    queues: list[str]
+    slots: int
+    facts: dict[str, Any]
+    started_at: datetime
+    seen_at: datetime
+
+
+class QueueList(BaseModel):
+    """The queues and the workers."""
+
+    queues: list[QueueView]
+    workers: list[WorkerView]
+
+
+class Health(BaseModel):
+    """How the service is."""
+
+    status: Literal["ok", "unready"]
+    checks: dict[str, str] = {}

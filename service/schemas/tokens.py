@@ -1,0 +1,47 @@
+"""Tokens."""
+
+import uuid
+from datetime import datetime
+from typing import Literal
+
+from pydantic import BaseModel, Field
+
+from service.schemas.base import Strict
+from workers.records.rows import Token
+
+
+class NewToken(Strict):
+    """A token to make."""
+
+    name: str = Field(max_length=100)
+    owner: str = Field(pattern=r"^[A-Za-z0-9._@-]{1,100}$", description="Whose things it shows.")
+    scopes: list[Literal["read", "write", "admin"]] = Field(min_length=1)
+
+
+class TokenView(BaseModel):
+    """A token, without its secret."""
+
+    id: uuid.UUID
+    name: str
+    owner: str
+    scopes: list[str]
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+
+    @classmethod
+    def of(cls, row: Token) -> "TokenView":
+        """From its row."""
+        return cls.model_validate(row, from_attributes=True)
+
+
+class MadeToken(TokenView):
+    """A new token; its secret is shown this once."""
+
+    token: str
+
+
+class TokenList(BaseModel):
+    """All tokens."""
+
+    tokens: list[TokenView]
