@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 from numba import njit
 
-from engine.trace.cpu.kernels_footprint import BINS, CELLS, FRAME_WORDS, footprints, rays_between, write_bins
+from engine.trace.cpu.kernels_footprint import BINS, FRAME_WORDS, footprints, rays_between, write_bins
 from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
 from engine.trace.cpu.kernels_rays import ray_origin
 from engine.trace.cpu.kernels_simd import (
@@ -65,8 +65,6 @@ CHUNK = 128
 Small enough that rays which end early leave most candidates untested, large enough that the sorting of a
 ray's hits, once a chunk, does not show; a chunk's rows (15 kB) stay in the first cache.
 """
-FEW_KEYS = 48
-"""An insertion sort is faster than two passes over 256 buckets for so few."""
 SIDES = 5
 """Planes of a pyramid: four through its sides, one through its apex across the axis."""
 SLOPE_ROOM = 1e-9
@@ -316,95 +314,6 @@ def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
         candidates = new_candidates((count * 5 // 4 + WIDTH - 1) // WIDTH * WIDTH)
         count = gather_candidates(tree, pyramid, origin, farthest, walk, candidates)
     return candidates, count
-
-
-@lean(fastmath={"contract"})
-def sort_candidates(candidates, count, order, histogram):
-    """Order the candidates in chunks by distance, within a chunk by the rays that may meet them."""
-    keys, bounds, cells, near = candidates.keys, candidates.bounds, candidates.cells, candidates.near
-    block_rays = candidates.block_rays
-    if count > FEW_KEYS:
-        sort_keys(keys, candidates.pending, count, histogram)
-    else:
-        insertion_sort(keys, count)
-    nearest = np.float32(np.inf)
-    near[count] = nearest
-    for k in range(count - 1, -1, -1):
-        nearest = min(nearest, bounds[np.int64(keys[k] & np.uint64(0xFFFFFFFF))])
-        near[k] = nearest
-    for b in range((count + WIDTH - 1) // WIDTH):
-        block_rays[b] = 0
-    for start in range(0, count, CHUNK):
-        end = min(start + CHUNK, count)
-        histogram[: CELLS + 1] = 0
-        for k in range(start, end):
-            histogram[cells[np.int64(keys[k] & np.uint64(0xFFFFFFFF))] + 1] += 1
-        for cell in range(CELLS):
-            histogram[cell + 1] += histogram[cell]
-        for k in range(start, end):
-            which = np.int64(keys[k] & np.uint64(0xFFFFFFFF))
-            cell = cells[which]
-            place = start + histogram[cell]
-            histogram[cell] += 1
-            candidates.ids[place] = order[candidates.found[which]]
-            block_rays[place // WIDTH] |= candidates.masks[which]
-
-
-@lean()
-def keep_candidates(candidates, count, order):
-    """Leave the candidates in the order in which they were found, where none is needed."""
-    for b in range((count + WIDTH - 1) // WIDTH):
-        candidates.block_rays[b] = 0
-    for k in range(count):
-        candidates.ids[k] = order[candidates.found[k]]
-        candidates.block_rays[k // WIDTH] |= candidates.masks[k]
-
-
-@lean()
-def insertion_sort(keys, count):
-    """Sort a few keys in place."""
-    for i in range(1, count):
-        key = keys[i]
-        j = i
-        while j > 0 and keys[j - 1] > key:
-            keys[j] = keys[j - 1]
-            j -= 1
-        keys[j] = key
-
-
-@lean()
-def sort_keys(keys, scratch, count, histogram):
-    """Sort in place by the upper bits of the keys' distances, then by the rest.
-
-    Two passes over the 16 bits below the distances' common upper bits leave so little disorder that the
-    insertion sort afterwards hardly moves anything.
-    """
-    low, high = keys[0], keys[0]
-    for k in range(1, count):
-        low, high = min(low, keys[k]), max(high, keys[k])
-    low, high = low >> np.uint64(32), high >> np.uint64(32)
-    shift = np.uint64(32)
-    span = high - low
-    while span >= np.uint64(1 << 16):
-        span >>= np.uint64(1)
-        shift += np.uint64(1)
-    low <<= np.uint64(32)
-    for digit in range(2):
-        histogram[:] = 0
-        at = shift + np.uint64(8 * digit)
-        for k in range(count):
-            histogram[((keys[k] - low) >> at) & np.uint64(255)] += 1
-        total = 0
-        for b in range(256):
-            size = histogram[b]
-            histogram[b] = total
-            total += size
-        for k in range(count):
-            bucket = ((keys[k] - low) >> at) & np.uint64(255)
-            scratch[histogram[bucket]] = keys[k]
-            histogram[bucket] += 1
-        keys, scratch = scratch, keys
-    insertion_sort(keys, count)
 
 
 @lean(fastmath={"contract"})

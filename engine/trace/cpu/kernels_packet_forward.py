@@ -15,14 +15,13 @@ from engine.trace.cpu.kernels_packet import (
     V_ROW,
     exponential,
     find_candidates,
-    keep_candidates,
     meet_blocks,
     new_candidates,
     new_pyramid,
     new_walk,
-    sort_candidates,
     write_rows,
 )
+from engine.trace.cpu.kernels_packet_order import keep_candidates, sort_candidates
 from engine.trace.cpu.kernels_rays import ray_direction, ray_limits, ray_origin
 from engine.trace.cpu.kernels_sh import write_basis
 from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, write_ranks
