@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Int64, UInt64
 
+from engine.gaussians.kernels_order import spread_bits
+
 _BITS = 21
 
 
@@ -23,17 +25,3 @@ def morton_codes(points: Float[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
 def morton_order(points: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
     """Indices that sort points along the Z-order curve; equal codes keep their order."""
     return np.argsort(morton_codes(points), kind="stable")
-
-
-def spread_bits(bits: UInt64[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
-    """Two zero bits between each of the low 21 bits; numba compiles this for single numbers as it is."""
-    x = bits
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
-    return x

@@ -2,40 +2,34 @@
 
 import numpy as np
 
+from engine.gaussians.harmonics import SH_C1, SH_C2, SH_C3
+from engine.gaussians.model import SH_C0
 from engine.trace.kernels_native import lean
-
-C0 = 0.28209479177387814
-C1 = 0.4886025119029199
-C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-C3 = (
-    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
-    -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
-)  # fmt: skip
 
 
 @lean()
 def write_basis(basis, count, x, y, z):
     """Values of the first ``count`` (1, 4, 9 or 16) harmonics at the unit direction (x, y, z)."""
-    basis[0] = C0
+    basis[0] = SH_C0
     if count > 1:
-        basis[1] = -C1 * y
-        basis[2] = C1 * z
-        basis[3] = -C1 * x
+        basis[1] = -SH_C1 * y
+        basis[2] = SH_C1 * z
+        basis[3] = -SH_C1 * x
     if count > 4:
         xx, yy, zz = x * x, y * y, z * z
-        basis[4] = C2[0] * x * y
-        basis[5] = C2[1] * y * z
-        basis[6] = C2[2] * (2.0 * zz - xx - yy)
-        basis[7] = C2[3] * x * z
-        basis[8] = C2[4] * (xx - yy)
+        basis[4] = SH_C2[0] * x * y
+        basis[5] = SH_C2[1] * y * z
+        basis[6] = SH_C2[2] * (2.0 * zz - xx - yy)
+        basis[7] = SH_C2[3] * x * z
+        basis[8] = SH_C2[4] * (xx - yy)
         if count > 9:
-            basis[9] = C3[0] * y * (3.0 * xx - yy)
-            basis[10] = C3[1] * x * y * z
-            basis[11] = C3[2] * y * (4.0 * zz - xx - yy)
-            basis[12] = C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
-            basis[13] = C3[4] * x * (4.0 * zz - xx - yy)
-            basis[14] = C3[5] * z * (xx - yy)
-            basis[15] = C3[6] * x * (xx - 3.0 * yy)
+            basis[9] = SH_C3[0] * y * (3.0 * xx - yy)
+            basis[10] = SH_C3[1] * x * y * z
+            basis[11] = SH_C3[2] * y * (4.0 * zz - xx - yy)
+            basis[12] = SH_C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
+            basis[13] = SH_C3[4] * x * (4.0 * zz - xx - yy)
+            basis[14] = SH_C3[5] * z * (xx - yy)
+            basis[15] = SH_C3[6] * x * (xx - 3.0 * yy)
 
 
 @lean(forceinline=True)

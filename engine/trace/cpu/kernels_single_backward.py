@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 from numba import njit, prange
 
+from engine.gaussians.model import SH_C0
 from engine.trace.cpu.kernels_hit import NORMAL, OPACITY
 from engine.trace.cpu.kernels_rays import ray_direction, ray_origin
 from engine.trace.cpu.kernels_records import rotation_columns
@@ -249,9 +250,7 @@ def gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, sh
         for j in range(basis_count):
             for channel in range(3):
                 # degree 0 skips the basis in the loop above
-                out.sh[segment, j, channel] = sh_sum[j, channel] * (
-                    0.28209479177387814 if basis_count == 1 else 1.0
-                )
+                out.sh[segment, j, channel] = sh_sum[j, channel] * (SH_C0 if basis_count == 1 else 1.0)
         for f in range(feature_count):
             out.features[segment, f] = feature_sum[f]
         out.ids[segment] = i

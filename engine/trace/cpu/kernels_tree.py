@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from engine.gaussians.kernels_order import spread_bits
 from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
 
 WIDTH = 8
@@ -29,14 +30,7 @@ TOP_CELL = (1 << _CURVE_BITS) - 1
 _CLASSES = 32
 
 
-@njit(error_model="numpy")
-def _spread(x):
-    """Two zero bits between each of the low 21 bits."""
-    x = (x | (x << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
-    x = (x | (x << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
-    x = (x | (x << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
-    x = (x | (x << np.uint64(4))) & np.uint64(0x10C30C30C30C30C3)
-    return (x | (x << np.uint64(2))) & np.uint64(0x1249249249249249)
+_spread = njit(error_model="numpy")(spread_bits)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
