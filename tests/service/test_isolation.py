@@ -16,7 +16,7 @@ from workers.client.api import Api
 from workers.client.upload import upload_scene
 from workers.client.watch import watch_job
 
-TOYS = Path(__file__).parents[1] / "worker"
+TOYS = Path(__file__).parents[1] / "work"
 START = "import sys; sys.path.append({toys!r}); from workers.cli.main import main; main()"
 
 
