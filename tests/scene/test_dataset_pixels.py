@@ -169,7 +169,7 @@ def test_both_uses_of_masks(tmp_path, make_scene, save_image, coded):
 
 def test_masks_as_alpha_are_refused_where_there_are_none(tmp_path, make_scene):
     root = make_scene(tmp_path / "scene")
-    with pytest.raises(DatasetError, match="has no masks to take as the alpha"):
+    with pytest.raises(DatasetError, match="Masks are to be the alpha"):
         Dataset.open(root, tmp_path / "cache", masks="alpha")
 
 

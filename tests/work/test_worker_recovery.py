@@ -247,7 +247,7 @@ def test_the_log_tells_the_stages_and_the_cause_without_paths(bench: Bench) -> N
     assert lines == [
         "Attempt 1 on w",
         "Loading",
-        "Warning: images/a b.jpg is dark; …/worker/toy_kind.py says so.",
+        "Warning: images/a b.jpg is dark; …/work/toy_kind.py says so.",
         "Loaded in 2.0 s",
         "Caused by FileNotFoundError: [Errno 2] No such file or directory: 'cache/pixels.bin'",
         "Failed: cache/pixels.bin cannot be read.",
@@ -258,7 +258,7 @@ def test_the_log_tells_the_stages_and_the_cause_without_paths(bench: Bench) -> N
     fault = bench.submit(options={"fault": True})
     bench.over(fault)
     log = bench.log(fault)
-    assert 'File "…/worker/toy_kind.py"' in log and "RuntimeError: a fault of the program" in log
+    assert 'File "…/work/toy_kind.py"' in log and "RuntimeError: a fault of the program" in log
     assert str(ROOT) not in log and str(bench.folder) not in log and sys.prefix not in log
 
 

@@ -57,7 +57,7 @@ def run(task: Task) -> None:
     if options.refuse:
         raise DatasetError("The toy refuses this scene; send another.")
     if options.tell_paths:
-        inner, sheet = task.run / "cache" / "pixels.bin", task.folder / "posed" / "fox" / "images" / "a b.jpg"
+        inner, sheet = task.run / "cache" / "pixels.bin", task.run / "images" / "a b.jpg"
         print(f"[x.cc:12] Cannot open:{inner}, file://{inner}; see https://example.org/home/x")  # noqa: T201
         task.listener(StageStarted("load", 3))
         task.listener(Warned(f"{sheet} is dark; {__file__} says so."))

@@ -7,6 +7,7 @@ one JSON object a line; whatever libraries print goes to stderr, which is the jo
 
 import contextlib
 import importlib
+import io
 import json
 import os
 import signal
@@ -32,6 +33,8 @@ class _Lines:
     def __init__(self) -> None:
         self._file = os.fdopen(os.dup(1), "w", encoding="utf-8")
         os.dup2(2, 1)
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(line_buffering=True)  # what is printed belongs between the stages
         self._lock = threading.Lock()
 
     def write(self, line: dict[str, object]) -> None:
