@@ -7,6 +7,27 @@ from contextlib import contextmanager
 from engine.errors import Cancelled
 from engine.events import Event, Listener, StageFinished, StageProgress, StageStarted
 
+DOING = {
+    "load": "Loading",
+    "train": "Training",
+    "evaluate": "Evaluating",
+    "export": "Exporting",
+    "generate": "Generating",
+    "render": "Rendering",
+    "features": "Finding features",
+    "matches": "Matching",
+    "poses": "Finding poses",
+    "upload": "Uploading",
+    "download": "Downloading",
+    "read": "Reading",
+    "depth": "Rendering depth",
+    "fusing": "Fusing depth",
+    "meshing": "Meshing",
+    "unwrapping": "Unwrapping",
+    "colouring": "Colouring",
+}
+"""What is being done at a stage, in a word or two."""
+
 
 class StageClock:
     """The time of a stage, with that of runs before this one that were stopped in it."""
@@ -55,7 +76,8 @@ def stopping(listener: Listener, should_stop: Callable[[], bool], message: str |
     def listen(event: Event) -> None:
         listener(event)
         if isinstance(event, StageProgress) and should_stop():
-            told = f"Stopped at the stage {event.stage!r}; the same command with --resume goes on."
+            doing = DOING.get(event.stage, event.stage).lower()
+            told = f"Stopped while {doing}; the same command with --resume goes on."
             raise Cancelled(message or told)
 
     return listen

@@ -99,7 +99,7 @@ def test_work_outside_of_training_stops_at_its_next_step():
     listen(StageProgress("export", 1, 3))
     stop.append(1)
     listen(TRAINING)  # training writes a checkpoint and stops by itself
-    with pytest.raises(Cancelled, match="export"):
+    with pytest.raises(Cancelled, match="exporting"):
         listen(StageProgress("export", 2, 3))
     assert len(heard) == 3
 

@@ -18,7 +18,8 @@ from engine.events import (
     TrainingProgress,
     Warned,
 )
-from workers.telling.lines import DOING, PlainLines, StageState
+from engine.stages import DOING
+from workers.telling.lines import PlainLines, StageState
 from workers.telling.wording import clock, training_state
 
 _STOPPING = "Stopping at the next safe point; press Ctrl-C again to stop at once."

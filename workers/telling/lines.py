@@ -12,28 +12,10 @@ from engine.events import (
     TrainingProgress,
     Warned,
 )
+from engine.stages import DOING
 from workers.telling.wording import clock, duration, training_state
 
 SECONDS_BETWEEN_LINES = 5.0
-DOING = {
-    "load": "Loading",
-    "train": "Training",
-    "evaluate": "Evaluating",
-    "export": "Exporting",
-    "generate": "Generating",
-    "render": "Rendering",
-    "features": "Finding features",
-    "matches": "Matching",
-    "poses": "Finding poses",
-    "upload": "Uploading",
-    "download": "Downloading",
-    "read": "Reading",
-    "depth": "Rendering depth",
-    "fusing": "Fusing depth",
-    "meshing": "Meshing",
-    "unwrapping": "Unwrapping",
-    "colouring": "Colouring",
-}
 # What a finished stage did, and what its steps are; "" where nobody would want them counted.
 _DONE = {
     "load": ("Loaded", "photograph"),
