@@ -1,5 +1,6 @@
 """The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
 
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from engine.errors import DatasetError
 from engine.events import Listener, StageFinished, StageProgress, StageStarted, Warned
 from engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, RECORD, STAGE, PosesConfig
 from engine.poses.features import find_features, match_pairs, quick_pairs
+from engine.poses.folds import false_pairs, pair_votes, without_pairs
 from engine.poses.mapping import map_photographs, rank
 from engine.poses.pairs import Pair, all_pairs, pairs_with
 from engine.scene.images import read_image_info
@@ -20,6 +22,7 @@ from engine.writing import write_json
 SMALL_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""
 _POOR_FEATURES = 50
+_MOST_UNFOLDINGS = 3
 
 
 class Search:
@@ -103,7 +106,9 @@ class Search:
         matched = self._match(database, thorough)
         count = len(self._names)
         with self._stage(STAGE, count) as at:
-            best = map_photographs(database, self._photographs, self._config, counted=at)
+            best = self._unfolded(
+                database, map_photographs(database, self._photographs, self._config, counted=at), at
+            )
             if rank(best)[0] < count:
                 best = self._place_the_rest(database, best, matched, at)
             at(rank(best)[0])
@@ -143,6 +148,26 @@ class Search:
                 counted=lambda done: at(unlike + done),
             )
         return pairs
+
+    def _unfolded(self, database: Path, model: Any, at: Callable[[int], None]) -> Any:
+        """The model, made anew without the false matches of its folds for as long as it has any."""
+        for _ in range(_MOST_UNFOLDINGS):
+            if model is None:
+                break
+            votes = pair_votes(model, database)
+            false = false_pairs(votes)
+            if len(false) == 0:
+                break
+            trial = shutil.copy(database, database.with_name("trial.db"))
+            without_pairs(trial, false)
+            again = map_photographs(trial, self._photographs, self._config, counted=at)
+            if rank(again)[0] < rank(model)[0]:
+                break
+            if pair_votes(again, trial).kept.sum() <= votes.kept.sum():
+                break
+            trial.replace(database)
+            model = again
+        return model
 
     def _place_the_rest(
         self, database: Path, best: Any, matched: list[Pair], at: Callable[[int], None]
