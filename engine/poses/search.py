@@ -158,7 +158,8 @@ class Search:
             false = false_pairs(votes)
             if len(false) == 0:
                 break
-            trial = shutil.copy(database, database.with_name("trial.db"))
+            trial = database.with_name("trial.db")
+            shutil.copy(database, trial)
             without_pairs(trial, false)
             again = map_photographs(trial, self._photographs, self._config, counted=at)
             if rank(again)[0] < rank(model)[0]:
