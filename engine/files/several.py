@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from engine.errors import OctasplatError
+from engine.errors import NoSpaceLeft, OctasplatError
 from engine.files.exporting import export_scene, lost_channels
 from engine.files.options import ExportOptions
 from engine.gaussians.model import FlatGaussians
@@ -29,6 +29,9 @@ def export_files(
 
     Returns:
         What could not be written and why, in a sentence for each file, or None.
+
+    Raises:
+        NoSpaceLeft: there is no room for a file.
     """
     failed: list[str] = []
     for done, name in enumerate(names, start=1):
@@ -36,6 +39,8 @@ def export_files(
             if lost := lost_channels(gaussians, folder / name):
                 on_loss(lost)
             export_scene(gaussians, folder / name, options)
+        except NoSpaceLeft:
+            raise  # the others would find none either, and whoever makes room goes on from here
         except OctasplatError as error:
             failed.append(str(error).replace(f"{folder / name}", name).rstrip("."))
         except Exception as error:  # noqa: BLE001 - a fault of one format costs none of the others
