@@ -13,6 +13,7 @@ from PIL import Image
 from engine.config import ReconstructionConfig
 from engine.events import Event
 from engine.pipeline import Watcher, reconstruct
+from engine.rays import ImageRays, RayBatch
 from engine.scene import Dataset
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.trace.protocol import Tracer
@@ -98,16 +99,16 @@ def test_pictures_become_smaller_where_they_take_long(
 ) -> None:
     """A picture takes at most 2 % of 12 s, or is as small as pictures become."""
 
-    def rays(view: np.ndarray, _y: np.ndarray, _x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros((len(view), 3), np.float32), np.zeros((len(view), 3), np.float32)
+    def rays(view: np.ndarray, _y: np.ndarray, _x: np.ndarray) -> RayBatch:
+        return RayBatch(np.zeros((1, 3), np.float32), np.zeros((len(view), 3), np.float32))
 
-    def render(_tracer: None, _origin: np.ndarray, directions: np.ndarray, _background: np.ndarray) -> Any:
-        clock.now += seconds_per_ray * directions.size / 3
-        return SimpleNamespace(rgb_srgb=directions)
+    def render(_tracer: None, image: ImageRays, _background: np.ndarray) -> Any:
+        clock.now += seconds_per_ray * image.height_px * image.width_px
+        return SimpleNamespace(rgb_srgb=image.directions_world)
 
     monkeypatch.setattr(preview, "render_rays", render)
-    view = SimpleNamespace(name="a.jpg", width_px=1600, height_px=1200)
-    dataset = SimpleNamespace(views=(view,), test_indices=np.array([0]), rays=rays)
+    view = SimpleNamespace(name="a.jpg", width_px=1600, height_px=1200, origin_world=np.zeros(3))
+    dataset = SimpleNamespace(views=(view,), test_indices=np.array([0]), rays=rays, near_world=0.0)
     draw: Callable[..., None] = Previews(tmp_path, "black", lambda _event: None)
     for iteration in range(4):
         draw(iteration, dataset, None)
