@@ -144,7 +144,7 @@ def test_a_file_that_fails_leaves_the_rest_and_a_retry_does_not_train_again(
         "exports": ["a.sog", "mesh.glb", "b.sog", "mesh.ply"],
     }
     with machine.api as api:
-        job = submit(api, Submission(tmp_path / "scene", options), quiet=True)
+        job = submit(api, Submission(tmp_path / "scene", options))
         address = f"/v1/jobs/{job['id']}"
         done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)
         assert done["state"] == "failed" and done["error"]["type"] == "export_failed"
