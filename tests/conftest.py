@@ -1,10 +1,16 @@
 """For all tests: array shapes are checked at run time, and the photographed scenes are found."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import jaxtyping
+import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from engine.gaussians.model import FlatGaussians
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before OpenMP is loaded, as the command line does
 
@@ -31,3 +37,25 @@ def scenes_root() -> Path:
     if not root:
         pytest.skip("OCTASPLAT_SCENES does not name a folder of photographed scenes")
     return Path(root)
+
+
+@pytest.fixture
+def make_gaussians() -> "Callable[..., FlatGaussians]":
+    """Makes random flat Gaussians."""
+    from engine.gaussians.model import FlatGaussians  # after the hook
+
+    def make(count: int, sh_degree: int = 0, seed: int = 0) -> FlatGaussians:
+        random = np.random.default_rng(seed)
+
+        def normal(*shape: int) -> np.ndarray:
+            return random.standard_normal(shape, dtype=np.float32)
+
+        return FlatGaussians(
+            means_world=normal(count, 3),
+            quats_wxyz=normal(count, 4) * 3,
+            log_scales=normal(count, 2) - 3,
+            opacity_logits=normal(count) + 1,
+            sh=normal(count, (sh_degree + 1) ** 2, 3),
+        )
+
+    return make
