@@ -24,11 +24,12 @@ from engine.gaussians.channels import Channels
 from engine.gaussians.model import FlatGaussians, concatenate
 from engine.gaussians.octagon import SIDES, octagon_triangles
 from engine.gaussians.order import morton_order
-from engine.train.checkpoint import TrainState, load_best, load_checkpoint, save_best, save_checkpoint
+from engine.train.checkpoint import load_best, load_checkpoint, save_best, save_checkpoint
 from engine.train.config import McmcConfig, PaperConfig
 from engine.train.densify import Mcmc, Paper
 from engine.train.optimiser import Adam
-from engine.train.trainer import Trainer, fresh_state
+from engine.train.state import TrainState, fresh_state
+from engine.train.trainer import Trainer
 from workers.cli.main import cli
 
 sys.path.append(str(Path(__file__).parent / "train"))

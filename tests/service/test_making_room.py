@@ -16,8 +16,9 @@ from model_builder import photograph
 from zip_builder import Member, build
 
 from service.state import Service
+from workers.queue import storing
 from workers.store.errors import StorageUnavailable
-from workers.upkeep import collecting, storing
+from workers.upkeep import collecting
 from workers.upkeep.collecting import collect_at_once
 
 MIB = 1 << 20

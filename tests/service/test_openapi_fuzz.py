@@ -46,7 +46,7 @@ def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
         "OCTASPLAT_PORT": "0",
         "OCTASPLAT_TOKEN": TOKEN,
         "OCTASPLAT_KIND_MODULES": '["toy_kind"]',
-        "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'worker'}",
+        "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'work'}",
     }
     log = tmp_path / "service.log"
     with log.open("wb") as errors:
