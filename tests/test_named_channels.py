@@ -101,8 +101,8 @@ def state_of(g: FlatGaussians) -> TrainState:
 
 
 def best(g: FlatGaussians, folder: Path) -> FlatGaussians:
-    save_best(g, folder)
-    return load_best(folder)
+    save_best(g, {}, folder)
+    return load_best(folder)[0]
 
 
 def deformed(g: FlatGaussians, _folder: Path) -> FlatGaussians:
