@@ -60,7 +60,7 @@ def main() -> None:
             reconstruct(scene, output, settings, threads=1)
         finally:
             sys.setprofile(None)
-    everywhere = {"errors", "events", "stages", "threads", "writing", "files_atomic", "versions", "config"}
+    everywhere = {"errors", "events", "stages", "threads", "writing", "versions", "config"}
     rooms = [room for room in visits.rooms if room not in everywhere]
     path = [room for place, room in enumerate(rooms) if place == 0 or rooms[place - 1] != room]
     print(" -> ".join(path))
