@@ -10,14 +10,6 @@ export function notify(text, bad = false) {
 
 document.addEventListener("notice", ({ detail }) => notify(detail.text, detail.bad));
 
-// Before anything else hears of the click: what is asked must not depend on how far the page has been set up.
-document.addEventListener("click", (event) => {
-    const asks = event.target.closest?.("[data-confirm]");
-    if (!asks || window.confirm(asks.dataset.confirm)) return;
-    event.preventDefault();
-    event.stopImmediatePropagation();
-}, { capture: true });
-
 // A page that nobody looks at asks for nothing.
 document.addEventListener("htmx:config:request", (event) => {
     if (document.hidden && event.target.matches("[data-poll]")) event.preventDefault();
