@@ -164,5 +164,5 @@ def test_a_written_environment_comes_back(tmp_path: Path) -> None:
     write_environment(tmp_path / "map.hdr", radiance)
     brightest = radiance.max(axis=2, keepdims=True)  # shares its exponent with the pixel's other two
     assert (np.abs(read_environment(tmp_path / "map.hdr") - radiance) <= 0.01 * brightest).all()
-    with pytest.raises(ConfigError, match="written as .hdr or .exr"):
+    with pytest.raises(ConfigError, match=r"written as \.hdr or \.exr"):
         write_environment(tmp_path / "map.png", radiance)
