@@ -36,12 +36,14 @@ from engine.files import ExportOptions, check_writable
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
 from engine.gaussians.model import FlatGaussians
+from engine.light.environment import read_environment, write_environment
 from engine.poses import find_poses
 from engine.poses.find import read_record
 from engine.run_folder import (
     CACHE,
     CHECKPOINTS,
     CONFIG,
+    ENVIRONMENT,
     EVENTS,
     HELD_OUT,
     POSES,
@@ -56,6 +58,7 @@ from engine.scene import Dataset, write_held_out
 from engine.scene.colmap import has_model
 from engine.scene.load import photograph_folder
 from engine.scene.views_file import ViewsRecord, read_views, write_views
+from engine.shading.protocol import ShadingModel
 from engine.stages import StageClock, stage
 from engine.threads import use_threads
 from engine.trace.protocol import Tracer
@@ -63,8 +66,8 @@ from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count
 from engine.train.fingerprint import run_fingerprint
-from engine.train.initialise import initial_gaussians
-from engine.train.shading import make_shading
+from engine.train.initialise import initial_gaussians, with_first_materials
+from engine.train.shading import deferred_of, make_shading
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 from engine.versions import versions
@@ -334,6 +337,8 @@ def _train(
     state = _resume(folder, fingerprint, tell)
     if state is None:
         first = initial_gaussians(dataset, config, threads=use_threads(threads))
+        if config.materials.learn:
+            first = with_first_materials(first, config.materials)
         state = fresh_state(first, config.seed)
         state.seconds = clock.seconds()
     else:
@@ -350,6 +355,8 @@ def _train(
         onlooker=None if watch is None else lambda iteration, tracer: watch(iteration, dataset, tracer),
     )
     gaussians = trainer.run()
+    if (deferred := deferred_of(trainer.shading)) is not None:
+        write_environment(output / ENVIRONMENT, deferred.light.radiance_linear)
     write_json(output / TRAINING, {"seconds": clock.stop(), "iterations": trainer.state.iteration})
     return gaussians
 
@@ -375,7 +382,7 @@ def _evaluate(
         gaussians,
         output,
         settings=config.train.trace,
-        shading=make_shading(config.train, len(dataset.views)),
+        shading=finished_shading(output, config.train, dataset),
         background=config.evaluate_background,
         run={
             "gaussians": len(gaussians),
@@ -391,6 +398,18 @@ def _evaluate(
         threads=threads,
         tell=tell,
     )
+
+
+def finished_shading(output: Path, config: TrainConfig, dataset: Dataset) -> ShadingModel:
+    """The shading model of a finished run, with the environment that it left.
+
+    Raises:
+        ConfigError: the run learnt materials and its environment is missing or damaged.
+    """
+    shading = make_shading(config, len(dataset.views), dataset.extent)
+    if (deferred := deferred_of(shading)) is not None:
+        deferred.light.put(read_environment(output / ENVIRONMENT))
+    return shading
 
 
 def _placed(output: Path) -> dict[str, object]:
