@@ -37,8 +37,8 @@ class MaterialSettings(BaseModel):
         hdr: whether the environment may be brighter than 1.
         reflected_gradient: whether normals learn through the reflected direction.
         start: distance from the surface at which reflected rays begin, of the extent.
-        blur: roughness of the level that leads reflected directions at first; it falls to 0 until
-            ``blur_until``.
+        blur: roughness that everything has at least at first, so that normals and the environment are
+            found coarse to fine; it falls to 0 until ``blur_until``.
         blur_until: see there.
         normal_weight: of the spread of the normals along a ray.
         depth_normal_weight: of the angle between normals and the surface that the depths span.
@@ -78,13 +78,13 @@ class MaterialSettings(BaseModel):
     reflected_gradient: bool = True
     start: float = Field(0.004, gt=0)
     blur: float = Field(0.5, ge=0, le=1)
-    blur_until: float = Field(0.4, ge=0, le=1)
+    blur_until: float = Field(0.3, ge=0, le=1)
     normal_weight: float = Field(0.1, ge=0)
     depth_normal_weight: float = Field(0.1, ge=0)
     smooth_normal_weight: float = Field(0.05, ge=0)
     smooth_weight: float = Field(0.01, ge=0)
-    white_weight: float = Field(1e-4, ge=0)
-    even_weight: float = Field(1e-4, ge=0)
+    white_weight: float = Field(0.01, ge=0)
+    even_weight: float = Field(0.1, ge=0)
     harmonics_weight: float = Field(0.01, ge=0)
     propagation: bool = False
     propagation_every: float = Field(0.02, gt=0, le=1)
@@ -109,5 +109,5 @@ class MaterialSettings(BaseModel):
         return max(progress - begin, 0.0) / (end - begin)
 
     def blurred(self, progress: float) -> float:
-        """Roughness of the level that leads reflected directions."""
+        """Roughness that everything has at least."""
         return self.blur * max(0.0, 1.0 - progress / self.blur_until) if self.blur_until > 0 else 0.0

@@ -39,9 +39,9 @@ class LearningRates(_Frozen):
     colour: float = Field(1e-2, ge=0, description="of the display colour; harmonics get it over C0")
     sh_rest_ratio: float = Field(0.05, ge=0, description="of the constant harmonic's step")
     exposure: float = Field(2e-3, ge=0, description="of the views' log gains and offsets, where learnt")
-    albedo: float = Field(0.05, ge=0, description="of the logit, as for the two below")
-    metallic: float = Field(0.05, ge=0)
-    roughness: float = Field(0.05, ge=0)
+    albedo: float = Field(0.03, ge=0, description="of the logit, as for the two below")
+    metallic: float = Field(0.03, ge=0)
+    roughness: float = Field(0.03, ge=0)
     decay: float = Field(0.1, gt=0, le=1)
 
     def of_channel(self, name: str) -> float:
@@ -73,6 +73,9 @@ class McmcConfig(_Frozen):
     interval: int = Field(100, ge=1)
     growth: float = Field(0.2, ge=0, description="fraction added at each interval")
     dead_opacity: float = Field(0.012, gt=0, lt=1)
+    copies: Literal["opacity", "area"] = Field(
+        "opacity", description="what a Gaussian and its copies share: area suits opaque surfaces"
+    )
     error_power: float = Field(
         0.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it"
     )
@@ -209,6 +212,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "materials": config.materials.model_copy(update={"learn": True}),
             "rates": config.rates.model_copy(update=rates),
             "lift_pixels": False,
+            "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
             "max_gaussians_auto": min(config.max_gaussians_auto, 60_000),
         }

@@ -79,7 +79,7 @@ def test_gradients_agree_with_finite_differences(indirect: str) -> None:
 
     def look() -> tuple[float, dict[str, np.ndarray]]:
         tracer.build(gaussians, model.features(gaussians))
-        found = differentiate(batch, tracer, model, config.loss, progress=0.9)
+        found = differentiate(batch, tracer, model, config.loss, progress=1.0)
         by_light = model.light._prefilter.transposed(found.shading["materials.texels"])
         whole = {"light": by_light * model.light.radiance_linear}
         features = np.zeros((len(gaussians), 6))
