@@ -84,6 +84,18 @@ def occluded1_address() -> int:
     return _address("rtcOccluded1")
 
 
+@cache
+def intersect16_address() -> int:
+    """Address of rtcIntersect16, for sixteen rays through triangles."""
+    return _address("rtcIntersect16")
+
+
+@cache
+def occluded16_address() -> int:
+    """Address of rtcOccluded16."""
+    return _address("rtcOccluded16")
+
+
 def _address(name: str) -> int:
     address = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
     assert address is not None
