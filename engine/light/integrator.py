@@ -171,8 +171,8 @@ class PathTracer:
                 paths = room.paths(len(batch.pixels) * batch.each)
                 follow_paths(
                     len(paths.keys), room.scratch, view, self._rules, batch.top, batch.each,
-                    batch.first_sample, order, near, NO_END, paths, room.active, room.distances, room.faces, room.barycentrics,
-                    *given, environment, room.shadows, room.share,
+                    batch.first_sample, order, near, NO_END, paths, room.active, room.distances, room.faces,
+                    room.barycentrics, *given, environment, room.shadows, room.share,
                 )  # fmt: skip
                 film.add(paths, batch.pixels)
             finally:

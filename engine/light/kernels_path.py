@@ -210,161 +210,169 @@ def _glass(paths, p, materials, m, entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s
 
 
 @lean(forceinline=True)
-def _meet(
-    k, numbers, n, paths, active, depth, distances, faces, barycentrics, surfaces, materials, lights, environment,
-    rules, shadows,
-):  # fmt: skip
-    """What the path in row ``k`` finds; its numbers are those of column ``n``."""
-    p = active[k]
-    face = faces[k]
-    shadows.lit[k, 0] = shadows.lit[k, 1] = shadows.lit[k, 2] = 0.0
-    if face == ENDED:
-        return
-    if face < 0:
-        _miss(paths, p, lights, environment, rules)
-        paths.alive[p] = False
-        return
-    d = paths.directions_world[p]
-    b, c = float(barycentrics[k, 0]), float(barycentrics[k, 1])
-    a = 1.0 - b - c
-    n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
-    facing = -(d[0] * n_x + d[1] * n_y + d[2] * n_z)
-    m = surfaces.materials[face]
-    kind = materials.kinds[m]
-    if paths.inside[p] >= 0:
-        medium = materials.absorption[paths.inside[p]]
-        for channel in range(3):
-            paths.weights[p, channel] *= math.exp(-medium[channel] * distances[k])
-    if kind == LIGHT:
-        _light_seen(paths, p, lights, materials.lights[m], distances[k], facing, rules)
-    if kind == LIGHT or depth >= rules.max_depth:
-        paths.alive[p] = False
-        return
-    x, y, z = hit_point(surfaces.corners_world[face], a, b, c)
-    if facing < 0.0:
-        n_x, n_y, n_z = -n_x, -n_y, -n_z
-    s_x, s_y, s_z = shading_normal(surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d[0], d[1], d[2])
-    choice, roulette = numbers[CHOICE, 0, n], numbers[CHOICE, 1, n]
-    if depth >= rules.roulette_depth:
-        w = paths.weights[p]
-        stay = min(max(w[0], w[1], w[2]), 0.95)
-        if roulette >= stay:
-            paths.alive[p] = False
-            return
-        for channel in range(3):
-            paths.weights[p, channel] /= stay
-    if kind == GLASS:
-        _glass(paths, p, materials, m, facing >= 0.0, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice)
-        return
-    uv = surfaces.corner_uv[face]
-    u_t = a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0]
-    v_t = a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1]
-    red, green, blue, metallic, roughness = material_at(materials, m, u_t, v_t)
-    if kind == MIRROR:
-        _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue)
-        return
-    # --- a surface that scatters: what lights send to it, and a direction to go on ---
-    x, y, z = lifted(x, y, z, n_x, n_y, n_z)
-    a_x, a_y, a_z, b_x, b_y, b_z = around(s_x, s_y, s_z)
-    o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
-    o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
-    o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
-    coat, coat_mean = materials.coat[materials.coats[m]], materials.coat_means[materials.coats[m]]
-    ior, ground, kept = materials.iors[m], materials.grounds[m], materials.kept[m] != 0
-    if len(lights.kinds):
-        l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
-        if l >= 0:
-            u, v = numbers[PLACE, 0, n], numbers[PLACE, 1, n]
-            w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
-            i_z = w_x * s_x + w_y * s_y + w_z * s_z
-            if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
-                if kind == DIFFUSE:
-                    pdf = i_z / math.pi
-                    f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
-                else:
-                    f_r, f_g, f_b, pdf = opaque_value(
-                        o_x, o_y, o_z,
-                        w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z,
-                        red, green, blue, metallic, roughness, ior, ground, kept,
-                        materials.mirror, coat, coat_mean,
-                    )  # fmt: skip
-                factor = 1.0 / share
-                shadows.straight[k] = l_pdf == 0.0
-                if l_pdf > 0.0:
-                    l_pdf *= share
-                    factor = 1.0 / (l_pdf + pdf) if lights.seen[l] else 1.0 / l_pdf
-                w = paths.weights[p]
-                l_r, l_g, l_b = (
-                    w[0] * f_r * l_r * factor,
-                    w[1] * f_g * l_g * factor,
-                    w[2] * f_b * l_b * factor,
-                )
-                most = max(l_r, l_g, l_b)
-                if paths.marks[p] & SCATTERED and most > rules.clamp:
-                    l_r, l_g, l_b = (
-                        l_r * rules.clamp / most,
-                        l_g * rules.clamp / most,
-                        l_b * rules.clamp / most,
-                    )
-                shadows.lit[k, 0], shadows.lit[k, 1], shadows.lit[k, 2] = l_r, l_g, l_b
-                shadows.origins_world[k, 0] = x
-                shadows.origins_world[k, 1] = y
-                shadows.origins_world[k, 2] = z
-                shadows.directions_world[k, 0] = w_x
-                shadows.directions_world[k, 1] = w_y
-                shadows.directions_world[k, 2] = w_z
-                shadows.t_max[k] = distance * SHORT_OF_LIGHT if distance < FAR else np.inf
-    u, v = numbers[DIRECTION, 0, n], numbers[DIRECTION, 1, n]
-    if kind == DIFFUSE:
-        i_x, i_y, i_z = sample_cosine(u, v)
-        pdf = i_z / math.pi
-        f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
-    else:
-        i_x, i_y, i_z = opaque_sample(
-            o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, choice, u, v
-        )
-        f_r, f_g, f_b, pdf = opaque_value(
-            o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, ground, kept,
-            materials.mirror, coat, coat_mean,
-        )  # fmt: skip
-    w_x = i_x * a_x + i_y * b_x + i_z * s_x
-    w_y = i_x * a_y + i_y * b_y + i_z * s_y
-    w_z = i_x * a_z + i_y * b_z + i_z * s_z
-    if not pdf > 0.0 or w_x * n_x + w_y * n_y + w_z * n_z <= 0.0 or f_r + f_g + f_b <= 0.0:
-        paths.alive[p] = False
-        return
-    paths.weights[p, 0] *= f_r / pdf
-    paths.weights[p, 1] *= f_g / pdf
-    paths.weights[p, 2] *= f_b / pdf
-    paths.marks[p] = (paths.marks[p] | SCATTERED) & ~(CLEAR | STRAIGHT)
-    w_x, w_y, w_z = unit(w_x, w_y, w_z)
-    _leave(paths, p, x, y, z, w_x, w_y, w_z, pdf)
+def fill_numbers(scratch, paths, active, first, last, first_pair):
+    """The uniform numbers of the rows ``first`` to ``last``, at most a block of them."""
+    for k in range(first, last):
+        p = active[k]
+        scratch.keys[k - first], scratch.samples[k - first] = paths.keys[p], paths.samples[p]
+    fill_pairs(scratch.keys, scratch.samples, last - first, first_pair, scratch.numbers)
 
 
 @lean(cache=True, nogil=True)
 def meet_surfaces(
-    first, last, scratch, paths, active, depth, distances, faces, barycentrics, surfaces, materials, lights,
-    environment, rules, shadows,
-):  # fmt: skip
+    first,
+    last,
+    scratch,
+    paths,
+    active,
+    depth,
+    distances,
+    faces,
+    barycentrics,
+    surfaces,
+    materials,
+    lights,
+    environment,
+    rules,
+    shadows,
+):
     """What the paths ``active`` find at the end of their rays; ``depth`` counts the surfaces met before.
 
     Adds light that they run into, turns them to where they go on, and writes what they ask of lights into
     ``shadows``, a row a ray. Paths that end are not alive any more.
     """
-    for start in range(first, last, BLOCK):
-        count = min(BLOCK, last - start)
-        for n in range(count):
-            scratch.keys[n], scratch.samples[n] = (
-                paths.keys[active[start + n]],
-                paths.samples[active[start + n]],
+    numbers = scratch.numbers
+    first_pair = PAIRS_OF_CAMERA + depth * PAIRS_OF_SURFACE
+    for k in range(first, last):
+        n = (k - first) % BLOCK
+        if n == 0:
+            fill_numbers(scratch, paths, active, k, min(k + BLOCK, last), first_pair)
+        p = active[k]
+        face = faces[k]
+        shadows.lit[k, 0] = shadows.lit[k, 1] = shadows.lit[k, 2] = 0.0
+        if face == ENDED:
+            continue
+        if face < 0:
+            _miss(paths, p, lights, environment, rules)
+            paths.alive[p] = False
+            continue
+        d = paths.directions_world[p]
+        b, c = float(barycentrics[k, 0]), float(barycentrics[k, 1])
+        a = 1.0 - b - c
+        n_x, n_y, n_z = face_normal(surfaces.corners_world[face])
+        facing = -(d[0] * n_x + d[1] * n_y + d[2] * n_z)
+        m = surfaces.materials[face]
+        kind = materials.kinds[m]
+        if paths.inside[p] >= 0:
+            medium = materials.absorption[paths.inside[p]]
+            for channel in range(3):
+                paths.weights[p, channel] *= math.exp(-medium[channel] * distances[k])
+        if kind == LIGHT:
+            _light_seen(paths, p, lights, materials.lights[m], distances[k], facing, rules)
+        if kind == LIGHT or depth >= rules.max_depth:
+            paths.alive[p] = False
+            continue
+        x, y, z = hit_point(surfaces.corners_world[face], a, b, c)
+        if facing < 0.0:
+            n_x, n_y, n_z = -n_x, -n_y, -n_z
+        s_x, s_y, s_z = shading_normal(
+            surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d[0], d[1], d[2]
+        )
+        choice, roulette = numbers[CHOICE, 0, n], numbers[CHOICE, 1, n]
+        if depth >= rules.roulette_depth:
+            w = paths.weights[p]
+            stay = min(max(w[0], w[1], w[2]), 0.95)
+            if roulette >= stay:
+                paths.alive[p] = False
+                continue
+            for channel in range(3):
+                paths.weights[p, channel] /= stay
+        if kind == GLASS:
+            _glass(paths, p, materials, m, facing >= 0.0, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice)
+            continue
+        uv = surfaces.corner_uv[face]
+        u_t = a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0]
+        v_t = a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1]
+        red, green, blue, metallic, roughness = material_at(materials, m, u_t, v_t)
+        if kind == MIRROR:
+            _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue)
+            continue
+        # --- a surface that scatters: what lights send to it, and a direction to go on ---
+        x, y, z = lifted(x, y, z, n_x, n_y, n_z)
+        a_x, a_y, a_z, b_x, b_y, b_z = around(s_x, s_y, s_z)
+        o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
+        o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
+        o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
+        coat, coat_mean = materials.coat[materials.coats[m]], materials.coat_means[materials.coats[m]]
+        ior, ground, kept = materials.iors[m], materials.grounds[m], materials.kept[m] != 0
+        if len(lights.kinds):
+            l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
+            if l >= 0:
+                u, v = numbers[PLACE, 0, n], numbers[PLACE, 1, n]
+                w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
+                i_z = w_x * s_x + w_y * s_y + w_z * s_z
+                if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
+                    if kind == DIFFUSE:
+                        pdf = i_z / math.pi
+                        f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
+                    else:
+                        f_r, f_g, f_b, pdf = opaque_value(
+                            o_x, o_y, o_z,
+                            w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z,
+                            red, green, blue, metallic, roughness, ior, ground, kept,
+                            materials.mirror, coat, coat_mean,
+                        )  # fmt: skip
+                    factor = 1.0 / share
+                    shadows.straight[k] = l_pdf == 0.0
+                    if l_pdf > 0.0:
+                        l_pdf *= share
+                        factor = 1.0 / (l_pdf + pdf) if lights.seen[l] else 1.0 / l_pdf
+                    w = paths.weights[p]
+                    l_r, l_g, l_b = (
+                        w[0] * f_r * l_r * factor,
+                        w[1] * f_g * l_g * factor,
+                        w[2] * f_b * l_b * factor,
+                    )
+                    most = max(l_r, l_g, l_b)
+                    if paths.marks[p] & SCATTERED and most > rules.clamp:
+                        l_r, l_g, l_b = (
+                            l_r * rules.clamp / most,
+                            l_g * rules.clamp / most,
+                            l_b * rules.clamp / most,
+                        )
+                    shadows.lit[k, 0], shadows.lit[k, 1], shadows.lit[k, 2] = l_r, l_g, l_b
+                    shadows.origins_world[k, 0] = x
+                    shadows.origins_world[k, 1] = y
+                    shadows.origins_world[k, 2] = z
+                    shadows.directions_world[k, 0] = w_x
+                    shadows.directions_world[k, 1] = w_y
+                    shadows.directions_world[k, 2] = w_z
+                    shadows.t_max[k] = distance * SHORT_OF_LIGHT if distance < FAR else np.inf
+        u, v = numbers[DIRECTION, 0, n], numbers[DIRECTION, 1, n]
+        if kind == DIFFUSE:
+            i_x, i_y, i_z = sample_cosine(u, v)
+            pdf = i_z / math.pi
+            f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
+        else:
+            i_x, i_y, i_z = opaque_sample(
+                o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, choice, u, v
             )
-        pair = PAIRS_OF_CAMERA + depth * PAIRS_OF_SURFACE
-        fill_pairs(scratch.keys, scratch.samples, count, pair, scratch.numbers)
-        for n in range(count):
-            _meet(
-                start + n, scratch.numbers, n, paths, active, depth, distances, faces, barycentrics,
-                surfaces, materials, lights, environment, rules, shadows,
+            f_r, f_g, f_b, pdf = opaque_value(
+                o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, ground, kept,
+                materials.mirror, coat, coat_mean,
             )  # fmt: skip
+        w_x = i_x * a_x + i_y * b_x + i_z * s_x
+        w_y = i_x * a_y + i_y * b_y + i_z * s_y
+        w_z = i_x * a_z + i_y * b_z + i_z * s_z
+        if not pdf > 0.0 or w_x * n_x + w_y * n_y + w_z * n_z <= 0.0 or f_r + f_g + f_b <= 0.0:
+            paths.alive[p] = False
+            continue
+        paths.weights[p, 0] *= f_r / pdf
+        paths.weights[p, 1] *= f_g / pdf
+        paths.weights[p, 2] *= f_b / pdf
+        paths.marks[p] = (paths.marks[p] | SCATTERED) & ~(CLEAR | STRAIGHT)
+        w_x, w_y, w_z = unit(w_x, w_y, w_z)
+        _leave(paths, p, x, y, z, w_x, w_y, w_z, pdf)
 
 
 @lean(cache=True, nogil=True)

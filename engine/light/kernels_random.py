@@ -96,8 +96,8 @@ def fill_uniform(seed, pixels, samples, pair, out):
 def fill_pairs(keys, samples, count, first, numbers):
     """:func:`uniform_pair` of ``count`` paths in the pairs of dimensions from ``first`` on.
 
-    ``numbers`` (pairs, 2, count or more) gets them. The loops go through without a branch, so that the compiler
-    does many paths at a time.
+    ``numbers`` (pairs, 2, count or more) gets them. The loops go through without a branch, so that the
+    compiler does many paths at a time.
     """
     for pair in range(len(numbers)):
         u, v = numbers[pair, 0], numbers[pair, 1]

@@ -49,7 +49,7 @@ def _block(query, shadows, scratch, count, share):
 
 @lean(forceinline=True)
 def _through_glass(queries, surfaces, materials, shadows, first, scratch, count, share):
-    """Take what Fresnel, tint and Beer take from the first ``count`` rows on their way straight through glass."""
+    """Take what Fresnel, tint and Beer take from ``count`` rows on their way straight through glass."""
     for k in range(BLOCK):
         scratch.starts[k] = 0.0
     for _ in range(MOST_SURFACES):

@@ -68,10 +68,8 @@ def closest_hits(
 ):  # fmt: skip
     """The first triangle on each ray; rows ``first`` to ``last`` of the results get it.
 
-    Args:
-        which: the ray of each row; empty where they are the same.
-        coherent: whether neighbours go about one way.
-        scratch: one thread's own 26 rows of 16 words, which begin on a cache line.
+    ``which`` says the ray of each row and is empty where they are the same; ``coherent`` whether neighbours
+    go about one way. ``scratch`` is one thread's own 26 rows of 16 words, which begin on a cache line.
     """
     whole = scratch.view(np.int32)
     for k in range(first, last, LANES):
