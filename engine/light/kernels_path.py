@@ -19,7 +19,7 @@ from engine.light.kernels_lights import (
     pick_light,
     sample_light,
 )
-from engine.light.kernels_random import fill_pairs, pixel_key, uniform_pair
+from engine.light.kernels_random import fill_pairs, pixel_key
 from engine.light.kernels_surface import (
     DIFFUSE,
     GLASS,
@@ -49,6 +49,20 @@ CHOICE, DIRECTION, PICK, PLACE, LAYER_PLACE = 0, 1, 2, 3, 4
 SHORT_OF_LIGHT = 1.0 - 1e-4
 
 
+@lean(forceinline=True)
+def _camera_numbers(scratch, rules, first_pixel, per_pixel, first_sample, order, place, number, count):
+    """Keys, sample numbers and the camera's uniform numbers of ``count`` paths, at most a block of them."""
+    count = min(count, BLOCK)
+    key = pixel_key(rules.seed, order[first_pixel + place])
+    for n in range(count):
+        if number == per_pixel:
+            place, number = place + 1, 0
+            key = pixel_key(rules.seed, order[first_pixel + place])
+        scratch.keys[n], scratch.samples[n] = key, first_sample + number
+        number += 1
+    fill_pairs(scratch.keys, scratch.samples, count, 0, scratch.numbers[:PAIRS_OF_CAMERA])
+
+
 @lean(cache=True, nogil=True)
 def start_paths(first, last, scratch, view, rules, first_pixel, per_pixel, first_sample, order, paths):
     """Paths of pixels ``order[first_pixel]`` and on, ``per_pixel`` to each, numbered from ``first_sample``.
@@ -58,15 +72,27 @@ def start_paths(first, last, scratch, view, rules, first_pixel, per_pixel, first
     """
     height, width, _ = view.directions_world.shape
     across_x, across_y, across_z, up_x, up_y, up_z = around(view.axis[0], view.axis[1], view.axis[2])
+    numbers = scratch.numbers
+    place, number = first // per_pixel, first % per_pixel - 1
+    pixel = order[first_pixel + place]
+    y, x = pixel // width, pixel % width
     for k in range(first, last):
-        pixel, sample = order[first_pixel + k // per_pixel], first_sample + k % per_pixel
-        key = pixel_key(rules.seed, pixel)
-        paths.keys[k], paths.samples[k] = key, sample
-        y, x = pixel // width, pixel % width
+        n = (k - first) % BLOCK
+        number += 1
+        if number == per_pixel:
+            place, number = place + 1, 0
+        if n == 0:
+            _camera_numbers(
+                scratch, rules, first_pixel, per_pixel, first_sample, order, place, number, last - k
+            )
+        if n == 0 or number == 0:
+            pixel = order[first_pixel + place]
+            y, x = pixel // width, pixel % width
+        paths.keys[k], paths.samples[k] = scratch.keys[n], scratch.samples[n]
         centre = view.directions_world[y, x]
         d_x, d_y, d_z = float(centre[0]), float(centre[1]), float(centre[2])
         if rules.anti_aliasing:
-            u, v = uniform_pair(key, sample, 0)
+            u, v = numbers[0, 0, n], numbers[0, 1, n]
             left, right = max(x - 1, 0), min(x + 1, width - 1)
             high, low = max(y - 1, 0), min(y + 1, height - 1)
             along = (u - 0.5) / max(right - left, 1)
@@ -79,7 +105,7 @@ def start_paths(first, last, scratch, view, rules, first_pixel, per_pixel, first
             d_x, d_y, d_z = unit(d_x, d_y, d_z)
         o_x, o_y, o_z = view.origin_world[0], view.origin_world[1], view.origin_world[2]
         if view.aperture > 0.0:
-            u, v = uniform_pair(key, sample, 1)
+            u, v = numbers[1, 0, n], numbers[1, 1, n]
             radius, angle = 0.5 * view.aperture * math.sqrt(u), 2.0 * math.pi * v
             a, b = radius * math.cos(angle), radius * math.sin(angle)
             l_x, l_y, l_z = a * across_x + b * up_x, a * across_y + b * up_y, a * across_z + b * up_z
@@ -93,10 +119,9 @@ def start_paths(first, last, scratch, view, rules, first_pixel, per_pixel, first
             d_y,
             d_z,
         )
-        paths.weights[k, :] = 1.0
-        paths.radiance_linear[k, :] = 0.0
-        paths.layer_srgb[k, :] = 0.0
-        paths.shade[k, :] = 0.0
+        for channel in range(3):
+            paths.weights[k, channel], paths.radiance_linear[k, channel] = 1.0, 0.0
+            paths.layer_srgb[k, channel], paths.shade[k, channel] = 0.0, 0.0
         paths.transmittance[k], paths.coverage[k] = 1.0, 1.0
         paths.densities[k], paths.inside[k] = 0.0, -1
         paths.marks[k], paths.alive[k] = CLEAR | STRAIGHT, True
@@ -210,12 +235,15 @@ def _glass(paths, p, materials, m, entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s
 
 
 @lean(forceinline=True)
-def fill_numbers(scratch, paths, active, first, last, first_pair):
-    """The uniform numbers of the rows ``first`` to ``last``, at most a block of them."""
+def _fill_numbers(scratch, paths, active, faces, first, last, first_pair):
+    """The uniform numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face."""
+    count = 0
     for k in range(first, last):
-        p = active[k]
-        scratch.keys[k - first], scratch.samples[k - first] = paths.keys[p], paths.samples[p]
-    fill_pairs(scratch.keys, scratch.samples, last - first, first_pair, scratch.numbers)
+        if faces[k] >= 0:
+            p = active[k]
+            scratch.keys[count], scratch.samples[count] = paths.keys[p], paths.samples[p]
+            count += 1
+    fill_pairs(scratch.keys, scratch.samples, count, first_pair, scratch.numbers)
 
 
 @lean(cache=True, nogil=True)
@@ -243,10 +271,11 @@ def meet_surfaces(
     """
     numbers = scratch.numbers
     first_pair = PAIRS_OF_CAMERA + depth * PAIRS_OF_SURFACE
+    n = 0
     for k in range(first, last):
-        n = (k - first) % BLOCK
-        if n == 0:
-            fill_numbers(scratch, paths, active, k, min(k + BLOCK, last), first_pair)
+        if (k - first) % BLOCK == 0:
+            _fill_numbers(scratch, paths, active, faces, k, min(k + BLOCK, last), first_pair)
+            n = -1
         p = active[k]
         face = faces[k]
         shadows.lit[k, 0] = shadows.lit[k, 1] = shadows.lit[k, 2] = 0.0
@@ -256,6 +285,7 @@ def meet_surfaces(
             _miss(paths, p, lights, environment, rules)
             paths.alive[p] = False
             continue
+        n += 1
         d = paths.directions_world[p]
         b, c = float(barycentrics[k, 0]), float(barycentrics[k, 1])
         a = 1.0 - b - c

@@ -85,15 +85,15 @@ def occluded1_address() -> int:
 
 
 @cache
-def intersect16_address() -> int:
-    """Address of rtcIntersect16, for sixteen rays through triangles."""
-    return _address("rtcIntersect16")
+def intersect8_address() -> int:
+    """Address of rtcIntersect8, for eight rays through triangles."""
+    return _address("rtcIntersect8")
 
 
 @cache
-def occluded16_address() -> int:
-    """Address of rtcOccluded16."""
-    return _address("rtcOccluded16")
+def occluded8_address() -> int:
+    """Address of rtcOccluded8."""
+    return _address("rtcOccluded8")
 
 
 def _address(name: str) -> int:

@@ -1,6 +1,6 @@
-"""Rays through triangles: Embree's own tests of sixteen rays at a time, called in a loop.
+"""Rays through triangles: Embree's own tests of eight rays at a time, called in a loop.
 
-Embree gives each ray of sixteen what it would give that ray alone.
+Embree gives each ray of eight what it would give that ray alone.
 """
 
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from numba import njit, prange
 
 from engine.trace.kernels_native import call_with_four_pointers, lean
 
-LANES = 16
-# --- RTCRayHit16: a row of sixteen 32-bit words each ---
+LANES = 8
+# --- RTCRayHit8: a row of eight 32-bit words each ---
 ORIGIN, T_NEAR, DIRECTION, TIME, T_FAR, MASK, ID, FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
 U, V, FACE, GEOMETRY, INSTANCE = 15, 16, 17, 18, 19
 # --- behind it in the scratch memory: which lanes count, and RTCIntersectArguments ---
@@ -23,7 +23,7 @@ NO_HIT = -1
 
 
 class TriangleQuery(NamedTuple):
-    """Addresses of a function of Embree for sixteen rays, and of the scene that it is to search."""
+    """Addresses of a function of Embree for eight rays, and of the scene that it is to search."""
 
     function: int
     scene: int
@@ -69,7 +69,7 @@ def closest_hits(
     """The first triangle on each ray; rows ``first`` to ``last`` of the results get it.
 
     ``which`` says the ray of each row and is empty where they are the same; ``coherent`` whether neighbours
-    go about one way. ``scratch`` is one thread's own 26 rows of 16 words, which begin on a cache line.
+    go about one way. ``scratch`` is one thread's own 26 rows of 8 words, which begin on a cache line.
     """
     whole = scratch.view(np.int32)
     for k in range(first, last, LANES):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32
 from engine.rays import RayBatch
 from engine.threads import use_threads
 from engine.trace.cpu.memory import aligned_empty
-from engine.trace.embree_library import Device, MeshScene, intersect16_address, occluded16_address
+from engine.trace.embree_library import Device, MeshScene, intersect8_address, occluded8_address
 from engine.trace.kernels_triangles import (
     LANES,
     SCRATCH_ROWS,
@@ -106,12 +106,12 @@ class TriangleScene:
     @property
     def closest_query(self) -> TriangleQuery:
         """What :func:`engine.trace.kernels_triangles.closest_hits` is to ask; good while this lives."""
-        return TriangleQuery(intersect16_address(), self._scene.handle)
+        return TriangleQuery(intersect8_address(), self._scene.handle)
 
     @property
     def any_query(self) -> TriangleQuery:
         """What :func:`engine.trace.kernels_triangles.any_hits` is to ask; good while this lives."""
-        return TriangleQuery(occluded16_address(), self._scene.handle)
+        return TriangleQuery(occluded8_address(), self._scene.handle)
 
     def _scratch(self, rays: int) -> Float32[np.ndarray, "c w"]:
         return new_scratch(max(1, min(rays, CHUNKS_PER_THREAD * self._threads)))
