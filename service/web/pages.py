@@ -148,7 +148,7 @@ async def show_new(
         "new.html",
         who,
         form=options_form(kind, unwritable_formats(workers), ceilings_by_path(kind, service.settings)),
-        datasets=[row for row in datasets.rows if row.state == "committed"],
+        datasets=[row for row in datasets.rows if row.state == "committed" and row.holds == "photographs"],
         chosen=dataset,
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),
         max_file_bytes=service.settings.max_upload_bytes,
