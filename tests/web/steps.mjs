@@ -291,7 +291,9 @@ const steps = {
             return [image.naturalWidth, image.naturalHeight];
         });
         await shot(page, "light_preview");
-        found.download = await page.locator("#light a[download]").evaluate(async (link) => (await fetch(link.href)).text()).catch(() => null);
+        await page.click("#light summary");
+        const [download] = await Promise.all([page.waitForEvent("download"), page.click("#light a[download]")]);
+        found.saved = { name: download.suggestedFilename(), same: readFileSync(await download.path(), "utf8") === await text() };
         found.nameless = await nameless(page);
         await page.click("[data-do=views]");
         await page.waitForURL((url) => !url.pathname.endsWith(job.job));

@@ -163,7 +163,7 @@ def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_
     thing, floor = stage.meshes
     assert thing.file == "x.obj" and floor.shape == "plane" and stage.lights[0].kind == "rectangle"
     assert thing.on is not None and thing.on.pixel == pytest.approx((0.25 * 96, 0.745 * 72), abs=1)
-    assert found["refused"].startswith("sky.hdr: ") and "is not an image" in found["refused"]
+    assert found["refused"].startswith("'sky.hdr' is not an image") and found["refused"].count("sky.hdr") == 1
     assert found["preview"] == [96, 72] and found["took"].startswith("The preview took ")
     assert len(found["pictures"]) == 2 and set(found["pictures"]) == {96}
     job = flow.service.ask("GET", f"/v1/jobs/{found['job']}")
@@ -171,6 +171,7 @@ def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_
     assert len(job["options"]["stage"]["meshes"]) == 2
     files = flow.service.ask("GET", f"/v1/datasets/{job['files_id']}/files")["files"]
     assert [file["path"] for file in files] == ["a_thing.obj"]
+    assert found["saved"] == {"name": "stage.toml", "same": True}
     assert found["left"] == 0 and found["nameless"] == []
     assert [
         text for text in found["complaints"] if "422" not in text

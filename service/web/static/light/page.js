@@ -50,10 +50,17 @@ function stage(samples) {
     return stageText({ ...given, samples: samples ?? given.samples }, { ...cameras, forward: camera.forward }, at, extent);
 }
 
+/** Whether a field counts: `name=value value`, or `name=*` for any. */
+function isNeeded(needs, given) {
+    const [name, wanted] = needs.split("=");
+    if (name === "material" && given.thing === "none") return false;
+    return wanted === "*" ? Boolean(given[name]) : wanted.split(" ").includes(String(given[name]));
+}
+
 function show() {
     for (const output of form.querySelectorAll("output")) output.textContent = `${output.htmlFor.value && document.getElementById(output.htmlFor.value).value}${output.dataset.unit}`;
-    const { thing, x, y } = values();
-    find("[data-for=file]").hidden = thing !== "file";
+    const given = values(), { x, y } = given;
+    for (const field of form.querySelectorAll("[data-needs]")) field.hidden = !isNeeded(field.dataset.needs, given);
     spot.style.left = `${x}%`;
     spot.style.top = `${y}%`;
     if (!cameras) return;
@@ -88,6 +95,8 @@ async function queueRender(options, more = {}) {
     return queueJob(body, crypto.randomUUID?.() ?? String(Math.random()));
 }
 
+/** What went wrong, each sentence once. */
+const sentences = (error) => [...new Set([error.message, ...(error.faults ?? [])])].join(" ");
 const api = (path, method = "GET") => fetch(`/v1/jobs/${path}`, { method });
 
 /** One small picture with few samples; the job goes when its picture is here. */
@@ -107,7 +116,7 @@ async function preview() {
     } catch (error) {
         if (mine === trial) {
             say("");
-            complain([error.message, ...(error.faults ?? [])].join(" "));
+            complain(sentences(error));
         }
     } finally {
         if (mine.id) forget(mine.id);
@@ -159,7 +168,7 @@ async function render(options, button) {
         location.href = `/jobs/${id}`;
     } catch (error) {
         say("");
-        complain([error.message, ...(error.faults ?? [])].join(" "));
+        complain(sentences(error));
         button.disabled = false;
     }
 }
