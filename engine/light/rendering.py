@@ -8,13 +8,11 @@ from engine.light.integrator import PathTracer
 from engine.light.stage import Integrator
 from engine.light.staging import LitMeshes, refuse_inside_glass
 from engine.render.images import write_exr, write_png
-from engine.render.jobs import Shot
+from engine.render.jobs import Paint, Shot
 
 
-def stage_paint(
-    tracer: PathTracer, settings: Integrator
-) -> Callable[[Shot, Path, Callable[[float], None]], None]:
-    """What renders a shot of a stage to a file, for :mod:`engine.render.series`.
+def stage_paint(tracer: PathTracer, settings: Integrator) -> Paint:
+    """What renders a shot of a stage to a file.
 
     ``.exr`` gets the linear picture before exposure and tone curve as R, G, B, and alpha as A; anything else
     gets 8-bit display values.

@@ -4,6 +4,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -71,7 +72,7 @@ def with_files(stage: Stage, names: Mapping[str, str]) -> Stage:
     content = stage.model_dump(mode="json")
     for key, name in named_files(stage):
         *path, last = key.replace("[", ".").replace("]", "").split(".")
-        place = content
+        place: Any = content
         for part in path:
             place = place[int(part) if part.isdigit() else part]
         place[last] = names.get(name, name)

@@ -38,6 +38,13 @@ class Shot:
     rays: Callable[[], ImageRays]
 
 
+Paint = Callable[[Shot, Path, Callable[[float], None]], None]
+"""Renders a shot and writes it to a file, whose suffix says the format; told the share that is done.
+
+It raises :class:`engine.errors.OutputError` where the file cannot be written.
+"""
+
+
 def view_shots(
     scene: Viewpoints, indices: Int64[np.ndarray, " n"], near_world: float = 0.0
 ) -> tuple[Shot, ...]:
@@ -124,10 +131,8 @@ def gaussian_turntable(
     return Turntable(centre, up, float(distance * np.cos(elevation)), float(distance * np.sin(elevation)))
 
 
-def scene_paint(
-    tracer: Tracer, background: Float32[np.ndarray, "3"]
-) -> Callable[[Shot, Path, Callable[[float], None]], None]:
-    """What renders a shot of a scene to a file, for :mod:`engine.render.series`.
+def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"]) -> Paint:
+    """What renders a shot of a scene to a file.
 
     ``.exr`` gets linear R, G, B, alpha A, the expected distance Z (0 where nothing is) and the world normal
     N.x, N.y, N.z; anything else gets 8-bit display colours.

@@ -4,37 +4,19 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
 
 from engine.errors import OutputError
 from engine.render.images import read_image
-from engine.render.jobs import Shot
+from engine.render.jobs import Paint, Shot
 from engine.render.kept import KeptImages
 from engine.render.video import VideoWriter
 from engine.stages import Count
 
 FILM = "film.mp4"
 """Name of a film among its frames while it is written."""
-
-
-@runtime_checkable
-class Paint(Protocol):
-    """Renders a shot and writes it to a file."""
-
-    def __call__(self, shot: Shot, path: Path, part: Callable[[float], None]) -> None:
-        """Do so.
-
-        Args:
-            shot: what to render.
-            path: the file; its suffix says the format.
-            part: told the share that is done.
-
-        Raises:
-            OutputError: the file cannot be written.
-        """
 
 
 Kept = Callable[[int], None]

@@ -47,8 +47,7 @@ def fetch(api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), *, q
 
 def submit_and_wait(api: Api, what: Submission | Derivation, output: Path, *, quiet: bool = False) -> None:
     """All of it, and a summary at the end."""
-    is_derived = isinstance(what, Derivation)
-    job = derive(api, what, quiet=quiet) if is_derived else submit(api, what, quiet=quiet)
+    job = derive(api, what, quiet=quiet) if isinstance(what, Derivation) else submit(api, what, quiet=quiet)
     if not quiet:
         click.echo(f"Queued as job {job['id']}.")
     try:

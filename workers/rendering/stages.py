@@ -18,9 +18,8 @@ from engine.light.rendering import refuse_cameras_in_glass, render_preview, stag
 from engine.light.stage import Integrator, Stage
 from engine.light.stage_file import StageFacts, write_first_stage
 from engine.light.staging import stage_meshes
-from engine.render.jobs import Shot, gaussian_turntable, scene_turntable
+from engine.render.jobs import Paint, Shot, gaussian_turntable, scene_turntable
 from engine.render.paths import Turntable
-from engine.render.series import Paint
 from engine.scene.model import Viewpoints
 from engine.stages import counted_stage
 from engine.trace.make import make_tracer

@@ -20,6 +20,7 @@ from engine.render.cameras import RenderCamera
 from engine.render.identity import identity_of
 from engine.render.jobs import (
     DEFAULT_FOV_Y_DEGREES,
+    Paint,
     Shot,
     camera_shots,
     gaussian_turntable,
@@ -32,7 +33,7 @@ from engine.render.jobs import (
 from engine.render.kept import KeptImages
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
-from engine.render.series import Kept, Paint, render_film, render_series
+from engine.render.series import Kept, render_film, render_series
 from engine.run_folder import CONFIG, SCENE, is_run, run_viewpoints
 from engine.scene.model import Viewpoints
 from engine.scene.views_file import SplitViewpoints
