@@ -9,24 +9,19 @@ import numpy as np
 from jaxtyping import Float64
 
 from engine.config import read_config
-from engine.errors import OutputError
+from engine.errors import ConfigError, OutputError
 from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
 from engine.light.stage_file import read_stage
-from engine.render.cameras import RenderCamera
 from engine.render.jobs import (
-    DEFAULT_FOV_Y_DEGREES,
     Shot,
     camera_shots,
-    gaussian_turntable,
     render_images,
     render_video,
-    scene_fov_y_degrees,
-    scene_turntable,
-    turntable_cameras,
     view_shots,
 )
+from engine.render.names import names_by_number
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
 from engine.run_folder import CONFIG, SCENE, is_run, run_viewpoints
@@ -35,11 +30,10 @@ from engine.scene.views_file import SplitViewpoints
 from engine.stages import counted_stage
 from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
+from workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
 from workers.rendering.stages import StagePlace, render_stage
 from workers.telling.losses import open_scene
 
-DEFAULT_FPS = 30.0
-DEFAULT_FRAMES = 120
 ANY_SIDE_PX = 1 << 30
 """A cap that no photograph reaches."""
 
@@ -61,7 +55,7 @@ def render_files(
     """Render as the options of the command say.
 
     Args:
-        mode: ``views``, ``turntable`` or ``camera_path``.
+        mode: ``views``, ``turntable``, ``camera_path`` or ``camera``.
         options: the options of the command by parameter name.
         listener: hears the progress.
         say: told in a sentence what reading a scene has lost.
@@ -79,13 +73,15 @@ def render_files(
         path = read_camera_path(options["camera_path"])
         cameras, fps = path.cameras, options["fps"] or path.fps
     source = _read_run(options) if is_run(options["source"]) else _read_file(options, say)
-    if mode == "turntable":
-        cameras = _turntable(source, options, fps)
+    if mode in ("turntable", "camera"):
+        cameras = cameras_of_options(source.gaussians, source.viewpoints, options, fps)
     if cameras is not None:
         cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
-    background = background_colour(options["background"] or source.background)
+    shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
+    _check_one_file(output, 1 if options.get("preview") else len(shots))
+    transparent = options["background"] == "transparent"
+    background = background_colour("black" if transparent else options["background"] or source.background)
     if stage is not None:
-        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
         place = StagePlace(
             source.gaussians, source.settings, _full_size(options), options["stage"].parent,
             lambda path: open_scene(path, say), background, options["threads"],
@@ -95,13 +91,23 @@ def render_files(
         return render_stage(stage, place, shots, output, names, film, listener)
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
-    background = background_colour(options["background"] or source.background)
     with counted_stage("render", listener) as progress:
         if cameras is not None and output.suffix.lower() == ".mp4":
             render_video(tracer, cameras, output, fps, background, progress)
             return (output,)
-        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
-        return render_images(tracer, shots, _FileNames(output, options["exr"]), background, progress)
+        names = _FileNames(output, options["exr"])
+        return render_images(tracer, shots, names, background, progress, transparent=transparent)
+
+
+def _check_one_file(output: Path, images: int) -> None:
+    """Refuse the name of one image where there are several.
+
+    Raises:
+        ConfigError: they would all be one file.
+    """
+    if images > 1 and output.suffix.lower() in (".png", ".exr") and not names_by_number(output):
+        pattern = f"{output.stem}_%04d{output.suffix}"
+        raise ConfigError(f"{output} names one image for {images}; write a pattern such as {pattern}.")
 
 
 @dataclass(frozen=True)
@@ -113,6 +119,8 @@ class _FileNames:
 
     def __call__(self, number: int, shot: Shot) -> Path:
         if self.output.suffix.lower() in (".png", ".exr"):
+            if not names_by_number(self.output):
+                return self.output
             return self.output.with_name(self.output.name % number)
         return self.output / f"{shot.name}{'.exr' if self.exr else '.png'}"
 
@@ -158,7 +166,7 @@ def stage_place(
         found.gaussians, found.settings, _full_size(options), source.parent,
         lambda path: open_scene(path, say), background_colour(found.background), 0,
     )  # fmt: skip
-    return place, None if up is None else _axis(up)
+    return place, None if up is None else axis_named(up)
 
 
 def _full_size(options: dict[str, Any]) -> Viewpoints | None:
@@ -166,25 +174,6 @@ def _full_size(options: dict[str, Any]) -> Viewpoints | None:
     if not is_run(options["source"]):
         return None
     return run_viewpoints(options["source"], scene=options["scene"], max_side=ANY_SIDE_PX)
-
-
-def _turntable(source: _Source, options: dict[str, Any], fps: float) -> tuple[RenderCamera, ...]:
-    frames: int = options["frames"] or DEFAULT_FRAMES
-    if options["seconds"]:
-        frames = max(1, round(options["seconds"] * fps))
-    fov: float | None = options["fov"]
-    if source.viewpoints is not None:
-        table = scene_turntable(source.viewpoints)
-        fov = fov or scene_fov_y_degrees(source.viewpoints)
-    else:
-        fov = fov or DEFAULT_FOV_Y_DEGREES
-        table = gaussian_turntable(source.gaussians, up_world=_axis(options["up"] or "-y"), fov_y_degrees=fov)
-    return turntable_cameras(table, frames, options["width"], options["height"], fov)
-
-
-def _axis(name: str) -> Float64[np.ndarray, "3"]:
-    axis = np.eye(3)["xyz".index(name[-1])]
-    return -axis if name.startswith("-") else axis
 
 
 def _views(source: _Source, which: str | None) -> tuple[Shot, ...]:
