@@ -101,7 +101,7 @@ def test_faint_gaussians_do_not_move_the_turntable():
     solid, haze = rng.standard_normal((300, 3)), 50 + rng.standard_normal((300, 3))
     gaussians = cloud(np.concatenate([solid, haze]), 3.0)
     gaussians.opacity_logits[300:] = -6
-    assert np.linalg.norm(gaussian_turntable(gaussians).centre_world) < 0.5
+    assert np.linalg.norm(gaussian_turntable(gaussians).centre_world) < 1
 
 
 def test_a_single_gaussian_has_a_turntable():
