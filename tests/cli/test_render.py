@@ -201,7 +201,8 @@ def test_distance_and_elevation_of_a_turntable(run, octasplat, tmp_path):
     for distance in (20, 40):
         result = octasplat(
             "render", run.output / "scene.ply", "-o", tmp_path / f"{distance}.exr", "--turntable",
-            "--frames", 1, "--distance", distance, "--elevation", 80, "--look-at", 0, 0, 0, "--up", "z", *SIZE,
+            "--frames", 1, "--distance", distance, "--elevation", 80, "--look-at", 0, 0, 0,
+            "--up", "z", *SIZE,
         )  # fmt: skip
         assert result.exit_code == 0, result.output
         layers = read_channels(tmp_path / f"{distance}.exr")
