@@ -19,7 +19,8 @@ from engine.rays import ImageRays, RayBatch
 from engine.render.renderer import tile_order
 from engine.trace.protocol import TraceGradients, Tracer
 
-STEPS = 8
+STEPS = 4
+"""More follow the given cameras closer, and others less."""
 HELD = 0.02
 """Weight, in rays, that holds a Gaussian at its mean colour; those that are hardly seen stay there."""
 
