@@ -12,8 +12,6 @@ takes what the coat leaves, in both directions: "A Microfacet Based Coupled Spec
 
 import math
 
-from numba import njit
-
 from engine.shading.kernels_microfacets import (
     ggx_density,
     ggx_masking,
@@ -21,12 +19,13 @@ from engine.shading.kernels_microfacets import (
     schlick_weight,
     table_value,
 )
+from engine.trace.kernels_native import lean
 
 LEAST_ALPHA = 1e-3
 COUPLED, BURLEY = 0, 1
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def fresnel_dielectric(cos_o, eta):
     """Share of unpolarised light that a smooth surface reflects, and the cosine of the refracted ray.
 
@@ -42,14 +41,14 @@ def fresnel_dielectric(cos_o, eta):
     return 0.5 * (parallel * parallel + across * across), cos_t
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def sample_cosine(u, v):
     """A direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
     radius, angle = math.sqrt(u), 2.0 * math.pi * v
     return radius * math.cos(angle), radius * math.sin(angle), math.sqrt(max(1.0 - u, 0.0))
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def specular_share(o_z, red, green, blue, metallic, roughness, coat):
     """Probability with which a sample goes to the specular lobe rather than to the ground."""
     if metallic >= 1.0:
@@ -62,7 +61,7 @@ def specular_share(o_z, red, green, blue, metallic, roughness, coat):
     return min(max(specular / (specular + ground), 0.1), 0.9)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def opaque_value(
     o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, ground_kind, kept,
     mirror, coat, coat_mean,
@@ -112,7 +111,7 @@ def opaque_value(
     return f_r, f_g, f_b, pdf
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def opaque_sample(o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, choice, u, v):
     """A direction to the light, as dense as :func:`opaque_value` says; worth 0 below the surface."""
     share = specular_share(o_z, red, green, blue, metallic, roughness, coat)
@@ -124,7 +123,7 @@ def opaque_sample(o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, ch
     return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def around(n_x, n_y, n_z):
     """Two unit vectors that make a right-handed frame with the unit vector n as its third axis.
 
