@@ -37,8 +37,8 @@ class MaterialSettings(BaseModel):
         hdr: whether the environment may be brighter than 1.
         reflected_gradient: whether normals learn through the reflected direction.
         start: distance from the surface at which reflected rays begin, of the extent.
-        blur: roughness that everything has at least at first, so that normals and the environment are
-            found coarse to fine; it falls to 0 until ``blur_until``.
+        blur: roughness of the level that leads reflected directions at first, and sees farther than a
+            sharp one; it falls to 0 until ``blur_until``.
         blur_until: see there.
         normal_weight: of the spread of the normals along a ray.
         depth_normal_weight: of the angle between normals and the surface that the depths span.
@@ -103,5 +103,5 @@ class MaterialSettings(BaseModel):
         return max(progress - begin, 0.0) / (end - begin)
 
     def blurred(self, progress: float) -> float:
-        """Roughness that everything has at least."""
+        """Roughness of the level that leads reflected directions."""
         return self.blur * max(0.0, 1.0 - progress / self.blur_until) if self.blur_until > 0 else 0.0

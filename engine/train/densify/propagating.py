@@ -1,8 +1,8 @@
 """Material-aware normal propagation: what reflects well hands its normal on to its neighbours.
 
 A smooth metal shows by its reflections which way it faces, to a fraction of a degree; what is matt hardly
-does. So now and then each Gaussian turns to the mean of the normals around it, in which those of smooth metals
-count most. New Gaussians, which begin with the normal of the one they come from, find theirs that way.
+does. So now and then each Gaussian turns to the mean of the normals around it, in which those of smooth
+metals count most. New Gaussians, which begin with the normal of the one they come from, find theirs that way.
 
 The idea is that of "Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282), whose code instead
 raises all opacities, enlarges the Gaussians that reflect, and throws the colours of all others about by
