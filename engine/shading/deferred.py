@@ -153,6 +153,7 @@ class Deferred:
             by_linear = by_shown * buffer.alpha[:, None]
             if settings.recipe != "seed":
                 by_linear *= encoding_slope(kept.linear)
+                by_linear[(kept.linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
             blur = settings.blurred(sight.progress)
             back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
             normal = back.normal + back.reflected if settings.reflected_gradient else back.normal
