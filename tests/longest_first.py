@@ -1,7 +1,7 @@
 """The files of tests that take longest, in the order in which they are begun.
 
 First come three of different kinds: while one compiles kernels, which all others then find compiled, the rest
-waits for clocks and browsers. Whatever is not listed takes less than ten seconds and fills the gaps at the end.
+waits for clocks and browsers. What is not listed takes less than ten seconds and fills the gaps at the end.
 """
 
 _NAMES = """
