@@ -12,8 +12,10 @@ from jaxtyping import Float32, Float64, Int64
 
 from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.light.arrays import Paths
+from engine.light.kernels_film import add_up
 
 Tone = Literal["none", "reinhard", "filmic"]
+_ONE = np.empty(0, np.float32)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -50,14 +52,18 @@ class Film:
         """Add finished paths, equally many to each of ``pixels``, those of one pixel beside each other."""
         each = len(paths.keys) // len(pixels)
 
-        def total(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
-            return values.reshape(len(pixels), each, *values.shape[1:]).sum(axis=1, dtype=np.float64)
+        def add(
+            sums: Float64[np.ndarray, "..."],
+            values: Float32[np.ndarray, "..."],
+            factors: Float32[np.ndarray, " f"] = _ONE,
+        ) -> None:
+            add_up(values.reshape(len(values), -1), factors, each, pixels, sums.reshape(len(sums), -1))
 
-        self._layer[pixels] += total(paths.layer_srgb)
-        self._light[pixels] += total(paths.radiance_linear * paths.transmittance[:, None])
-        self._shade[pixels] += total(paths.shade)
-        self._through[pixels] += total(paths.transmittance)
-        self._coverage[pixels] += total(paths.coverage)
+        add(self._layer, paths.layer_srgb)
+        add(self._light, paths.radiance_linear, paths.transmittance)
+        add(self._shade, paths.shade)
+        add(self._through, paths.transmittance)
+        add(self._coverage, paths.coverage)
         self._samples[pixels] += each
 
     def image(self, *, exposure: float = 0.0, tone: Tone = "none") -> StageImage:
