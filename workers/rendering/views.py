@@ -24,7 +24,7 @@ from engine.render.jobs import (
     scene_paint,
     view_shots,
 )
-from engine.render.kept import KeptImages
+from engine.render.kept import RECORD, KeptImages
 from engine.render.names import names_by_number
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
@@ -158,10 +158,12 @@ class _Series:
     def kept(self, identity: str) -> KeptImages:
         """What there is already of images that look as ``identity`` says."""
         keeping, output = self.keeping, self.output
-        folder = output.parent if output.suffix.lower() in (".png", ".exr") else output
+        folder, record = output, RECORD
+        if output.suffix.lower() in (".png", ".exr"):
+            folder, record = output.parent, f"{output.name}.{RECORD}"
         if self.is_film:
             folder = keeping.frames or output.with_name(f"{output.name}.frames")
-        return KeptImages(folder, identity, resume=keeping.resume, or_anew=keeping.or_anew)
+        return KeptImages(folder, identity, resume=keeping.resume, or_anew=keeping.or_anew, record=record)
 
     def render(self, paint: Paint, kept: KeptImages, listener: Listener) -> tuple[Path, ...]:
         """Do so; returns the files."""
