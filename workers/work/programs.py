@@ -7,11 +7,11 @@ from typing import Any
 
 from engine.config import read_config
 from engine.errors import ExportFailed
+from engine.evaluate.runs import evaluate as evaluate_run
 from engine.events import Event, StageFinished, StageProgress, Warned, broadcast
 from engine.files import ExportOptions
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.files.several import export_files
-from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
 from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.stages import counted_stage, stopping
