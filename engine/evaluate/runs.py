@@ -6,6 +6,7 @@ from pathlib import Path
 from engine.config import ReconstructionConfig, read_config
 from engine.errors import OutputError
 from engine.evaluate.held_out import evaluate_held_out
+from engine.evaluate.truth import find_truth
 from engine.events import Listener, StageProgress, Warned
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.poses.find import read_record
@@ -90,6 +91,7 @@ def measure_run(
     into: Path | None = None,
 ) -> None:
     """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
+    truth = find_truth(dataset.root)
     gaussians, _ = read_gaussian_ply(output / SCENE)
     training = json.loads((output / TRAINING).read_text(encoding="utf-8"))
     evaluate_held_out(
@@ -112,6 +114,7 @@ def measure_run(
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
         threads=threads,
         tell=tell,
+        truth=truth,
     )
 
 

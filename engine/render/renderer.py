@@ -1,6 +1,6 @@
 """Whole images from a tracer, a band of rows at a time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -25,6 +25,7 @@ class RenderedImage:
         depth: expected distance along the ray, world units; 0 where nothing was met.
         depth_median: distance at which half of the light is gone, 0 where it never is.
         normal_world: mean normal, turned to the viewer and of unit length; 0 where nothing was met.
+        features: mean of the features that the tracer was built with; 0 where nothing was met.
     """
 
     rgb_srgb: Float32[np.ndarray, "h w 3"]
@@ -32,6 +33,7 @@ class RenderedImage:
     depth: Float32[np.ndarray, "h w"]
     depth_median: Float32[np.ndarray, "h w"]
     normal_world: Float32[np.ndarray, "h w 3"]
+    features: Float32[np.ndarray, "h w f"]
 
 
 def render_rays(
@@ -51,6 +53,7 @@ def render_rays(
         np.empty((height, width), np.float32),
         np.empty((height, width), np.float32),
         np.empty((height, width, 3), np.float32),
+        np.empty((height, width, 0), np.float32),
     )
     rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
     for top in range(0, height, rows):
@@ -58,6 +61,8 @@ def render_rays(
         order = tile_order(min(rows, height - top), width)
         rays = image.rays[top * width + order]
         seen = tracer.trace(rays)
+        if top == 0:
+            out = replace(out, features=np.empty((height, width, seen.features.shape[1]), np.float32))
         rgb = shading.develop(Sight(rays, seen, tracer)).over(background)
         length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
         for part, values in (
@@ -66,8 +71,10 @@ def render_rays(
             (out.depth, seen.expected_depth),
             (out.depth_median, seen.depth_median),
             (out.normal_world, seen.normal_world / np.maximum(length, 1e-12)),
+            (out.features, seen.features / np.maximum(seen.alpha, 1e-8)[:, None]),
         ):
-            part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
+            rows_of_part = part[band].reshape(len(order), int(np.prod(part.shape[2:])))
+            rows_of_part[order] = values.reshape(rows_of_part.shape)
     return out
 
 
