@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, Int32
 from engine.light.arrays import Paths, Rules, ShadowRays, View, new_paths, new_shadow_rays
 from engine.light.film import Film
 from engine.light.kernels_layer import add_layer_light, meet_layers
+from engine.light.kernels_material_layer import meet_materials
 from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
 from engine.light.layers import GaussianLayers
 from engine.light.shadows import let_through, shadow_rays
@@ -19,6 +20,7 @@ from engine.light.staging import LitMeshes
 from engine.rays import ImageRays, RayBatch
 from engine.render.renderer import tile_order
 from engine.threads import use_threads
+from engine.trace.protocol import Tracer
 
 PATHS_AT_ONCE = 1 << 18
 LEAST_TILE = 64
@@ -144,6 +146,14 @@ class PathTracer:
             shadows = new_shadow_rays(len(active))
             if layers is not None:
                 seen = layers.trace(rays, hits.distances)
+                if layers.with_materials:
+                    self._share(
+                        meet_materials, len(active), paths, active, depth, hits.faces, seen.rgb_srgb,
+                        seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
+                        seen.features, meshes.materials, meshes.lights, self._rules, layers.spent_below,
+                        shadows,
+                    )  # fmt: skip
+                    self._add_surface_light(paths, active, shadows, layers.tracer)
                 self._share(
                     meet_layers, len(active), paths, active, depth, hits.distances, hits.faces,
                     seen.rgb_srgb, seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
@@ -156,21 +166,22 @@ class PathTracer:
                 paths, active, depth, hits.distances, hits.faces, hits.barycentrics,
                 meshes.surfaces, meshes.materials, meshes.lights, environment, self._rules, shadows,
             )  # fmt: skip
-            self._add_surface_light(paths, active, shadows)
+            self._add_surface_light(paths, active, shadows, None if layers is None else layers.on_meshes)
             active = active[paths.alive[active]]
             if len(active) == 0:
                 return
 
-    def _add_surface_light(self, paths: Paths, active: Int32[np.ndarray, " n"], shadows: ShadowRays) -> None:
-        """Add the light that reaches surfaces."""
+    def _add_surface_light(
+        self, paths: Paths, active: Int32[np.ndarray, " n"], shadows: ShadowRays, casters: Tracer | None
+    ) -> None:
+        """Add the light that reaches surfaces past meshes and the Gaussians of ``casters``."""
         asked = np.flatnonzero(shadows.lit.any(axis=1))
         if len(asked) == 0:
             return
         share = let_through(self._scene.meshes, shadows, asked)
-        layers = self._scene.layers
         free = share.any(axis=1)
-        if layers is not None and layers.on_meshes is not None and free.any():
-            share[free] *= layers.on_meshes.transmittance(shadow_rays(shadows, asked[free]))[:, None]
+        if casters is not None and free.any():
+            share[free] *= casters.transmittance(shadow_rays(shadows, asked[free]))[:, None]
         self._share(add_lit, len(asked), paths, active[asked], shadows.lit[asked], share)
 
     def _add_layer_light(

@@ -41,6 +41,9 @@ SCATTERED = 2
 STRAIGHT = 4
 """Mark: the path is still the camera's own ray."""
 
+FRONT = 8
+"""Mark: what the camera sees in this place is a surface of Gaussians with materials."""
+
 ENDED = -2
 """In place of a face: the ray ended in front of what it would have met."""
 PAIRS_OF_CAMERA, PAIRS_OF_SURFACE = 2, 5

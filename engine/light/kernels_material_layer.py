@@ -1,0 +1,99 @@
+"""Gaussians with materials on a ray: a surface that scatters light as a mesh of that material would.
+
+What a ray sees of them is one surface, where half of its light is gone: their mean albedo, metallic,
+roughness and normal, weighted as the tracer composites. A path meets it with the probability of its coverage,
+and else goes on to what is behind; so no light is counted twice, and rays of all kinds see the same.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from engine.light.kernels_bsdf import BURLEY
+from engine.light.kernels_layer import NOTHING
+from engine.light.kernels_path import ENDED, FRONT, STRAIGHT
+from engine.light.kernels_random import uniform_pair
+from engine.light.kernels_scatter import scatter
+from engine.light.kernels_surface import unit
+
+MATERIAL, ALBEDO, METALLIC, ROUGHNESS, LIFT = 3, 4, 7, 8, 9
+"""Features of Gaussians behind those of :mod:`engine.light.kernels_layer`.
+
+Whether they have a material, this, and how far off their surface rays begin, world units.
+"""
+COLUMNS = 10
+FIRST_PAIR, PAIRS = 1 << 12, 4
+"""Pairs of numbers of these surfaces, apart from those of meshes."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def meet_materials(
+    first, last, paths, active, depth, faces, rgb, transmittance, depth_median, depth_sum, normals, features,
+    materials, lights, rules, spent_below, shadows,
+):  # fmt: skip
+    """Let paths meet the Gaussians with materials on their rays, or take these away from what was seen.
+
+    A path that meets them goes on from there: its face becomes :data:`ENDED`, and nothing of the layer is
+    left. ``shadows`` gets what it asks of lights.
+    """
+    numbers = np.empty(6)
+    for k in range(first, last):
+        p = active[k]
+        shadows.lit[k, :] = 0.0
+        left = float(transmittance[k])
+        share = 1.0 - left
+        chance = float(features[k, MATERIAL])
+        if chance <= NOTHING:
+            continue
+        if left < spent_below:  # the tracer stopped looking here
+            chance /= share
+        pair = FIRST_PAIR + depth * PAIRS
+        choice, roulette = uniform_pair(paths.keys[p], paths.samples[p], pair)
+        if choice >= chance:
+            # --- past them: what is left is seen as if they were not there ---
+            rest = 1.0 / max(1.0 - chance, NOTHING)
+            transmittance[k] = min(left * rest, 1.0)
+            for channel in range(3):
+                rgb[k, channel] *= rest
+                features[k, channel] *= rest
+            depth_sum[k] *= rest
+            continue
+        # Not the mean: the little that shines through to a far side would pull it below the surface.
+        distance = depth_median[k] if depth_median[k] > 0.0 else depth_sum[k] / share
+        transmittance[k] = 1.0
+        faces[k] = ENDED
+        if depth >= rules.max_depth:
+            paths.alive[p] = False
+            continue
+        if paths.inside[p] >= 0:
+            medium = materials.absorption[paths.inside[p]]
+            for channel in range(3):
+                paths.weights[p, channel] *= math.exp(-medium[channel] * distance)
+        if depth >= rules.roulette_depth:
+            w = paths.weights[p]
+            stay = min(max(w[0], w[1], w[2]), 0.95)
+            if roulette >= stay:
+                paths.alive[p] = False
+                continue
+            for channel in range(3):
+                paths.weights[p, channel] /= stay
+        if paths.marks[p] & STRAIGHT:
+            paths.marks[p] |= FRONT
+        for place in range(3):
+            numbers[2 * place], numbers[2 * place + 1] = uniform_pair(
+                paths.keys[p], paths.samples[p], pair + 1 + place
+            )
+        o, d = paths.origins_world[p], paths.directions_world[p]
+        n_x, n_y, n_z = unit(normals[k, 0], normals[k, 1], normals[k, 2])
+        part = 1.0 / float(features[k, MATERIAL])
+        lift = features[k, LIFT] * part
+        scatter(
+            k, p, paths,
+            o[0] + distance * d[0] + lift * n_x, o[1] + distance * d[1] + lift * n_y,
+            o[2] + distance * d[2] + lift * n_z, n_x, n_y, n_z,
+            min(features[k, ALBEDO] * part, 1.0), min(features[k, ALBEDO + 1] * part, 1.0),
+            min(features[k, ALBEDO + 2] * part, 1.0), min(features[k, METALLIC] * part, 1.0),
+            min(features[k, ROUGHNESS] * part, 1.0), 1.5, BURLEY, False,
+            materials.mirror, materials.coat[0], materials.coat_means[0], lights, rules, numbers, shadows,
+        )  # fmt: skip
