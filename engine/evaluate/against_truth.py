@@ -18,7 +18,8 @@ from engine.evaluate.truth_metrics import (
     normal_errors_degrees,
     pooled_psnr,
 )
-from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, split_materials
+from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
+from engine.light.relighting import RelitImage
 from engine.rays import ImageRays
 from engine.render.renderer import RenderedImage
 
@@ -32,12 +33,10 @@ class TruthMeasures:
 
     Attributes:
         truth: what is known.
-        has_materials: whether the rendered features begin with albedo, metallic and roughness.
         rows: measures by view, in the order in which they came.
     """
 
     truth: Truth
-    has_materials: bool
     rows: dict[str, dict[str, float]] = field(default_factory=dict)
     _albedo: list[Float32[np.ndarray, "n 3"]] = field(default_factory=list)
     _true_albedo: list[Float32[np.ndarray, "n 3"]] = field(default_factory=list)
@@ -59,7 +58,7 @@ class TruthMeasures:
         height, width = image.alpha.shape
         known = self.truth.view(name, (height, width))
         self.rows[name] = _geometry(image, known, rays, axis_world)
-        if self.has_materials:
+        if known.mask.any():
             self._add_materials(name, image, known)
 
     def as_dict(self) -> dict[str, object]:
@@ -77,17 +76,12 @@ class TruthMeasures:
         }
 
     def _add_materials(self, name: str, image: RenderedImage, known: ViewTruth) -> None:
-        found = split_materials(image.features[known.mask][:, :5])
-        for key, channel, true in (
-            ("roughness_mae", ROUGHNESS, known.roughness),
-            ("metallic_mae", METALLIC, known.metallic),
-        ):
-            if true is not None and known.mask.any():
-                self.rows[name][key] = float(
-                    np.abs(found[channel][:, 0] - true[known.mask]).mean(dtype=float)
-                )
-        if known.albedo_linear is not None:
-            self._albedo.append(found[ALBEDO])
+        for channel, true in ((ROUGHNESS, known.roughness), (METALLIC, known.metallic)):
+            if true is not None and channel in image.layers:
+                errors = np.abs(image.layers[channel][known.mask, 0] - true[known.mask])
+                self.rows[name][f"{channel}_mae"] = float(errors.mean(dtype=float))
+        if known.albedo_linear is not None and ALBEDO in image.layers:
+            self._albedo.append(image.layers[ALBEDO][known.mask])
             self._true_albedo.append(known.albedo_linear[known.mask])
 
     def _albedo_mean(self) -> dict[str, object]:
@@ -122,14 +116,14 @@ def _rounded(row: Mapping[str, float]) -> dict[str, float]:
 
 
 def relit_measures(
-    pictures: Sequence[Float32[np.ndarray, "h w 3"]],
+    pictures: Sequence[RelitImage],
     true_srgb: Sequence[Float32[np.ndarray, "h w 4"]],
     names: Sequence[tuple[str, str]],
 ) -> dict[str, object]:
     """Measures of pictures under other light.
 
     Args:
-        pictures: linear, over black (multiplied by their coverage).
+        pictures: what is measured.
         true_srgb: display colours times coverage, and coverage, of the same pictures.
         names: map and view of each.
 
@@ -139,7 +133,7 @@ def relit_measures(
     wanted = [image[..., :3] for image in true_srgb]
     inside = [image[..., 3] > COVERED for image in true_srgb]
     scales = best_scales(
-        np.concatenate([picture[mask] for picture, mask in zip(pictures, inside, strict=True)]),
+        np.concatenate([picture.linear[mask] for picture, mask in zip(pictures, inside, strict=True)]),
         np.concatenate([srgb_to_linear(w[mask]) for w, mask in zip(wanted, inside, strict=True)]),
         display,
     )
@@ -147,8 +141,9 @@ def relit_measures(
     scaled: dict[str, list[float]] = {}
     for (folder, _), picture, target in zip(names, pictures, wanted, strict=True):
         flat = target.reshape(-1, 3)
-        raw.setdefault(folder, []).append(pooled_psnr(display(picture.astype(float)).reshape(-1, 3), flat))
-        scaled.setdefault(folder, []).append(pooled_psnr(display(picture * scales).reshape(-1, 3), flat))
+        for values, factor in ((raw, np.ones(3)), (scaled, scales)):
+            shown = picture.coverage[..., None] * display(picture.linear * factor)
+            values.setdefault(folder, []).append(pooled_psnr(shown.reshape(-1, 3), flat))
     return {
         "relight_psnr": float(np.mean([value for values in raw.values() for value in values])),
         "relight_psnr_scaled": float(np.mean([value for values in scaled.values() for value in values])),

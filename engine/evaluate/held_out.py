@@ -6,15 +6,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numba
+import numpy as np
+from jaxtyping import Float32
 
 from engine.colour import composited
 from engine.evaluate.against_truth import TruthMeasures
 from engine.evaluate.gallery import ViewImages, WorstAndBest
+from engine.evaluate.layers import shown_layers
 from engine.evaluate.report import write_report
 from engine.evaluate.truth import Truth
 from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
 from engine.events import Listener, StageProgress
-from engine.gaussians.materials import has_materials
 from engine.gaussians.model import FlatGaussians
 from engine.render.images import write_png
 from engine.render.names import render_names
@@ -41,6 +43,7 @@ def evaluate_held_out(
     threads: int,
     tell: Listener,
     truth: Truth | None = None,
+    environment_linear: Float32[np.ndarray, "h w 3"] | None = None,
 ) -> None:
     """Measure ``gaussians`` on the held-out views of ``dataset``.
 
@@ -56,10 +59,11 @@ def evaluate_held_out(
         threads: for rendering and measuring; 0 means all cores.
         tell: hears the progress.
         truth: of the scene, whose measures then join the metrics as ``truth``.
+        environment_linear: the map that the scene was learnt with, for the report.
     """
     tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
-    measures = None if truth is None else TruthMeasures(truth, has_materials(gaussians))
+    measures = None if truth is None else TruthMeasures(truth)
     rows: list[ViewMetrics] = []
     images = WorstAndBest()
     total = len(dataset.test_indices)
@@ -72,7 +76,9 @@ def evaluate_held_out(
         write_png(path, view.render)
         rows.append(measured.metrics)
         images.offer(
-            view.name, measured.metrics.psnr, ViewImages(view.reference, view.render, measured.flip_map)
+            view.name,
+            measured.metrics.psnr,
+            ViewImages(view.reference, view.render, measured.flip_map, view.layers),
         )
         tell(StageProgress("evaluate", len(rows), total))
     if measures is not None and measures.rows:
@@ -86,6 +92,7 @@ def evaluate_held_out(
         events=_read_events(output / "events.jsonl"),
         config=config,
         images=images,
+        environment_linear=environment_linear,
     )
 
 
@@ -106,7 +113,12 @@ def _rendered(
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
         reference = composited(rgb, alpha, colour)
         yield RenderedView(
-            dataset.views[index].name, image.rgb_srgb, reference, weight, alpha if dataset.has_alpha else None
+            dataset.views[index].name,
+            image.rgb_srgb,
+            reference,
+            weight,
+            alpha if dataset.has_alpha else None,
+            shown_layers(image),
         )
 
 

@@ -68,6 +68,14 @@ class Film:
         self._coverage[pixels] += total(paths.coverage)
         self._samples[pixels] += each
 
+    def surface(self) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        """Mean linear radiance of the Gaussians with materials that the camera sees, and their coverage."""
+        linear = _divided(self._front_light, self._front[:, None])
+        coverage = self._front / np.maximum(self._samples, 1)
+        return linear.astype(np.float32).reshape(*self._shape, 3), coverage.astype(np.float32).reshape(
+            self._shape
+        )
+
     def image(self, *, exposure: float = 0.0, tone: Tone = "none") -> StageImage:
         """The picture of all paths so far; ``exposure`` is in stops."""
         count = np.maximum(self._samples, 1)[:, None]

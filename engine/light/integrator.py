@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 
-from engine.light.arrays import Paths, Rules, ShadowRays, View, new_paths, new_shadow_rays
+from engine.light.arrays import Paths, Rules, ShadowRays, SurfacePoints, View, new_paths, new_shadow_rays
 from engine.light.film import Film
 from engine.light.kernels_layer import add_layer_light, meet_layers
-from engine.light.kernels_material_layer import meet_materials
+from engine.light.kernels_material_layer import meet_materials, start_at_points
 from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
 from engine.light.layers import GaussianLayers
 from engine.light.shadows import let_through, shadow_rays
@@ -131,12 +131,46 @@ class PathTracer:
             film.add(paths, order[top : top + many])
         progress(len(cuts), len(cuts))
 
-    def _follow(self, paths: Paths, near: Float32[np.ndarray, "1"]) -> None:
-        """Follow paths to their ends; the camera sees nothing nearer than ``near``."""
+    def radiance(
+        self, at: SurfacePoints, pixels: Int64[np.ndarray, " n"], samples: Int64[np.ndarray, " n"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """What points of surfaces send to who sees them, each by one path: linear, unbiased.
+
+        The surface of a point is not part of the scene unless that holds it too.
+
+        Args:
+            at: the points.
+            pixels: any number for each; with its sample it decides the path.
+            samples: number of each path among those of its pixel, below 65,536.
+        """
+        use_threads(self._threads)
+        meshes, layers = self._scene.meshes, self._scene.layers
+        count = len(at.points_world)
+        paths, shadows = new_paths(count), new_shadow_rays(count)
+        self._share(
+            start_at_points, count, at, pixels, samples, self._rules, meshes.materials, meshes.lights,
+            paths, shadows,
+        )  # fmt: skip
+        every = np.arange(count, dtype=np.int32)
+        self._add_surface_light(paths, every, shadows, None if layers is None else layers.tracer)
+        self._follow(paths, np.zeros(1, np.float32), every[paths.alive], met=1)
+        return paths.radiance_linear
+
+    def _follow(
+        self,
+        paths: Paths,
+        near: Float32[np.ndarray, "1"],
+        active: Int32[np.ndarray, " n"] | None = None,
+        met: int = 0,
+    ) -> None:
+        """Follow paths to their ends; the camera sees nothing nearer than ``near``.
+
+        ``active`` are those that are left after they ``met`` so many surfaces; None stands for all.
+        """
         meshes, layers = self._scene.meshes, self._scene.layers
         environment = meshes.lights.environment_number
-        active = np.arange(len(paths.keys), dtype=np.int32)
-        for depth in range(self._rules.max_depth + 1):
+        active = np.arange(len(paths.keys), dtype=np.int32) if active is None else active
+        for depth in range(met, self._rules.max_depth + 1):
             rays = RayBatch(
                 paths.origins_world if depth == 0 else paths.origins_world[active],
                 paths.directions_world if depth == 0 else paths.directions_world[active],

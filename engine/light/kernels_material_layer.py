@@ -13,7 +13,7 @@ from numba import njit
 from engine.light.kernels_bsdf import BURLEY
 from engine.light.kernels_layer import NOTHING
 from engine.light.kernels_path import ENDED, FRONT, STRAIGHT
-from engine.light.kernels_random import uniform_pair
+from engine.light.kernels_random import pixel_key, uniform_pair
 from engine.light.kernels_scatter import scatter
 from engine.light.kernels_surface import unit
 
@@ -25,6 +25,14 @@ Whether they have a material, this, and how far off their surface rays begin, wo
 COLUMNS = 10
 FIRST_PAIR, PAIRS = 1 << 12, 4
 """Pairs of numbers of these surfaces, apart from those of meshes."""
+
+
+@njit(error_model="numpy")
+def _draw(paths, p, pair, numbers):
+    """The six numbers of :func:`scatter`."""
+    key, sample = paths.keys[p], paths.samples[p]
+    for place in range(3):
+        numbers[2 * place], numbers[2 * place + 1] = uniform_pair(key, sample, pair + place)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -80,10 +88,7 @@ def meet_materials(
                 paths.weights[p, channel] /= stay
         if paths.marks[p] & STRAIGHT:
             paths.marks[p] |= FRONT
-        for place in range(3):
-            numbers[2 * place], numbers[2 * place + 1] = uniform_pair(
-                paths.keys[p], paths.samples[p], pair + 1 + place
-            )
+        _draw(paths, p, pair + 1, numbers)
         o, d = paths.origins_world[p], paths.directions_world[p]
         n_x, n_y, n_z = unit(normals[k, 0], normals[k, 1], normals[k, 2])
         part = 1.0 / float(features[k, MATERIAL])
@@ -96,4 +101,31 @@ def meet_materials(
             min(features[k, ALBEDO + 2] * part, 1.0), min(features[k, METALLIC] * part, 1.0),
             min(features[k, ROUGHNESS] * part, 1.0), 1.5, BURLEY, False,
             materials.mirror, materials.coat[0], materials.coat_means[0], lights, rules, numbers, shadows,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def start_at_points(first, last, at, pixels, samples, rules, materials, lights, paths, shadows):
+    """Paths that begin at points of surfaces, as if the camera's rays had met them there."""
+    numbers = np.empty(6)
+    for k in range(first, last):
+        paths.keys[k], paths.samples[k] = pixel_key(rules.seed, pixels[k]), samples[k]
+        paths.directions_world[k] = at.directions_world[k]
+        paths.weights[k, :] = 1.0
+        paths.radiance_linear[k, :] = 0.0
+        paths.layer_srgb[k, :] = 0.0
+        paths.shade[k, :] = 0.0
+        paths.transmittance[k], paths.coverage[k] = 1.0, 1.0
+        paths.densities[k], paths.inside[k] = 0.0, -1
+        paths.marks[k], paths.alive[k] = FRONT, True
+        shadows.lit[k, :] = 0.0
+        _draw(paths, k, FIRST_PAIR + 1, numbers)
+        point, normal, material = at.points_world[k], at.normals_world[k], at.materials[k]
+        scatter(
+            k, k, paths, float(point[0]), float(point[1]), float(point[2]),
+            float(normal[0]), float(normal[1]), float(normal[2]),
+            float(material[0]), float(material[1]), float(material[2]),
+            float(material[3]), float(material[4]),
+            1.5, BURLEY, False, materials.mirror, materials.coat[0], materials.coat_means[0], lights, rules,
+            numbers, shadows,
         )  # fmt: skip

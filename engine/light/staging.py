@@ -1,6 +1,6 @@
 """From a stage to the arrays that paths are traced through."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +57,10 @@ class LitMeshes:
     obstacles: TriangleScene | None = None
     glass: TriangleScene | None = None
     glass_faces: Int64[np.ndarray, " g"] | None = None
+
+    def lit_by(self, lights: LightArrays) -> "LitMeshes":
+        """The same meshes in other light, their environment unseen by the camera."""
+        return replace(self, lights=lights, environment_visible=False)
 
 
 def stage_meshes(stage: Stage, folder: Path, *, threads: int = 0) -> LitMeshes:

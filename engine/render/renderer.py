@@ -1,6 +1,7 @@
 """Whole images from a tracer, a band of rows at a time."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -25,7 +26,7 @@ class RenderedImage:
         depth: expected distance along the ray, world units; 0 where nothing was met.
         depth_median: distance at which half of the light is gone, 0 where it never is.
         normal_world: mean normal, turned to the viewer and of unit length; 0 where nothing was met.
-        features: mean of the features that the tracer was built with; 0 where nothing was met.
+        layers: what else the shading model shows, by name.
     """
 
     rgb_srgb: Float32[np.ndarray, "h w 3"]
@@ -33,7 +34,7 @@ class RenderedImage:
     depth: Float32[np.ndarray, "h w"]
     depth_median: Float32[np.ndarray, "h w"]
     normal_world: Float32[np.ndarray, "h w 3"]
-    features: Float32[np.ndarray, "h w f"]
+    layers: Mapping[str, Float32[np.ndarray, "h w _"]]
 
 
 def render_rays(
@@ -47,13 +48,14 @@ def render_rays(
     Where ``shading`` has features, ``tracer`` must have been built with them.
     """
     height, width = image.height_px, image.width_px
+    layers: dict[str, Float32[np.ndarray, "h w _"]] = {}
     out = RenderedImage(
         np.empty((height, width, 3), np.float32),
         np.empty((height, width), np.float32),
         np.empty((height, width), np.float32),
         np.empty((height, width), np.float32),
         np.empty((height, width, 3), np.float32),
-        np.empty((height, width, 0), np.float32),
+        layers,
     )
     rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
     for top in range(0, height, rows):
@@ -61,9 +63,10 @@ def render_rays(
         order = tile_order(min(rows, height - top), width)
         rays = image.rays[top * width + order]
         seen = tracer.trace(rays)
-        if top == 0:
-            out = replace(out, features=np.empty((height, width, seen.features.shape[1]), np.float32))
-        rgb = shading.develop(Sight(rays, seen, tracer)).over(background)
+        developed = shading.develop(Sight(rays, seen, tracer))
+        rgb = developed.over(background)
+        for name, values in developed.layers.items():
+            layers.setdefault(name, np.empty((height, width, values.shape[1]), np.float32))
         length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
         for part, values in (
             (out.rgb_srgb, np.clip(rgb, 0, 1)),
@@ -71,10 +74,9 @@ def render_rays(
             (out.depth, seen.expected_depth),
             (out.depth_median, seen.depth_median),
             (out.normal_world, seen.normal_world / np.maximum(length, 1e-12)),
-            (out.features, seen.features / np.maximum(seen.alpha, 1e-8)[:, None]),
+            *((layers[name], values) for name, values in developed.layers.items()),
         ):
-            rows_of_part = part[band].reshape(len(order), int(np.prod(part.shape[2:])))
-            rows_of_part[order] = values.reshape(rows_of_part.shape)
+            part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
     return out
 
 

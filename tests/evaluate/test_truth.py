@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,8 @@ from engine.errors import ConfigError, DatasetError
 from engine.evaluate.against_truth import TruthMeasures, relit_measures
 from engine.evaluate.truth import find_truth, read_truth
 from engine.evaluate.truth_metrics import best_scales, display, environment_errors, normal_errors_degrees
-from engine.gaussians.materials import DIELECTRIC_F0  # noqa: F401 (the channels of materials exist)
 from engine.light.environment import EnvironmentMap, environment_frame
+from engine.light.relighting import RelitImage
 from engine.rays import ImageRays
 from engine.render.cameras import RenderCamera
 from engine.render.renderer import RenderedImage
@@ -74,15 +75,16 @@ def wall(*, tilt_degrees: float, depth: float, albedo: float, roughness: float, 
     tilt = math.radians(tilt_degrees)
     normal = np.array([math.sin(tilt), 0.0, -math.cos(tilt)], np.float32) * alpha[..., None]
     distance = depth / rays.directions_world[..., 2] * alpha
-    features = np.array([albedo] * 3 + [metallic, roughness], np.float32) * alpha[..., None]
     rgb = np.zeros((SIDE, SIDE, 3), np.float32)
-    return RenderedImage(rgb, alpha, distance, distance, normal, features), rays
+    names = {"albedo": [albedo] * 3, "metallic": [metallic], "roughness": [roughness]}
+    layers = {name: np.array(values, np.float32) * alpha[..., None] for name, values in names.items()}
+    return RenderedImage(rgb, alpha, distance, distance, normal, layers), rays
 
 
-def measured(folder: Path, image: RenderedImage, rays: ImageRays, *, has_materials: bool = True) -> dict:
+def measured(folder: Path, image: RenderedImage, rays: ImageRays) -> dict:
     truth = find_truth(folder)
     assert truth is not None
-    measures = TruthMeasures(truth, has_materials)
+    measures = TruthMeasures(truth)
     measures.add("a.png", image, rays, np.array([0.0, 0.0, 1.0]))
     measures.add("unknown.png", image, rays, np.array([0.0, 0.0, 1.0]))
     return measures.as_dict()
@@ -107,7 +109,7 @@ def test_errors_are_what_was_put_in(truth_folder):
 
 def test_a_scene_without_materials_has_normals_and_depth_alone(truth_folder):
     image, rays = wall(tilt_degrees=0, depth=4.0, albedo=0.0, roughness=0.0, metallic=0.0)
-    mean = measured(truth_folder, image, rays, has_materials=False)["mean"]
+    mean = measured(truth_folder, replace(image, layers={}), rays)["mean"]
     assert set(mean) == {"normal_mae", "depth_mae", "mask_iou"}
     assert mean["normal_mae"] < 0.01 and mean["depth_mae"] < 1e-3
 
@@ -180,7 +182,8 @@ def test_relit_pictures_share_one_factor_a_channel():
     names = [("day", "a"), ("day", "b"), ("night", "a"), ("night", "b")]
     alpha = np.ones((6, 6, 1))
     true = [np.concatenate([display(image), alpha], axis=-1).astype(np.float32) for image in linear]
-    dark = [(image * [0.5, 0.25, 1.0]).astype(np.float32) for image in linear]
+    whole = np.ones((6, 6), np.float32)
+    dark = [RelitImage((image * [0.5, 0.25, 1.0]).astype(np.float32), whole) for image in linear]
     found = relit_measures(dark, true, names)
     assert found["relight_scales"] == pytest.approx([2, 4, 1], rel=1e-3)
     assert found["relight_psnr"] < 25 and found["relight_psnr_scaled"] > 60

@@ -25,6 +25,7 @@ from workers.cli.commands.import_ import import_
 from workers.cli.commands.merge import merge
 from workers.cli.commands.quota import quota
 from workers.cli.commands.reconstruct import reconstruct
+from workers.cli.commands.relight import relight
 from workers.cli.commands.render import render
 from workers.cli.commands.serve import serve
 from workers.cli.commands.stage import stage
@@ -86,7 +87,7 @@ def cli() -> None:
 
 
 for _command in (
-    reconstruct, evaluate, export, import_, render, stage, surface,
+    reconstruct, evaluate, export, import_, render, relight, stage, surface,
     edit, deform, transform, crop, merge, clean, demo,
     serve, worker, token, fsck, quota, *CLIENT_COMMANDS,
 ):  # fmt: skip

@@ -45,7 +45,7 @@ ANY_SIDE_PX = 1 << 30
 
 
 @dataclass(frozen=True)
-class _Source:
+class Source:
     """A scene to render; what only a run knows is None for a bare file of Gaussians."""
 
     gaussians: FlatGaussians
@@ -53,6 +53,14 @@ class _Source:
     near_world: float = 0.0
     background: str = "black"
     viewpoints: SplitViewpoints | None = None
+    max_side: int | None = None
+
+    @property
+    def extent_world(self) -> float:
+        """Radius of the cameras, or of a turntable that fits."""
+        if self.viewpoints is not None:
+            return self.viewpoints.extent
+        return gaussian_turntable(self.gaussians).radius
 
 
 def render_files(
@@ -78,20 +86,20 @@ def render_files(
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
         cameras, fps = path.cameras, options["fps"] or path.fps
-    source = _read_run(options) if is_run(options["source"]) else _read_file(options, say)
+    source = read_source(options, say)
     if mode == "turntable":
-        cameras = _turntable(source, options, fps)
+        cameras = turntable_of(source, options, fps)
     if cameras is not None:
         cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
     background = background_colour(options["background"] or source.background)
     if stage is not None:
-        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
+        shots = camera_shots(cameras) if cameras is not None else run_shots(source, options["views"])
         place = StagePlace(
             source.gaussians, source.settings, _full_size(options), options["stage"].parent,
             lambda path: open_scene(path, say), background, options["threads"],
         )  # fmt: skip
         film = fps if output.suffix.lower() == ".mp4" else None
-        names = None if options.get("preview") else _FileNames(output, options["exr"])
+        names = None if options.get("preview") else FileNames(output, options["exr"])
         return render_stage(stage, place, shots, output, names, film, listener)
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
@@ -100,42 +108,53 @@ def render_files(
         if cameras is not None and output.suffix.lower() == ".mp4":
             render_video(tracer, cameras, output, fps, background, progress)
             return (output,)
-        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
-        return render_images(tracer, shots, _FileNames(output, options["exr"]), background, progress)
+        shots = camera_shots(cameras) if cameras is not None else run_shots(source, options["views"])
+        return render_images(tracer, shots, FileNames(output, options["exr"]), background, progress)
 
 
 @dataclass(frozen=True)
-class _FileNames:
+class FileNames:
     """The file of a shot: by number in a pattern, by name in a folder."""
 
     output: Path
     exr: bool
 
     def __call__(self, number: int, shot: Shot) -> Path:
+        """The file of a shot and its number."""
         if self.output.suffix.lower() in (".png", ".exr"):
             return self.output.with_name(self.output.name % number)
         return self.output / f"{shot.name}{'.exr' if self.exr else '.png'}"
 
 
-def _read_run(options: dict[str, Any]) -> _Source:
+def read_source(options: dict[str, Any], say: Callable[[str], None]) -> Source:
+    """The scene that the options ``source``, ``scene`` and ``max_side`` name: of a run, or of a file.
+
+    Raises:
+        OctasplatError: it cannot be read.
+    """
+    return _read_run(options) if is_run(options["source"]) else _read_file(options, say)
+
+
+def _read_run(options: dict[str, Any]) -> Source:
     run: Path = options["source"]
     config = read_config(run / CONFIG)
     if not (run / SCENE).exists():
         raise OutputError(f"{run} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume.")
     viewpoints = run_viewpoints(run, scene=options["scene"], max_side=options["max_side"])
-    return _Source(
+    return Source(
         read_gaussian_ply(run / SCENE)[0],
         config.train.trace,
         config.train.near * viewpoints.extent,
         config.evaluate_background,
         viewpoints,
+        config.max_side,
     )
 
 
-def _read_file(options: dict[str, Any], say: Callable[[str], None]) -> _Source:
+def _read_file(options: dict[str, Any], say: Callable[[str], None]) -> Source:
     path: Path = options["source"]
     gaussians = open_scene(path, say)
-    return _Source(gaussians, TraceSettings(), read_near_world(path))
+    return Source(gaussians, TraceSettings(), read_near_world(path))
 
 
 def stage_place(
@@ -153,12 +172,12 @@ def stage_place(
         OctasplatError: the source cannot be read.
     """
     options = {"source": source, "scene": scene, "max_side": None}
-    found = _read_run(options) if is_run(source) else _read_file(options, say)
+    found = read_source(options, say)
     place = StagePlace(
         found.gaussians, found.settings, _full_size(options), source.parent,
         lambda path: open_scene(path, say), background_colour(found.background), 0,
     )  # fmt: skip
-    return place, None if up is None else _axis(up)
+    return place, None if up is None else axis_named(up)
 
 
 def _full_size(options: dict[str, Any]) -> Viewpoints | None:
@@ -168,7 +187,8 @@ def _full_size(options: dict[str, Any]) -> Viewpoints | None:
     return run_viewpoints(options["source"], scene=options["scene"], max_side=ANY_SIDE_PX)
 
 
-def _turntable(source: _Source, options: dict[str, Any], fps: float) -> tuple[RenderCamera, ...]:
+def turntable_of(source: Source, options: dict[str, Any], fps: float) -> tuple[RenderCamera, ...]:
+    """The cameras of a turn, as the options ``frames``, ``seconds``, ``width`` and so on say."""
     frames: int = options["frames"] or DEFAULT_FRAMES
     if options["seconds"]:
         frames = max(1, round(options["seconds"] * fps))
@@ -178,16 +198,24 @@ def _turntable(source: _Source, options: dict[str, Any], fps: float) -> tuple[Re
         fov = fov or scene_fov_y_degrees(source.viewpoints)
     else:
         fov = fov or DEFAULT_FOV_Y_DEGREES
-        table = gaussian_turntable(source.gaussians, up_world=_axis(options["up"] or "-y"), fov_y_degrees=fov)
+        table = gaussian_turntable(
+            source.gaussians, up_world=axis_named(options["up"] or "-y"), fov_y_degrees=fov
+        )
     return turntable_cameras(table, frames, options["width"], options["height"], fov)
 
 
-def _axis(name: str) -> Float64[np.ndarray, "3"]:
+def axis_named(name: str) -> Float64[np.ndarray, "3"]:
+    """The unit vector of an axis such as ``-y``."""
     axis = np.eye(3)["xyz".index(name[-1])]
     return -axis if name.startswith("-") else axis
 
 
-def _views(source: _Source, which: str | None) -> tuple[Shot, ...]:
+def run_shots(source: Source, which: str | None) -> tuple[Shot, ...]:
+    """The views of a run's photographs: ``held-out`` (also where nothing is said), ``train`` or ``all``.
+
+    Raises:
+        OutputError: there are none.
+    """
     viewpoints = source.viewpoints
     assert viewpoints is not None
     every = np.arange(len(viewpoints.views))

@@ -85,7 +85,7 @@ def render(**options: Any) -> None:
             )
         options["max_side"] = options["max_side"] or PREVIEW_SIDE_PX
     else:
-        _check_output(options["output"], options["exr"])
+        check_output(options["output"], options["exr"])
 
     from workers.cli.progress import show_progress
     from workers.cli.scene_files import speaker_of_losses
@@ -99,7 +99,7 @@ def render(**options: Any) -> None:
         click.echo(f"Wrote {files[0]}" + (f" and {len(files) - 1} more." if len(files) > 1 else "."))
 
 
-def _check_output(output: Path, exr: bool) -> None:
+def check_output(output: Path, exr: bool) -> None:
     """Refuse names that say something else than what would be written."""
     suffix = output.suffix.lower()
     if suffix == ".mp4" and exr:
