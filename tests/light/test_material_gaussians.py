@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from light_scenes import camera, psnr
+from light_scenes import camera, psnr, shiny_ball
 
 from engine.colour import linear_to_srgb
-from engine.gaussians.frames import quaternions
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import write_environment
 from engine.light.integrator import LitScene, PathTracer
@@ -25,32 +24,6 @@ from engine.light.staging import stage_meshes
 from engine.trace.protocol import TraceSettings
 
 FOLDER = Path(__file__).parent
-
-
-def ball(
-    count: int, radius: float, *, albedo: tuple[float, ...], metallic: float, roughness: float
-) -> FlatGaussians:
-    """Opaque Gaussians on a sphere, evenly spread (Fibonacci's spiral), of one material."""
-    k = np.arange(count) + 0.5
-    polar, around = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
-    n = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=1)
-    u = np.cross(n, np.where(np.abs(n[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    scale = radius * np.sqrt(4 * np.pi / count) * 0.6
-    scene = FlatGaussians(
-        (radius * n).astype(np.float32),
-        quaternions(np.stack([n, u, np.cross(n, u)], axis=2)).astype(np.float32),
-        np.full((count, 2), np.log(scale), np.float32),
-        np.full(count, 6.0, np.float32),
-        np.zeros((count, 1, 3), np.float32),
-    )
-    return scene.with_channels(
-        {
-            "albedo": np.tile(np.float32(albedo), (count, 1)),
-            "metallic": np.full((count, 1), metallic, np.float32),
-            "roughness": np.full((count, 1), roughness, np.float32),
-        }
-    )
 
 
 def sky(folder: Path, *, white: bool = False) -> str:
@@ -86,7 +59,7 @@ def both(
     given = {"up": (0.0, -1.0, 0.0), "environment": light, "integrator": settings, **(more or {})}
     meshes = given.pop("meshes", ())
     albedo, metallic, roughness = material["albedo"], material["metallic"], material["roughness"]
-    gaussians = ball(3000, 1.0, albedo=albedo, metallic=metallic, roughness=roughness)
+    gaussians = shiny_ball(3000, 1.0, albedo=albedo, metallic=metallic, roughness=roughness)
     ours = Stage(gaussians=(StageGaussians(light="relit"),), meshes=meshes, **given)
     colour = tuple(float(c) for c in linear_to_srgb(np.array(albedo)))
     solid = MetallicRoughness(
@@ -132,7 +105,7 @@ def test_a_mirror_shows_the_gaussians_and_they_show_the_mesh(tmp_path):
 def test_a_white_furnace_keeps_its_light(tmp_path):
     """Smooth metal that reflects everything is nearly white in white light, and never brighter."""
     environment = Environment(file=sky(tmp_path, white=True), visible=True)
-    gaussians = ball(2000, 1.0, albedo=(1.0, 1.0, 1.0), metallic=1.0, roughness=0.2)
+    gaussians = shiny_ball(2000, 1.0, albedo=(1.0, 1.0, 1.0), metallic=1.0, roughness=0.2)
     stage = Stage(
         gaussians=(StageGaussians(light="relit"),), environment=environment,
         integrator=Integrator(samples=64, max_depth=6),
@@ -142,13 +115,13 @@ def test_a_white_furnace_keeps_its_light(tmp_path):
 
 
 def test_threads_change_nothing_and_trained_colours_play_no_part(tmp_path):
-    gaussians = ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
+    gaussians = shiny_ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
     stage = Stage(
         gaussians=(StageGaussians(light="relit"),),
         environment=Environment(file=sky(tmp_path), visible=False),
         integrator=Integrator(samples=4, max_depth=3),
     )
     first = picture(stage, gaussians, threads=1)
-    coloured = ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
+    coloured = shiny_ball(1500, 1.0, albedo=(0.5, 0.5, 0.5), metallic=0.5, roughness=0.3)
     coloured.sh[:] = 1.0
     assert (picture(stage, coloured, threads=2) == first).all()

@@ -6,12 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from engine.light.split_sum_relighting import SplitSumRelighter
-from engine.shading.material_settings import MaterialSettings
 from jaxtyping import Float32, Float64
 
 from engine.colour import srgb_to_linear
-from engine.config import read_config
 from engine.errors import ConfigError
 from engine.events import Listener
 from engine.gaussians.materials import require_materials
@@ -23,7 +20,7 @@ from engine.render.jobs import Shot, camera_shots, view_shots
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
 from engine.render.video import VideoWriter
-from engine.run_folder import CONFIG, SCENE, is_run
+from engine.run_folder import SCENE, is_run
 from engine.scene import load_scene
 from engine.stages import counted_stage
 from workers.rendering.views import (
@@ -35,9 +32,6 @@ from workers.rendering.views import (
     run_shots,
     turntable_of,
 )
-
-PARTS = 100
-"""Progress of a picture is told in so many."""
 
 
 @dataclass(frozen=True)
@@ -71,15 +65,14 @@ def relight_files(
     source = read_source(options, say)
     is_of_run = is_run(options["source"])
     require_materials(source.gaussians, options["source"] / SCENE if is_of_run else options["source"])
-    learnt = read_config(options["source"] / CONFIG).train.materials if is_of_run else MaterialSettings()
-    up = _up(options["up"], learnt if is_of_run else None)
+    up = axis_named(options["up"] or "-y")
     shots, fps = _shots(mode, options, source)
     frames = [
         _Frame(shot, name, options["rotate"] + (360.0 * k / len(shots) if options["spin"] else 0.0))
         for name in environments
         for k, shot in enumerate(shots)
     ]
-    relighter = _relighter(options, source, learnt)
+    relighter = _relighter(options, source)
     output: Path = options["output"]
     with counted_stage("render", listener) as progress:
         pictures = _pictures(relighter, frames, environments, up, options, source, progress)
@@ -89,7 +82,7 @@ def relight_files(
                 for _, rgb, _ in pictures:
                     video.write(np.clip(rgb, 0, 1))
             return (output,)
-        return _write(pictures, frames, options, several=len(environments) > 1)
+        return _write(pictures, options, several=len(environments) > 1)
 
 
 def _environments(paths: Sequence[Path]) -> dict[str, Float32[np.ndarray, "h w 3"]]:
@@ -104,12 +97,6 @@ def _environments(paths: Sequence[Path]) -> dict[str, Float32[np.ndarray, "h w 3
             raise ConfigError(f"{path}: two environments are called {path.stem}; rename one.")
         found[path.stem] = read_environment(path)
     return found
-
-
-def _up(name: str | None, learnt: MaterialSettings | None) -> Float64[np.ndarray, "3"]:
-    if name is not None or learnt is None:
-        return axis_named(name or "-y")
-    return np.array(learnt.up_world, np.float64)
 
 
 def _shots(mode: str, options: dict[str, Any], source: Source) -> tuple[tuple[Shot, ...], float]:
@@ -129,16 +116,11 @@ def _shots(mode: str, options: dict[str, Any], source: Source) -> tuple[tuple[Sh
     return camera_shots([replace(camera, near_world=source.near_world) for camera in cameras]), fps
 
 
-def _relighter(options: dict[str, Any], source: Source, learnt: MaterialSettings) -> Relighter:
-    if options["by"] == "path":
-        integrator = Integrator(
-            samples=options["samples"], max_depth=options["depth"], roulette_depth=options["depth"]
-        )
-        return PathRelighter(source.gaussians, source.settings, integrator, threads=options["threads"])
-    return SplitSumRelighter(
-        source.gaussians, source.settings, learnt, extent_world=source.extent_world,
-        threads=options["threads"],
-    )  # fmt: skip
+def _relighter(options: dict[str, Any], source: Source) -> Relighter:
+    integrator = Integrator(
+        samples=options["samples"], max_depth=options["depth"], roulette_depth=options["depth"]
+    )
+    return PathRelighter(source.gaussians, source.settings, integrator, threads=options["threads"])
 
 
 def _pictures(
@@ -160,20 +142,16 @@ def _pictures(
                 environments[frame.environment], environment_frame(up_world, frame.rotation_degrees)
             )
             relighter.put(environment)
+        progress(number, len(frames))
         rays = frame.shot.rays()
-
-        def part(share: float, done: int = number) -> None:
-            progress(round((done + share) * PARTS), PARTS * len(frames))
-
-        image = relighter.render(rays, part)
+        image = relighter.render(rays)
         behind = surroundings(environment, rays) if plain == "environment" else background_colour(plain)
-        part(1.0)
         yield frame, image.over(behind), image.coverage
+    progress(len(frames), len(frames))
 
 
 def _write(
     pictures: Iterator[tuple[_Frame, Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]],
-    frames: Sequence[_Frame],
     options: dict[str, Any],
     *,
     several: bool,
@@ -189,5 +167,4 @@ def _write(
         else:
             write_png(path, np.clip(rgb, 0, 1))
         paths.append(path)
-    assert len(paths) == len(frames)
     return tuple(paths)
