@@ -1,4 +1,4 @@
-"""How near our path integrator comes to another program's pictures when nothing has to be learnt: the ceiling.
+"""How near the path integrator comes to another program's pictures with nothing left to learn: the ceiling.
 
 python benchmarks/material_ceiling.py SCENE            # SCENE/truth.json, its views in SCENE/test
 python benchmarks/material_ceiling.py SCENE --views 3 --samples 128 --relit
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from engine.colour import linear_to_srgb
-from engine.evaluate.truth import Truth, ViewTruth, read_truth
+from engine.evaluate.truth import ViewTruth, read_truth
 from engine.evaluate.truth_metrics import pooled_psnr
 from engine.gaussians.channels import unstacked
 from engine.gaussians.frames import quaternions
@@ -71,7 +71,7 @@ class Buffer:
     def within(
         self, y: Int64[np.ndarray, " n"], x: Int64[np.ndarray, " n"], offsets: Float64[np.ndarray, "n 2"]
     ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 8"], Float64[np.ndarray, "n 3"]]:
-        """Points, values and unit ray directions in pixels of the mask, beside their centres by ``offsets``."""
+        """Points, values and unit directions in pixels of the mask, beside their centres by ``offsets``."""
         step = np.where(offsets >= 0, 1, -1)
         height, width = self.mask.shape
         rows, columns = np.clip(y + step[:, 0], 0, height - 1), np.clip(x + step[:, 1], 0, width - 1)

@@ -260,7 +260,5 @@ def _unit(stored: Float64[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"
 
 def _steps(path: Path) -> float:
     """How many steps the file's integers have from 0 to 1; 1 for floats."""
-    source = oiio.ImageInput.open(str(path))
-    kind = str(source.spec().format)
-    source.close()
-    return {"uint8": 255.0, "uint16": 65535.0}.get(kind, 1.0)
+    kind = oiio.ImageBuf(str(path)).spec().format.basetype
+    return {oiio.UINT8: 255.0, oiio.UINT16: 65535.0}.get(kind, 1.0)

@@ -14,9 +14,11 @@ from jaxtyping import Float32, Float64, Int64
 
 from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.light.arrays import Paths
-from engine.light.kernels_path import FRONT
+from engine.light.kernels_film import add_up
+from engine.light.kernels_scatter import FRONT
 
 Tone = Literal["none", "reinhard", "filmic"]
+_ONE = np.empty(0, np.float32)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -54,18 +56,22 @@ class Film:
         """Add finished paths, equally many to each of ``pixels``, those of one pixel beside each other."""
         each = len(paths.keys) // len(pixels)
 
-        def total(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
-            return values.reshape(len(pixels), each, *values.shape[1:]).sum(axis=1, dtype=np.float64)
+        def add(
+            sums: Float64[np.ndarray, "..."],
+            values: Float32[np.ndarray, "..."],
+            factors: Float32[np.ndarray, " f"] = _ONE,
+        ) -> None:
+            add_up(values.reshape(len(values), -1), factors, each, pixels, sums.reshape(len(sums), -1))
 
-        self._layer[pixels] += total(paths.layer_srgb)
         front = (paths.marks & FRONT != 0).astype(np.float32)
         through = paths.transmittance * (1 - front)
-        self._light[pixels] += total(paths.radiance_linear * through[:, None])
-        self._front_light[pixels] += total(paths.radiance_linear * front[:, None])
-        self._front[pixels] += total(front)
-        self._shade[pixels] += total(paths.shade)
-        self._through[pixels] += total(through)
-        self._coverage[pixels] += total(paths.coverage)
+        add(self._layer, paths.layer_srgb)
+        add(self._light, paths.radiance_linear, through)
+        add(self._shade, paths.shade)
+        add(self._through, through)
+        add(self._coverage, paths.coverage)
+        add(self._front, front)
+        add(self._front_light, paths.radiance_linear, front)
         self._samples[pixels] += each
 
     def surface(self) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:

@@ -9,17 +9,19 @@ import math
 
 from numba import njit
 
+from engine.trace.kernels_native import lean
+
 POINT, SPOT, DIRECTIONAL, RECTANGLE, ENVIRONMENT = 0, 1, 2, 3, 4
 FAR = 1e30
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def luminance(red, green, blue):
     """Of linear Rec. 709 values."""
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _cone(lights, l, way_x, way_y, way_z):
     """How much of a spot's intensity goes a way (a unit vector from the light)."""
     axis = lights.axes[l]
@@ -29,7 +31,7 @@ def _cone(lights, l, way_x, way_y, way_z):
     return share * share
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def light_weight(lights, l, p_x, p_y, p_z):
     """About the irradiance that a light gives to a surface at p that faces it; 0 only where it gives none."""
     power = luminance(lights.rgb_linear[l, 0], lights.rgb_linear[l, 1], lights.rgb_linear[l, 2])
@@ -51,7 +53,7 @@ def light_weight(lights, l, p_x, p_y, p_z):
     return power / squared
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def pick_light(lights, p_x, p_y, p_z, u):
     """A light and the probability with which it is asked at p; -1 where none shines."""
     count = len(lights.kinds)
@@ -73,7 +75,7 @@ def pick_light(lights, p_x, p_y, p_z, u):
     return found, share
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def light_share(lights, wanted, p_x, p_y, p_z):
     """The probability with which :func:`pick_light` asks the light ``wanted`` at p."""
     total, own = 0.0, 0.0
@@ -85,7 +87,7 @@ def light_share(lights, wanted, p_x, p_y, p_z):
     return own / total if total > 0.0 else 0.0
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def sample_light(lights, l, p_x, p_y, p_z, u, v):
     """A way from p to a light: unit direction, distance, linear radiance, density over solid angle.
 
@@ -123,7 +125,7 @@ def sample_light(lights, l, p_x, p_y, p_z, u, v):
     return way_x, way_y, way_z, distance, rgb[0] * falloff, rgb[1] * falloff, rgb[2] * falloff, 0.0
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _environment_place(lights, d_x, d_y, d_z):
     """Where a direction lies in the map, (u, v) from 0 to 1, and the sine of its angle to up."""
     frame = lights.environment_frame
@@ -134,7 +136,7 @@ def _environment_place(lights, d_x, d_y, d_z):
     return 0.5 + math.atan2(right, forward) / (2.0 * math.pi), math.atan2(sine, up) / math.pi, sine
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def environment_radiance(lights, d_x, d_y, d_z):
     """Linear radiance from a direction: bilinear between the map's pixels, round at its sides."""
     radiance = lights.environment_linear
@@ -167,7 +169,7 @@ def environment_radiance(lights, d_x, d_y, d_z):
     return red, green, blue
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def environment_density(lights, d_x, d_y, d_z):
     """Density over solid angle with which :func:`sample_environment` gives a direction."""
     shares = lights.environment_shares
@@ -177,7 +179,7 @@ def environment_density(lights, d_x, d_y, d_z):
     return shares[j, i] * width * height / (2.0 * math.pi * math.pi * max(sine, 1e-9))
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _step(sums, u):
     """The step of a cumulative sum from 0 to 1 in which u lies, and how far in."""
     low, high = 0, len(sums) - 1
@@ -191,7 +193,7 @@ def _step(sums, u):
     return low, min(max((u - sums[low]) / span, 0.0), 1.0 - 1e-9) if span > 0.0 else 0.5
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def sample_environment(lights, u, v):
     """A direction, likelier where the map is brighter, and its density over solid angle."""
     height, width = lights.environment_shares.shape

@@ -2,13 +2,13 @@
 
 import math
 
-from numba import njit
+from engine.trace.kernels_native import lean
 
 DIFFUSE, MIRROR, GLASS, OPAQUE, LIGHT = 0, 1, 2, 3, 4
 OFFSET = 5e-6
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def hit_point(corners, a, b, c):
     """The point with weights a, b, c of the corners."""
     return (
@@ -18,14 +18,14 @@ def hit_point(corners, a, b, c):
     )
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def unit(x, y, z):
     """The vector with length 1."""
     length = max(math.sqrt(x * x + y * y + z * z), 1e-30)
     return x / length, y / length, z / length
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def face_normal(corners):
     """Unit normal of a triangle, on the side from which its corners run anticlockwise."""
     u_x, u_y, u_z = (
@@ -41,14 +41,14 @@ def face_normal(corners):
     return unit(u_y * v_z - u_z * v_y, u_z * v_x - u_x * v_z, u_x * v_y - u_y * v_x)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def lifted(p_x, p_y, p_z, n_x, n_y, n_z):
     """The point a little off a surface along n, so that rounding does not put it behind the surface."""
     step = OFFSET * max(abs(p_x), abs(p_y), abs(p_z), 1e-3)
     return p_x + step * n_x, p_y + step * n_y, p_z + step * n_z
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def texture_value(materials, texture, u, v):
     """Bilinear linear value of a texture that repeats."""
     first, height, width = (
@@ -72,7 +72,7 @@ def texture_value(materials, texture, u, v):
     )
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def material_at(materials, m, u, v):
     """Base colour, metallic and roughness of material ``m`` at texture coordinates."""
     red, green, blue = (
@@ -92,7 +92,7 @@ def material_at(materials, m, u, v):
     return red, green, blue, metallic, roughness
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def shading_normal(normals, a, b, c, n_x, n_y, n_z, d_x, d_y, d_z):
     """The interpolated normal on the side of n; n itself where the viewer would see it from behind."""
     s_x, s_y, s_z = hit_point(normals, a, b, c)
@@ -104,7 +104,7 @@ def shading_normal(normals, a, b, c, n_x, n_y, n_z, d_x, d_y, d_z):
     return s_x, s_y, s_z
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def reflected(d_x, d_y, d_z, n_x, n_y, n_z):
     """The direction d after a mirror with the normal n."""
     twice = 2.0 * (d_x * n_x + d_y * n_y + d_z * n_z)

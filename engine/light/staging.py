@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from engine.colour import srgb_to_linear
 from engine.errors import ConfigError, DatasetError
-from engine.light.arrays import Materials, Surfaces
+from engine.light.arrays import Materials, MeshQueries, Surfaces
 from engine.light.bsdf import albedo_table
 from engine.light.environment import EnvironmentMap, environment_frame, read_environment
 from engine.light.kernels_bsdf import BURLEY, COUPLED
@@ -57,6 +57,18 @@ class LitMeshes:
     obstacles: TriangleScene | None = None
     glass: TriangleScene | None = None
     glass_faces: Int64[np.ndarray, " g"] | None = None
+
+    @property
+    def queries(self) -> MeshQueries:
+        """What kernels ask Embree; good while this lives."""
+        if self.obstacles is None or self.glass is None or self.glass_faces is None:
+            every = self.triangles.any_query
+            no_glass = self.triangles.closest_query._replace(scene=0)
+            return MeshQueries(self.triangles.closest_query, every, every, no_glass, np.empty(0, np.int64))
+        return MeshQueries(
+            self.triangles.closest_query, self.triangles.any_query, self.obstacles.any_query,
+            self.glass.closest_query, self.glass_faces,
+        )  # fmt: skip
 
     def lit_by(self, lights: LightArrays) -> "LitMeshes":
         """The same meshes in other light, their environment unseen by the camera."""

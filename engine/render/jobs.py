@@ -1,6 +1,6 @@
-"""Series of images of a scene: its photographs' views, turntables and paths, to image files or a video."""
+"""What is rendered of a scene: its photographs' views, turntables and paths, each image a shot."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,12 +14,9 @@ from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.images import exr_layers, write_exr, write_png
 from engine.render.names import render_names
 from engine.render.paths import Turntable, fit_turntable
-from engine.render.renderer import RenderedImage, render_rays
-from engine.render.video import VideoWriter
+from engine.render.renderer import render_rays
 from engine.scene import Camera, PosedView, Viewpoints
 from engine.trace.protocol import Tracer
-
-Progress = Callable[[int, int], None]
 
 DEFAULT_FOV_Y_DEGREES = 50.0
 _FOV_RANGE_DEGREES = (20.0, 90.0)
@@ -39,6 +36,13 @@ class Shot:
 
     name: str
     rays: Callable[[], ImageRays]
+
+
+Paint = Callable[[Shot, Path, Callable[[float], None]], None]
+"""Renders a shot and writes it to a file, whose suffix says the format; told the share that is done.
+
+It raises :class:`engine.errors.OutputError` where the file cannot be written.
+"""
 
 
 def view_shots(
@@ -127,33 +131,19 @@ def gaussian_turntable(
     return Turntable(centre, up, float(distance * np.cos(elevation)), float(distance * np.sin(elevation)))
 
 
-def render_images(
-    tracer: Tracer,
-    shots: Sequence[Shot],
-    file_of: Callable[[int, Shot], Path],
-    background: Float32[np.ndarray, "3"],
-    progress: Progress = lambda _done, _total: None,
-) -> tuple[Path, ...]:
-    """Render each shot to a file of its own.
+def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"]) -> Paint:
+    """What renders a shot of a scene to a file.
+
+    ``.exr`` gets linear R, G, B, alpha A, the expected distance Z (0 where nothing is) and the world normal
+    N.x, N.y, N.z; anything else gets 8-bit display colours.
 
     Args:
         tracer: with the scene built.
-        shots: what to render.
-        file_of: the file of a shot, given its number and itself. ``.exr`` gets linear R, G, B, alpha A, the
-            expected distance Z (0 where nothing is) and the world normal N.x, N.y, N.z; anything else gets
-            8-bit display colours.
         background: display colour behind the scene.
-        progress: told (images done, images in all).
-
-    Returns:
-        The files.
-
-    Raises:
-        OutputError: a file cannot be written.
     """
-    paths = []
-    for number, shot, image in _rendered(tracer, shots, background, progress):
-        path = file_of(number, shot)
+
+    def paint(shot: Shot, path: Path, _part: Callable[[float], None]) -> None:
+        image = render_rays(tracer, shot.rays(), background)
         if path.suffix.lower() == ".exr":
             layers = exr_layers(
                 image.rgb_srgb, alpha=image.alpha, depth=image.depth, normals_world=image.normal_world
@@ -161,36 +151,8 @@ def render_images(
             write_exr(path, layers)
         else:
             write_png(path, image.rgb_srgb)
-        paths.append(path)
-    return tuple(paths)
 
-
-def render_video(
-    tracer: Tracer,
-    cameras: Sequence[RenderCamera],
-    path: Path,
-    fps: float,
-    background: Float32[np.ndarray, "3"],
-    progress: Progress = lambda _done, _total: None,
-) -> None:
-    """Render cameras of one image size as the frames of a video.
-
-    Raises:
-        OutputError: the video cannot be written.
-    """
-    first = cameras[0]
-    with VideoWriter(path, fps, first.width_px, first.height_px) as video:
-        for _, _, image in _rendered(tracer, camera_shots(cameras), background, progress):
-            video.write(image.rgb_srgb)
-
-
-def _rendered(
-    tracer: Tracer, shots: Sequence[Shot], background: Float32[np.ndarray, "3"], progress: Progress
-) -> Iterator[tuple[int, Shot, RenderedImage]]:
-    progress(0, len(shots))
-    for number, shot in enumerate(shots):
-        yield number, shot, render_rays(tracer, shot.rays(), background)
-        progress(number + 1, len(shots))
+    return paint
 
 
 def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from web_bench import ROOT, Browse, Service, StartService
 
+from engine.light.stage_file import parse_stage
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.train.config import preset
 
@@ -149,6 +150,32 @@ def test_the_result(flow: Flow, watched: dict[str, Any], browse: Browse) -> None
     assert "report" in found["report"]
     assert found["reportRuns"] and found["reportOrigin"] == "null"  # its script runs, as nobody
     assert found["viewerReady"] and found["complaints"] == []
+
+
+def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path) -> None:
+    mesh = tmp_path / "a thing.obj"
+    mesh.write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nv 0 0 2\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    found = browse("light", flow.service.url, job=flow.job, mesh=str(mesh))
+    before, stage = (
+        parse_stage(found[name].replace("a_thing.obj", "x.obj"), name) for name in ("first", "placed")
+    )
+    assert before.meshes[0].shape == "sphere" and before.lights[0].kind == "directional"
+    thing, floor = stage.meshes
+    assert thing.file == "x.obj" and floor.shape == "plane" and stage.lights[0].kind == "rectangle"
+    assert thing.on is not None and thing.on.pixel == pytest.approx((0.25 * 96, 0.745 * 72), abs=1)
+    assert found["refused"].startswith("'sky.hdr' is not an image") and found["refused"].count("sky.hdr") == 1
+    assert found["preview"] == [96, 72] and found["took"].startswith("The preview took ")
+    assert len(found["pictures"]) == 2 and set(found["pictures"]) == {96}
+    job = flow.service.ask("GET", f"/v1/jobs/{found['job']}")
+    assert (job["kind"], job["source_id"], job["state"]) == ("render", flow.job, "succeeded")
+    assert len(job["options"]["stage"]["meshes"]) == 2
+    files = flow.service.ask("GET", f"/v1/datasets/{job['files_id']}/files")["files"]
+    assert [file["path"] for file in files] == ["a_thing.obj"]
+    assert found["saved"] == {"name": "stage.toml", "same": True}
+    assert found["left"] == 0 and found["nameless"] == []
+    assert [
+        text for text in found["complaints"] if "422" not in text
+    ] == []  # one file is meant to be refused
 
 
 def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:

@@ -1,7 +1,7 @@
 """Scenes with materials in other light, as the options of ``octasplat relight`` say."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,17 @@ from engine.gaussians.materials import require_materials
 from engine.light.environment import EnvironmentMap, environment_frame, read_environment
 from engine.light.relighting import PathRelighter, Relighter, surroundings
 from engine.light.stage import Integrator
+from engine.render.identity import identity_of
 from engine.render.images import write_exr, write_png
 from engine.render.jobs import Shot, camera_shots, view_shots
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
-from engine.render.video import VideoWriter
 from engine.run_folder import SCENE, is_run
 from engine.scene import load_scene
-from engine.stages import counted_stage
 from workers.rendering.views import (
     DEFAULT_FPS,
-    FileNames,
+    Keeping,
+    Series,
     Source,
     axis_named,
     read_source,
@@ -33,18 +33,20 @@ from workers.rendering.views import (
     turntable_of,
 )
 
-
-@dataclass(frozen=True)
-class _Frame:
-    """A shot in the light of a map, turned."""
-
-    shot: Shot
-    environment: str
-    rotation_degrees: float
+_FRESH = Keeping()
+_OF_THE_PICTURES = (
+    "by", "samples", "depth", "rotate", "spin", "views", "turntable", "frames", "seconds", "fps", "width",
+    "height", "fov", "up", "exr", "background", "max_side",
+)  # fmt: skip
+"""Options that decide what the pictures show."""
 
 
 def relight_files(
-    mode: str, options: dict[str, Any], listener: Listener, say: Callable[[str], None]
+    mode: str,
+    options: dict[str, Any],
+    listener: Listener,
+    say: Callable[[str], None],
+    keeping: Keeping = _FRESH,
 ) -> tuple[Path, ...]:
     """Relight as the options of the command say.
 
@@ -53,36 +55,40 @@ def relight_files(
         options: the options of the command by parameter name.
         listener: hears the progress.
         say: told in a sentence what reading a scene has lost.
+        keeping: how it goes on after a stop.
 
     Returns:
         The files written.
 
     Raises:
-        ConfigError: the scene has no materials, or an environment cannot be used.
+        ConfigError: the scene has no materials, or an environment cannot be used; or there are images of
+            another render where this one is to go on.
         OctasplatError: the source cannot be read or the output not written.
     """
     environments = _environments(options["environment"])
     source = read_source(options, say)
-    is_of_run = is_run(options["source"])
-    require_materials(source.gaussians, options["source"] / SCENE if is_of_run else options["source"])
+    ply = options["source"] / SCENE if is_run(options["source"]) else options["source"]
+    require_materials(source.gaussians, ply)
     up = axis_named(options["up"] or "-y")
     shots, fps = _shots(mode, options, source)
-    frames = [
-        _Frame(shot, name, options["rotate"] + (360.0 * k / len(shots) if options["spin"] else 0.0))
-        for name in environments
-        for k, shot in enumerate(shots)
-    ]
-    relighter = _relighter(options, source)
-    output: Path = options["output"]
-    with counted_stage("render", listener) as progress:
-        pictures = _pictures(relighter, frames, environments, up, options, source, progress)
-        if output.suffix.lower() == ".mp4":
-            first = shots[0].rays()
-            with VideoWriter(output, fps, first.width_px, first.height_px) as video:
-                for _, rgb, _ in pictures:
-                    video.write(np.clip(rgb, 0, 1))
-            return (output,)
-        return _write(pictures, options, several=len(environments) > 1)
+    paint = _Paint(
+        _relighter(options, source),
+        environments,
+        up,
+        options["background"] or source.background,
+        _frames(list(environments), shots, options),
+    )
+    series = Series(options["output"], tuple(paint.frames), fps, options["exr"], keeping)
+    # Where the cameras are is said by the rays of the first and last of them.
+    ends = [shots[k].rays() for k in (0, -1)]
+    kept = series.kept(
+        identity_of(
+            mode, source.gaussians, source.settings, list(environments), list(environments.values()), up,
+            len(shots), [(e.origin_world, e.directions_world) for e in ends],
+            {name: options[name] for name in _OF_THE_PICTURES},
+        )
+    )  # fmt: skip
+    return series.render(paint, kept, listener)
 
 
 def _environments(paths: Sequence[Path]) -> dict[str, Float32[np.ndarray, "h w 3"]]:
@@ -106,7 +112,7 @@ def _shots(mode: str, options: dict[str, Any], source: Source) -> tuple[tuple[Sh
         )
         return view_shots(others, np.arange(len(others.views)), source.near_world), DEFAULT_FPS
     if mode == "views":
-        return run_shots(source, options["views"]), DEFAULT_FPS
+        return run_shots(source, options), DEFAULT_FPS
     fps = options["fps"] or DEFAULT_FPS
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
@@ -123,48 +129,50 @@ def _relighter(options: dict[str, Any], source: Source) -> Relighter:
     return PathRelighter(source.gaussians, source.settings, integrator, threads=options["threads"])
 
 
-def _pictures(
-    relighter: Relighter,
-    frames: Sequence[_Frame],
-    environments: dict[str, Float32[np.ndarray, "h w 3"]],
-    up_world: Float64[np.ndarray, "3"],
-    options: dict[str, Any],
-    source: Source,
-    progress: Callable[[int, int], None],
-) -> Iterator[tuple[_Frame, Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]]:
-    """Each frame with its display values, not cut at 1, and its coverage."""
-    plain = options["background"] or source.background
-    light: tuple[str, float] | None = None
-    for number, frame in enumerate(frames):
-        if light != (frame.environment, frame.rotation_degrees):
-            light = (frame.environment, frame.rotation_degrees)
-            environment = EnvironmentMap(
-                environments[frame.environment], environment_frame(up_world, frame.rotation_degrees)
-            )
-            relighter.put(environment)
-        progress(number, len(frames))
-        rays = frame.shot.rays()
-        image = relighter.render(rays)
-        behind = surroundings(environment, rays) if plain == "environment" else background_colour(plain)
-        yield frame, image.over(behind), image.coverage
-    progress(len(frames), len(frames))
+def _frames(
+    environments: Sequence[str], shots: Sequence[Shot], options: dict[str, Any]
+) -> dict[Shot, tuple[str, float]]:
+    """All shots under all maps, each with its map and how far that is turned, degrees."""
+    several = len(environments) > 1
+    return {
+        Shot(f"{name}/{shot.name}" if several else shot.name, shot.rays): (
+            name,
+            options["rotate"] + (360.0 * k / len(shots) if options["spin"] else 0.0),
+        )
+        for name in environments
+        for k, shot in enumerate(shots)
+    }
 
 
-def _write(
-    pictures: Iterator[tuple[_Frame, Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]],
-    options: dict[str, Any],
-    *,
-    several: bool,
-) -> tuple[Path, ...]:
-    names = FileNames(options["output"], options["exr"])
-    paths = []
-    for number, (frame, rgb, coverage) in enumerate(pictures):
-        shot = Shot(f"{frame.environment}/{frame.shot.name}", frame.shot.rays) if several else frame.shot
-        path = names(number, shot)
+@dataclass
+class _Paint:
+    """Renders a shot in the light that is its, and writes it."""
+
+    relighter: Relighter
+    environments: dict[str, Float32[np.ndarray, "h w 3"]]
+    up_world: Float64[np.ndarray, "3"]
+    background: str
+    frames: dict[Shot, tuple[str, float]]
+    _put: tuple[str, float] | None = None
+    _map: EnvironmentMap | None = field(default=None, repr=False)
+
+    def __call__(self, shot: Shot, path: Path, part: Callable[[float], None]) -> None:
+        """``.exr`` gets linear R, G, B and alpha A, anything else 8-bit display values."""
+        environment = self._light(*self.frames[shot])
+        rays = shot.rays()
+        image = self.relighter.render(rays, part)
+        is_map = self.background == "environment"
+        rgb = image.over(surroundings(environment, rays) if is_map else background_colour(self.background))
         if path.suffix.lower() == ".exr":
             linear = srgb_to_linear(rgb)
-            write_exr(path, {**{name: linear[..., k] for k, name in enumerate("RGB")}, "A": coverage})
+            write_exr(path, {**{name: linear[..., k] for k, name in enumerate("RGB")}, "A": image.coverage})
         else:
             write_png(path, np.clip(rgb, 0, 1))
-        paths.append(path)
-    return tuple(paths)
+
+    def _light(self, name: str, rotation_degrees: float) -> EnvironmentMap:
+        if self._map is None or self._put != (name, rotation_degrees):
+            frame = environment_frame(self.up_world, rotation_degrees)
+            self._map = EnvironmentMap(self.environments[name], frame)
+            self._put = (name, rotation_degrees)
+            self.relighter.put(self._map)
+        return self._map

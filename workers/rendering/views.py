@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,33 +10,37 @@ import numpy as np
 from jaxtyping import Float64
 
 from engine.config import read_config
-from engine.errors import OutputError
+from engine.errors import ConfigError, OutputError
 from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
-from engine.light.stage_file import read_stage
+from engine.light.stage import Stage
+from engine.light.stage_file import named_files
 from engine.render.cameras import RenderCamera
+from engine.render.identity import identity_of
 from engine.render.jobs import (
     DEFAULT_FOV_Y_DEGREES,
+    Paint,
     Shot,
     camera_shots,
     gaussian_turntable,
-    render_images,
-    render_video,
     scene_fov_y_degrees,
+    scene_paint,
     scene_turntable,
     turntable_cameras,
     view_shots,
 )
+from engine.render.kept import KeptImages
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
+from engine.render.series import Kept, render_film, render_series
 from engine.run_folder import CONFIG, SCENE, is_run, run_viewpoints
 from engine.scene.model import Viewpoints
 from engine.scene.views_file import SplitViewpoints
 from engine.stages import counted_stage
 from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
-from workers.rendering.stages import StagePlace, render_stage
+from workers.rendering.stages import StagePlace, painted_stage, preview_stage
 from workers.telling.losses import open_scene
 
 DEFAULT_FPS = 30.0
@@ -63,8 +68,42 @@ class Source:
         return gaussian_turntable(self.gaussians).radius
 
 
+@dataclass(frozen=True)
+class SetStage:
+    """A stage, and the folder that the names of its files are relative to."""
+
+    stage: Stage
+    folder: Path
+
+    def identity(self) -> tuple[object, ...]:
+        """What of it decides how a picture looks: itself and the content of its files."""
+        return self.stage, [self.folder / name for _, name in named_files(self.stage)]
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Where finished images wait for the others, and whether earlier ones are gone on with.
+
+    Attributes:
+        resume: go on with the images of a render that was stopped.
+        or_anew: where those are of another render, forget them rather than refuse.
+        frames: folder of a film's frames; None puts them beside the film.
+        on_kept: told how many images are safe on disk.
+    """
+
+    resume: bool = False
+    or_anew: bool = False
+    frames: Path | None = None
+    on_kept: Kept = lambda _count: None
+
+
 def render_files(
-    mode: str, options: dict[str, Any], listener: Listener, say: Callable[[str], None]
+    mode: str,
+    options: dict[str, Any],
+    listener: Listener,
+    say: Callable[[str], None],
+    stage: SetStage | None = None,
+    keeping: Keeping = Keeping(),
 ) -> tuple[Path, ...]:
     """Render as the options of the command say.
 
@@ -73,15 +112,17 @@ def render_files(
         options: the options of the command by parameter name.
         listener: hears the progress.
         say: told in a sentence what reading a scene has lost.
+        stage: what the scene is set on.
+        keeping: how a render that is stopped goes on.
 
     Returns:
         The files written.
 
     Raises:
-        OctasplatError: the source cannot be read or the output not written.
+        OctasplatError: the source cannot be read, or the output not written; or there are images of another
+            render where this one is to go on.
     """
     output: Path = options["output"]
-    stage = read_stage(options["stage"]) if options.get("stage") else None
     cameras, fps = None, options["fps"] or DEFAULT_FPS
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
@@ -92,24 +133,58 @@ def render_files(
     if cameras is not None:
         cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
     background = background_colour(options["background"] or source.background)
+    shots = camera_shots(cameras) if cameras is not None else run_shots(source, options)
+    series = Series(output, shots, fps, options["exr"], keeping)
+    what = source.gaussians, source.settings, background, cameras, stage and stage.identity()
+    of_views = None if cameras is not None else (source.viewpoints, source.near_world)
     if stage is not None:
-        shots = camera_shots(cameras) if cameras is not None else run_shots(source, options["views"])
         place = StagePlace(
-            source.gaussians, source.settings, _full_size(options), options["stage"].parent,
+            source.gaussians, source.settings, _full_size(options), stage.folder,
             lambda path: open_scene(path, say), background, options["threads"],
         )  # fmt: skip
-        film = fps if output.suffix.lower() == ".mp4" else None
-        names = None if options.get("preview") else FileNames(output, options["exr"])
-        return render_stage(stage, place, shots, output, names, film, listener)
+        set_up = partial(painted_stage, stage.stage, place, shots)
+        if options.get("preview"):
+            return preview_stage(set_up(), shots[0], output, listener)
+        kept = series.kept(identity_of(*what, of_views, place.photographs))
+        return series.render(set_up().paint, kept, listener)
+    kept = series.kept(identity_of(*what, of_views))
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
-    background = background_colour(options["background"] or source.background)
-    with counted_stage("render", listener) as progress:
-        if cameras is not None and output.suffix.lower() == ".mp4":
-            render_video(tracer, cameras, output, fps, background, progress)
-            return (output,)
-        shots = camera_shots(cameras) if cameras is not None else run_shots(source, options["views"])
-        return render_images(tracer, shots, FileNames(output, options["exr"]), background, progress)
+    return series.render(scene_paint(tracer, background), kept, listener)
+
+
+@dataclass(frozen=True)
+class Series:
+    """Images or a film to write."""
+
+    output: Path
+    shots: tuple[Shot, ...]
+    fps: float
+    exr: bool
+    keeping: Keeping
+
+    @property
+    def is_film(self) -> bool:
+        """Whether it is a film."""
+        return self.output.suffix.lower() == ".mp4"
+
+    def kept(self, identity: str) -> KeptImages:
+        """What there is already of images that look as ``identity`` says."""
+        keeping, output = self.keeping, self.output
+        folder = output.parent if output.suffix.lower() in (".png", ".exr") else output
+        if self.is_film:
+            folder = keeping.frames or output.with_name(f"{output.name}.frames")
+        return KeptImages(folder, identity, resume=keeping.resume, or_anew=keeping.or_anew)
+
+    def render(self, paint: Paint, kept: KeptImages, listener: Listener) -> tuple[Path, ...]:
+        """Do so; returns the files."""
+        on_kept = self.keeping.on_kept
+        with counted_stage("render", listener) as count:
+            if self.is_film:
+                render_film(self.shots, self.output, self.fps, paint, kept, count, on_kept)
+                return (self.output,)
+            names = FileNames(self.output, self.exr)
+            return render_series(self.shots, names, paint, kept, count, on_kept)
 
 
 @dataclass(frozen=True)
@@ -210,17 +285,24 @@ def axis_named(name: str) -> Float64[np.ndarray, "3"]:
     return -axis if name.startswith("-") else axis
 
 
-def run_shots(source: Source, which: str | None) -> tuple[Shot, ...]:
-    """The views of a run's photographs: ``held-out`` (also where nothing is said), ``train`` or ``all``.
+def run_shots(source: Source, options: dict[str, Any]) -> tuple[Shot, ...]:
+    """The views of a run's photographs: those of the option ``photographs``, or as ``views`` says.
 
     Raises:
-        OutputError: there are none.
+        ConfigError: there is no such photograph.
+        OutputError: there are no such views.
     """
     viewpoints = source.viewpoints
     assert viewpoints is not None
+    names = {view.name: number for number, view in enumerate(viewpoints.views)}
+    if asked := options.get("photographs"):
+        missing = [name for name in asked if name not in names]
+        if missing:
+            raise ConfigError(f"{missing[0]}: the run has no photograph of this name.")
+        return view_shots(viewpoints, np.array([names[name] for name in asked]), source.near_world)
     every = np.arange(len(viewpoints.views))
     chosen = {"train": viewpoints.train_indices, "all": every}
-    indices = chosen.get(which or "held-out", viewpoints.test_indices)
+    indices = chosen.get(options["views"] or "held-out", viewpoints.test_indices)
     if len(indices) == 0:
         raise OutputError("The run held out no views; ask for --views train or all.")
     return view_shots(viewpoints, indices, source.near_world)

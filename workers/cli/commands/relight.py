@@ -80,6 +80,7 @@ from workers.cli.options import quiet_option, threads_option
     type=click.Path(path_type=Path),
     help="Take the cameras of the photographs in this folder.  [default: those the run keeps]",
 )
+@click.option("--resume", is_flag=True, help="Go on where this was stopped, if it was.")
 @threads_option
 @quiet_option
 def relight(**options: Any) -> None:
@@ -103,13 +104,22 @@ def relight(**options: Any) -> None:
         raise click.UsageError(f"--{mode} gives images; name a folder.")
     check_output(options["output"], options["exr"])
 
+    from engine.errors import Cancelled
+    from engine.stages import stopping
     from workers.cli.progress import show_progress
     from workers.cli.scene_files import speaker_of_losses
-    from workers.cli.signals import orderly_termination
+    from workers.cli.signals import Stopped, stop_on_signals
     from workers.rendering.relighting import relight_files
+    from workers.rendering.views import Keeping
 
     quiet = options["quiet"]
-    with orderly_termination(), show_progress(quiet=quiet) as listener:
-        files = relight_files(mode, options, listener, speaker_of_losses(quiet))
+    with stop_on_signals() as should_stop:
+        try:
+            with show_progress(quiet=quiet, should_stop=should_stop) as listener:
+                tell = stopping(listener, should_stop)
+                keeping = Keeping(resume=options["resume"])
+                files = relight_files(mode, options, tell, speaker_of_losses(quiet), keeping)
+        except Cancelled as error:
+            raise Stopped(str(error), should_stop.exit_code) from None
     if not quiet:
         click.echo(f"Wrote {files[0]}" + (f" and {len(files) - 1} more." if len(files) > 1 else "."))

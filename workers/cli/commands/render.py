@@ -57,13 +57,15 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
     metavar="STAGE.toml",
     help="Render with the meshes, lights and materials of a stage, see docs/light.md.",
 )
+@click.option("--resume", is_flag=True, help="Go on with a render that was stopped, if there is one.")
 @click.option("--preview", is_flag=True, help="Stage: the first image only, -o one file, finer and finer.")
 @threads_option
 @quiet_option
 def render(**options: Any) -> None:
     """Render new views of IN, the folder of a run or a file of Gaussians in any splat format.
 
-    Without --views, --turntable or --path: the held-out views of a run, a turntable of a file.
+    Without --views, --turntable or --path: the held-out views of a run, a turntable of a file. Ctrl-C stops
+    after the image under way has come to a safe point; the same command with --resume goes on.
     """
     modes = [name for name in ("views", "turntable", "camera_path") if options[name]]
     if len(modes) > 1:
@@ -87,14 +89,25 @@ def render(**options: Any) -> None:
     else:
         check_output(options["output"], options["exr"])
 
+    from engine.errors import Cancelled
+    from engine.light.stage_file import read_stage
+    from engine.stages import stopping
     from workers.cli.progress import show_progress
     from workers.cli.scene_files import speaker_of_losses
-    from workers.cli.signals import orderly_termination
-    from workers.rendering.views import render_files
+    from workers.cli.signals import Stopped, stop_on_signals
+    from workers.rendering.views import Keeping, SetStage, render_files
 
-    quiet = options["quiet"]
-    with orderly_termination(), show_progress(quiet=quiet) as listener:
-        files = render_files(mode, options, listener, speaker_of_losses(quiet))
+    path, quiet = options["stage"], options["quiet"]
+    say = speaker_of_losses(quiet)
+    with stop_on_signals() as should_stop:
+        try:
+            with show_progress(quiet=quiet, should_stop=should_stop) as listener:
+                stage = None if path is None else SetStage(read_stage(path), path.parent)
+                told = "Stopped; the preview is as fine as it was." if options["preview"] else None
+                tell = stopping(listener, should_stop, told)
+                files = render_files(mode, options, tell, say, stage, Keeping(resume=options["resume"]))
+        except Cancelled as error:
+            raise Stopped(str(error), should_stop.exit_code) from None
     if not quiet:
         click.echo(f"Wrote {files[0]}" + (f" and {len(files) - 1} more." if len(files) > 1 else "."))
 
