@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, Int64
 from engine.gaussians.model import FlatGaussians
 from engine.rays import ImageRays
 from engine.render.cameras import RenderCamera, focal_from_fov
+from engine.render.framing import fitting_distance, seen_bounds
 from engine.render.images import exr_layers, write_exr, write_png
 from engine.render.names import render_names
 from engine.render.paths import Turntable, fit_turntable
@@ -21,8 +22,7 @@ from engine.trace.protocol import Tracer
 DEFAULT_FOV_Y_DEGREES = 50.0
 _FOV_RANGE_DEGREES = (20.0, 90.0)
 _ROWS_OF_RAYS = 1 << 18
-_SPREAD_QUANTILE = 0.8
-_ELEVATION_DEGREES = 20.0
+ELEVATION_DEGREES = 20.0
 
 
 @dataclass(frozen=True)
@@ -109,29 +109,27 @@ def gaussian_turntable(
     *,
     up_world: Float64[np.ndarray, "3"] | None = None,
     fov_y_degrees: float = DEFAULT_FOV_Y_DEGREES,
+    aspect: float = 1.0,
+    elevation_degrees: float = ELEVATION_DEGREES,
 ) -> Turntable:
-    """A turntable for a scene of which nothing but its Gaussians is known.
-
-    The centre is their median weighted by opacity; the camera looks down on it by 20 degrees from where four
-    fifths of all opacity fit into the image.
+    """A turntable for a scene of which nothing but its Gaussians is known: all that is seen of it fits.
 
     Args:
         gaussians: the scene.
         up_world: up; by default -y, as in most scenes that COLMAP made.
         fov_y_degrees: of the camera.
+        aspect: width over height of the images.
+        elevation_degrees: of the camera above the middle.
     """
-    up = np.array([0.0, -1.0, 0.0]) if up_world is None else up_world / np.linalg.norm(up_world)
-    points, weights = gaussians.means_world.astype(np.float64), gaussians.opacities
-    centre = np.array([_weighted_quantile(points[:, axis], weights, 0.5) for axis in range(3)])
-    spread = _weighted_quantile(np.linalg.norm(points - centre, axis=1), weights, _SPREAD_QUANTILE)
-    if not spread > 0:  # a single Gaussian, or all in one place
-        spread = float(np.median(gaussians.scales.max(axis=1)))
-    distance = spread / np.sin(np.radians(fov_y_degrees) / 2)
-    elevation = np.radians(_ELEVATION_DEGREES)
-    return Turntable(centre, up, float(distance * np.cos(elevation)), float(distance * np.sin(elevation)))
+    up = np.array([0.0, -1.0, 0.0]) if up_world is None else up_world
+    bounds = seen_bounds(gaussians, up)
+    distance = fitting_distance(bounds, elevation_degrees, fov_y_degrees, aspect)
+    elevation = np.radians(elevation_degrees)
+    radius, height = distance * np.cos(elevation), distance * np.sin(elevation)
+    return Turntable(bounds.centre_world, bounds.up_world, float(radius), float(height))
 
 
-def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"]) -> Paint:
+def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"], *, transparent: bool = False) -> Paint:
     """What renders a shot of a scene to a file.
 
     ``.exr`` gets linear R, G, B, alpha A, the expected distance Z (0 where nothing is) and the world normal
@@ -140,6 +138,7 @@ def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"]) -> Paint:
     Args:
         tracer: with the scene built.
         background: display colour behind the scene.
+        transparent: PNG get straight colours and alpha; the background should be black.
     """
 
     def paint(shot: Shot, path: Path, _part: Callable[[float], None]) -> None:
@@ -149,6 +148,9 @@ def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"]) -> Paint:
                 image.rgb_srgb, alpha=image.alpha, depth=image.depth, normals_world=image.normal_world
             )
             write_exr(path, layers)
+        elif transparent:
+            straight = image.rgb_srgb / np.maximum(image.alpha, 1e-6)[..., None]
+            write_png(path, np.clip(straight, 0, 1), image.alpha)
         else:
             write_png(path, image.rgb_srgb)
 
@@ -167,11 +169,3 @@ def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:
         world = directions @ view.rotation_cam_from_world
         directions_world[top : top + rows] = world.reshape(-1, width, 3)
     return ImageRays.of(view.origin_world, directions_world, near_world)
-
-
-def _weighted_quantile(
-    values: Float64[np.ndarray, " n"], weights: Float32[np.ndarray, " n"], quantile: float
-) -> float:
-    order = np.argsort(values)
-    sums = np.cumsum(weights[order], dtype=np.float64)
-    return float(values[order[np.searchsorted(sums, quantile * sums[-1])]])

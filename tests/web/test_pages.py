@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from web_bench import ROOT, Browse, Service, StartService
 
 from engine.light.stage_file import parse_stage
+from engine.render.path_file import read_camera_path
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.train.config import preset
 
@@ -178,13 +180,25 @@ def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_
     ] == []  # one file is meant to be refused
 
 
-def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
+def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path) -> None:
     found = browse("keyboard", flow.service.url, job=flow.job)
     assert found["first"] == "Skip to the content"
     assert found["keepsFocus"]
     assert all(found["changes"].values()), found["changes"]
     assert found["place"].startswith("view_")
     assert found["flies"] == "true" and found["back"]
+    (tmp_path / "path.json").write_text(found["path"])
+    cameras = read_camera_path(tmp_path / "path.json").cameras
+    assert len(cameras) == 60 and cameras[0].height_px == 720
+    views = {
+        view["name"]: view for view in flow.service.ask("GET", f"/jobs/{flow.job}/cameras.json")["views"]
+    }
+    # The first key is where the photograph was taken from that the place names.
+    np.testing.assert_allclose(
+        cameras[0].centre_world, views[found["place"].split(" ")[0]]["position"], atol=1e-4
+    )
+    forward = cameras[0].rotation_cam_from_world[2]
+    np.testing.assert_allclose(forward, views[found["place"].split(" ")[0]]["forward"], atol=1e-4)
     assert found["sorted"] == "descending"
     assert found["cut"] == "0%"
     assert found["chooser"] is True

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.colour import srgb_to_linear
+from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.errors import ConfigError
 from engine.events import Listener
 from engine.gaussians.materials import require_materials
@@ -22,21 +22,13 @@ from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
 from engine.run_folder import SCENE, is_run
 from engine.scene import load_scene
-from workers.rendering.views import (
-    DEFAULT_FPS,
-    Keeping,
-    Series,
-    Source,
-    axis_named,
-    read_source,
-    run_shots,
-    turntable_of,
-)
+from workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
+from workers.rendering.views import Keeping, Series, Source, check_one_file, read_source, run_shots
 
 _FRESH = Keeping()
 _OF_THE_PICTURES = (
-    "by", "samples", "depth", "rotate", "spin", "views", "turntable", "frames", "seconds", "fps", "width",
-    "height", "fov", "up", "exr", "background", "max_side",
+    "by", "samples", "depth", "rotate", "spin", "views", "camera", "look_at", "distance", "elevation",
+    "frames", "seconds", "fps", "width", "height", "fov", "up", "exr", "background", "max_side",
 )  # fmt: skip
 """Options that decide what the pictures show."""
 
@@ -51,7 +43,7 @@ def relight_files(
     """Relight as the options of the command say.
 
     Args:
-        mode: ``views``, ``on``, ``turntable`` or ``camera_path``.
+        mode: ``views``, ``on``, ``turntable``, ``camera`` or ``camera_path``.
         options: the options of the command by parameter name.
         listener: hears the progress.
         say: told in a sentence what reading a scene has lost.
@@ -78,6 +70,7 @@ def relight_files(
         options["background"] or source.background,
         _frames(list(environments), shots, options),
     )
+    check_one_file(options["output"], len(paint.frames))
     series = Series(options["output"], tuple(paint.frames), fps, options["exr"], keeping)
     # Where the cameras are is said by the rays of the first and last of them.
     ends = [shots[k].rays() for k in (0, -1)]
@@ -118,7 +111,7 @@ def _shots(mode: str, options: dict[str, Any], source: Source) -> tuple[tuple[Sh
         path = read_camera_path(options["camera_path"])
         cameras, fps = path.cameras, options["fps"] or path.fps
     else:
-        cameras = turntable_of(source, options, fps)
+        cameras = cameras_of_options(source.gaussians, source.viewpoints, options, fps)
     return camera_shots([replace(camera, near_world=source.near_world) for camera in cameras]), fps
 
 
@@ -161,8 +154,12 @@ class _Paint:
         environment = self._light(*self.frames[shot])
         rays = shot.rays()
         image = self.relighter.render(rays, part)
+        if self.background == "transparent" and path.suffix.lower() != ".exr":
+            write_png(path, np.clip(linear_to_srgb(image.linear), 0, 1), image.coverage)
+            return
         is_map = self.background == "environment"
-        rgb = image.over(surroundings(environment, rays) if is_map else background_colour(self.background))
+        plain = background_colour("white" if self.background == "white" else "black")
+        rgb = image.over(surroundings(environment, rays) if is_map else plain)
         if path.suffix.lower() == ".exr":
             linear = srgb_to_linear(rgb)
             write_exr(path, {**{name: linear[..., k] for k, name in enumerate("RGB")}, "A": image.coverage})

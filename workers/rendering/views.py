@@ -16,21 +16,10 @@ from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
 from engine.light.stage import Stage
 from engine.light.stage_file import named_files
-from engine.render.cameras import RenderCamera
 from engine.render.identity import identity_of
-from engine.render.jobs import (
-    DEFAULT_FOV_Y_DEGREES,
-    Paint,
-    Shot,
-    camera_shots,
-    gaussian_turntable,
-    scene_fov_y_degrees,
-    scene_paint,
-    scene_turntable,
-    turntable_cameras,
-    view_shots,
-)
+from engine.render.jobs import Paint, Shot, camera_shots, gaussian_turntable, scene_paint, view_shots
 from engine.render.kept import KeptImages
+from engine.render.names import names_by_number
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
 from engine.render.series import Kept, render_film, render_series
@@ -40,11 +29,10 @@ from engine.scene.views_file import SplitViewpoints
 from engine.stages import counted_stage
 from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
+from workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
 from workers.rendering.stages import StagePlace, painted_stage, preview_stage
 from workers.telling.losses import open_scene
 
-DEFAULT_FPS = 30.0
-DEFAULT_FRAMES = 120
 ANY_SIDE_PX = 1 << 30
 """A cap that no photograph reaches."""
 
@@ -108,7 +96,7 @@ def render_files(
     """Render as the options of the command say.
 
     Args:
-        mode: ``views``, ``turntable`` or ``camera_path``.
+        mode: ``views``, ``turntable``, ``camera_path`` or ``camera``.
         options: the options of the command by parameter name.
         listener: hears the progress.
         say: told in a sentence what reading a scene has lost.
@@ -128,14 +116,16 @@ def render_files(
         path = read_camera_path(options["camera_path"])
         cameras, fps = path.cameras, options["fps"] or path.fps
     source = read_source(options, say)
-    if mode == "turntable":
-        cameras = turntable_of(source, options, fps)
+    if mode in ("turntable", "camera"):
+        cameras = cameras_of_options(source.gaussians, source.viewpoints, options, fps)
     if cameras is not None:
         cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
-    background = background_colour(options["background"] or source.background)
     shots = camera_shots(cameras) if cameras is not None else run_shots(source, options)
+    check_one_file(output, 1 if options.get("preview") else len(shots))
+    transparent = options["background"] == "transparent"
+    background = background_colour("black" if transparent else options["background"] or source.background)
     series = Series(output, shots, fps, options["exr"], keeping)
-    what = source.gaussians, source.settings, background, cameras, stage and stage.identity()
+    what = source.gaussians, source.settings, background, transparent, cameras, stage and stage.identity()
     of_views = None if cameras is not None else (source.viewpoints, source.near_world)
     if stage is not None:
         place = StagePlace(
@@ -150,7 +140,7 @@ def render_files(
     kept = series.kept(identity_of(*what, of_views))
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
-    return series.render(scene_paint(tracer, background), kept, listener)
+    return series.render(scene_paint(tracer, background, transparent=transparent), kept, listener)
 
 
 @dataclass(frozen=True)
@@ -187,6 +177,17 @@ class Series:
             return render_series(self.shots, names, paint, kept, count, on_kept)
 
 
+def check_one_file(output: Path, images: int) -> None:
+    """Refuse the name of one image where there are several.
+
+    Raises:
+        ConfigError: they would all be one file.
+    """
+    if images > 1 and output.suffix.lower() in (".png", ".exr") and not names_by_number(output):
+        pattern = f"{output.stem}_%04d{output.suffix}"
+        raise ConfigError(f"{output} names one image for {images}; write a pattern such as {pattern}.")
+
+
 @dataclass(frozen=True)
 class FileNames:
     """The file of a shot: by number in a pattern, by name in a folder."""
@@ -197,6 +198,8 @@ class FileNames:
     def __call__(self, number: int, shot: Shot) -> Path:
         """The file of a shot and its number."""
         if self.output.suffix.lower() in (".png", ".exr"):
+            if not names_by_number(self.output):
+                return self.output
             return self.output.with_name(self.output.name % number)
         return self.output / f"{shot.name}{'.exr' if self.exr else '.png'}"
 
@@ -260,29 +263,6 @@ def _full_size(options: dict[str, Any]) -> Viewpoints | None:
     if not is_run(options["source"]):
         return None
     return run_viewpoints(options["source"], scene=options["scene"], max_side=ANY_SIDE_PX)
-
-
-def turntable_of(source: Source, options: dict[str, Any], fps: float) -> tuple[RenderCamera, ...]:
-    """The cameras of a turn, as the options ``frames``, ``seconds``, ``width`` and so on say."""
-    frames: int = options["frames"] or DEFAULT_FRAMES
-    if options["seconds"]:
-        frames = max(1, round(options["seconds"] * fps))
-    fov: float | None = options["fov"]
-    if source.viewpoints is not None:
-        table = scene_turntable(source.viewpoints)
-        fov = fov or scene_fov_y_degrees(source.viewpoints)
-    else:
-        fov = fov or DEFAULT_FOV_Y_DEGREES
-        table = gaussian_turntable(
-            source.gaussians, up_world=axis_named(options["up"] or "-y"), fov_y_degrees=fov
-        )
-    return turntable_cameras(table, frames, options["width"], options["height"], fov)
-
-
-def axis_named(name: str) -> Float64[np.ndarray, "3"]:
-    """The unit vector of an axis such as ``-y``."""
-    axis = np.eye(3)["xyz".index(name[-1])]
-    return -axis if name.startswith("-") else axis
 
 
 def run_shots(source: Source, options: dict[str, Any]) -> tuple[Shot, ...]:

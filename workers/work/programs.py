@@ -15,6 +15,7 @@ from engine.files.gaussian_ply import read_gaussian_ply
 from engine.files.several import export_files
 from engine.light.stage_file import named_files
 from engine.pipeline import reconstruct as reconstruct_scene
+from engine.plain_colours import PlainScene
 from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.stages import counted_stage, stopping
 from engine.writing import write_json
@@ -88,12 +89,19 @@ def export(task: Task) -> None:
     settings = ExportOptions(q=q, min_opacity=options.min_opacity, sh_pad_degree=options.sh_pad_degree)
     tell = stopping(task.listener, task.should_stop)
     count = len(options.files)
+    plain = PlainScene(
+        gaussians,
+        task.run,
+        threads=task.threads,
+        on_pass=lambda _done, _total: tell(StageProgress("export", 0, count)),
+    )
     with counted_stage("export", tell, count):
         failed = export_files(
             gaussians,
             task.results,
             options.files,
             settings,
+            plain=lambda: plain.gaussians,
             on_done=lambda done: tell(StageProgress("export", done, count)),
             on_loss=lambda text: tell(Warned(text)),
         )

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from workers.cli.commands.render import AXES, check_output
+from workers.cli.camera_options import AXES, camera_options, check_cameras, check_output
 from workers.cli.options import quiet_option, threads_option
 
 
@@ -50,27 +50,15 @@ from workers.cli.options import quiet_option, threads_option
     metavar="FOLDER",
     help="The views of the photographs of another folder (images/ and sparse/0).",
 )
-@click.option("--turntable", is_flag=True, help="One turn round the scene.")
-@click.option(
-    "--path",
-    "camera_path",
-    type=click.Path(path_type=Path),
-    help="The cameras of a JSON file; docs/cameras.md tells its format.",
-)
-@click.option("--frames", type=click.IntRange(min=1), help="Turntable: number of images.  [default: 120]")
-@click.option("--seconds", type=click.FloatRange(0, min_open=True), help="Turntable: duration instead.")
-@click.option("--fps", type=click.FloatRange(0, min_open=True), help="Images per second.  [default: 30]")
-@click.option("--width", type=click.IntRange(16, 16384), default=640, show_default=True, help="Turntable.")
-@click.option("--height", type=click.IntRange(16, 16384), default=480, show_default=True, help="Turntable.")
-@click.option("--fov", type=click.FloatRange(1, 170), help="Turntable: angle from top to bottom, degrees.")
+@camera_options
 @click.option(
     "--up", type=click.Choice(AXES), help="The axis that points up.  [default: the run's, of a file -y]"
 )
 @click.option("--exr", is_flag=True, help="Write EXR with linear RGB and A instead of PNG.")
 @click.option(
     "--background",
-    type=click.Choice(["black", "white", "environment"]),
-    help="Behind the scene.  [default: that of the run's evaluation, or black]",
+    type=click.Choice(["black", "white", "transparent", "environment"]),
+    help="Behind the scene; transparent gives alpha.  [default: that of the run's evaluation, or black]",
 )
 @click.option(
     "--max-side", type=click.IntRange(min=16), metavar="PX", help="Views: longer side of the images."
@@ -89,9 +77,9 @@ def relight(**options: Any) -> None:
     Without --views, --on, --turntable or --path: the held-out views of a run, a turntable of a file. Of
     several environments each has a folder of its name, or its turn in one film.
     """
-    modes = [name for name in ("views", "on", "turntable", "camera_path") if options[name]]
+    modes = [name for name in ("views", "on", "turntable", "camera_path", "camera") if options[name]]
     if len(modes) > 1:
-        raise click.UsageError("Choose one of --views, --on, --turntable and --path.")
+        raise click.UsageError("Choose one of --views, --on, --turntable, --path and --camera.")
     if options["frames"] and options["seconds"]:
         raise click.UsageError("Choose one of --frames and --seconds.")
     from engine.run_folder import is_run
@@ -102,7 +90,12 @@ def relight(**options: Any) -> None:
         raise click.UsageError("--views needs the folder of a run; a file has --on, --turntable and --path.")
     if mode in ("views", "on") and options["output"].suffix.lower() == ".mp4":
         raise click.UsageError(f"--{mode} gives images; name a folder.")
-    check_output(options["output"], options["exr"])
+    if options["background"] == "transparent" and options["output"].suffix.lower() == ".mp4":
+        raise click.UsageError("A video has no alpha; name a folder, or another --background.")
+    check_cameras(mode, options)
+    one = mode == "camera" or (mode == "turntable" and options["frames"] == 1)
+    single = one and len(options["environment"]) == 1
+    check_output(options["output"], options["exr"], single=single, known=mode == "turntable")
 
     from engine.errors import Cancelled
     from engine.stages import stopping

@@ -5,10 +5,10 @@ from typing import Any
 
 import click
 
-from workers.cli.options import background_option, quiet_option, threads_option
+from workers.cli.camera_options import AXES, camera_options, check_cameras, check_output
+from workers.cli.options import quiet_option, threads_option
 
 PREVIEW_SIDE_PX = 480
-AXES = ("x", "-x", "y", "-y", "z", "-z")
 
 
 @click.command(short_help="New views of a scene as images or a video.")
@@ -25,24 +25,14 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
     type=click.Choice(["held-out", "train", "all"]),
     help="The views of the photographs; IN must be a run.",
 )
-@click.option("--turntable", is_flag=True, help="One turn round the scene.")
-@click.option(
-    "--path",
-    "camera_path",
-    type=click.Path(path_type=Path),
-    help="The cameras of a JSON file; docs/cameras.md tells its format.",
-)
-@click.option("--frames", type=click.IntRange(min=1), help="Turntable: number of images.  [default: 120]")
-@click.option("--seconds", type=click.FloatRange(0, min_open=True), help="Turntable: duration instead.")
-@click.option("--fps", type=click.FloatRange(0, min_open=True), help="Images per second.  [default: 30]")
-@click.option("--width", type=click.IntRange(16, 16384), default=640, show_default=True, help="Turntable.")
-@click.option("--height", type=click.IntRange(16, 16384), default=480, show_default=True, help="Turntable.")
-@click.option("--fov", type=click.FloatRange(1, 170), help="Turntable: angle from top to bottom, degrees.")
-@click.option(
-    "--up", type=click.Choice(AXES), help="Turntable of a file: the axis that points up.  [default: -y]"
-)
+@camera_options
+@click.option("--up", type=click.Choice(AXES), help="The axis of a file that points up.  [default: -y]")
 @click.option("--exr", is_flag=True, help="Write EXR with linear RGB, A, Z and normals instead of PNG.")
-@background_option("Behind the scene.  [default: that of the run's evaluation, or black]")
+@click.option(
+    "--background",
+    type=click.Choice(["black", "white", "transparent"]),
+    help="Behind the scene; transparent gives alpha.  [default: that of the run's evaluation, or black]",
+)
 @click.option(
     "--max-side", type=click.IntRange(min=16), metavar="PX", help="Views: longer side of the images."
 )
@@ -67,17 +57,23 @@ def render(**options: Any) -> None:
     Without --views, --turntable or --path: the held-out views of a run, a turntable of a file. Ctrl-C stops
     after the image under way has come to a safe point; the same command with --resume goes on.
     """
-    modes = [name for name in ("views", "turntable", "camera_path") if options[name]]
+    modes = [name for name in ("views", "turntable", "camera_path", "camera") if options[name]]
     if len(modes) > 1:
-        raise click.UsageError("Choose one of --views, --turntable and --path.")
+        raise click.UsageError("Choose one of --views, --turntable, --path and --camera.")
     if options["frames"] and options["seconds"]:
         raise click.UsageError("Choose one of --frames and --seconds.")
     from engine.run_folder import is_run
 
     of_run = is_run(options["source"])
     mode = modes[0] if modes else "views" if of_run else "turntable"
+    check_cameras(mode, options)
     if mode == "views" and not of_run:
         raise click.UsageError("--views needs the folder of a run; a file has --turntable and --path.")
+    if options["background"] == "transparent":
+        if options["stage"] is not None:
+            raise click.UsageError("A stage is transparent in .exr only, which has alpha on any background.")
+        if options["output"].suffix.lower() == ".mp4":
+            raise click.UsageError("A video has no alpha; name a folder, or another --background.")
     if mode == "views" and options["output"].suffix.lower() == ".mp4":
         raise click.UsageError("--views gives images; name a folder.")
     if options["preview"]:
@@ -87,7 +83,8 @@ def render(**options: Any) -> None:
             )
         options["max_side"] = options["max_side"] or PREVIEW_SIDE_PX
     else:
-        check_output(options["output"], options["exr"])
+        single = mode == "camera" or (mode == "turntable" and options["frames"] == 1)
+        check_output(options["output"], options["exr"], single=single, known=mode == "turntable")
 
     from engine.errors import Cancelled
     from engine.light.stage_file import read_stage
@@ -110,19 +107,3 @@ def render(**options: Any) -> None:
             raise Stopped(str(error), should_stop.exit_code) from None
     if not quiet:
         click.echo(f"Wrote {files[0]}" + (f" and {len(files) - 1} more." if len(files) > 1 else "."))
-
-
-def check_output(output: Path, exr: bool) -> None:
-    """Refuse names that say something else than what would be written."""
-    suffix = output.suffix.lower()
-    if suffix == ".mp4" and exr:
-        raise click.UsageError("--exr gives images; name a folder instead of a video.")
-    if suffix in (".png", ".exr"):
-        try:
-            numbered = output.name % 0 != output.name % 1
-        except (TypeError, ValueError):
-            numbered = False
-        if not numbered:
-            raise click.UsageError(f"{output} names one image; write a pattern such as frame_%04d{suffix}.")
-        if exr and suffix == ".png":
-            raise click.UsageError("--exr and a pattern for .png contradict each other.")
