@@ -109,6 +109,16 @@ def write_exr(path: Path, channels: Mapping[str, Float32[np.ndarray, "h w"]], *,
     _write(path, spec, stacked)
 
 
+def write_rgbe(path: Path, rgb_linear: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write linear light as a Radiance picture, three bytes and a shared exponent a pixel, atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    height, width, channels = rgb_linear.shape
+    _write(path, oiio.ImageSpec(width, height, channels, oiio.FLOAT), rgb_linear.astype(np.float32))
+
+
 def read_image(path: Path) -> Float32[np.ndarray, "h w c"]:
     """An image with all its channels, as stored: 8- and 16-bit values scaled to [0, 1], floats unchanged.
 
