@@ -84,8 +84,8 @@ class MaterialSettings(BaseModel):
     even_weight: float = Field(0.03, ge=0)
     harmonics_weight: float = Field(0.01, ge=0)
     propagation: bool = True
-    propagation_every: float = Field(0.02, gt=0, le=1)
-    propagation_until: float = Field(0.6, ge=0, le=1)
+    propagation_every: float = Field(0.06, gt=0, le=1)
+    propagation_until: float = Field(0.4, ge=0, le=1)
     environment_rate: float = Field(0.03, ge=0)
     first_albedo: float = Field(0.5, gt=0, lt=1)
     first_metallic: float = Field(0.5, gt=0, lt=1)

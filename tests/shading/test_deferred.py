@@ -146,7 +146,7 @@ def train(
     materials = {
         "learn": True, "environment_height": 16, "ambient_rays": 4, "ambient_parts": 2, "recipe": recipe,
     }  # fmt: skip
-    config = small_config(materials=materials, sh_degree=0)
+    config = small_config(materials=materials, sh_degree=0, iterations=72)
     first = with_first_materials(world.start(opacity=0.6), config.materials)
     state = fresh_state(first, config.seed)
 
