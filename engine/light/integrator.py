@@ -180,7 +180,7 @@ class PathTracer:
         asked = np.flatnonzero(shadows.lit.any(axis=1) | shadows.lost.any(axis=1))
         if len(asked) == 0:
             return
-        share = let_through(self._scene.meshes, shadows, asked)
+        share = let_through(self._scene.meshes, shadows, asked, through_frost=True)
         free, whole = share.any(axis=1), (share == 1.0).all(axis=1)
         through = np.ones((2, len(asked)), np.float32)
         for row, tracer in enumerate((layers.on_gaussians, layers.not_on_gaussians)):

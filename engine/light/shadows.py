@@ -5,6 +5,7 @@ from jaxtyping import Float32, Int64
 
 from engine.light.arrays import ShadowRays
 from engine.light.bsdf import fresnel
+from engine.light.kernels_frosted import LEAST_FROST
 from engine.light.staging import LitMeshes
 from engine.rays import RayBatch
 
@@ -19,13 +20,14 @@ def shadow_rays(shadows: ShadowRays, which: Int64[np.ndarray, " n"], t_min: floa
 
 
 def let_through(
-    meshes: LitMeshes, shadows: ShadowRays, which: Int64[np.ndarray, " n"]
+    meshes: LitMeshes, shadows: ShadowRays, which: Int64[np.ndarray, " n"], *, through_frost: bool = False
 ) -> Float32[np.ndarray, "n 3"]:
     """The share of light that meshes let through on each ray, in each channel: 0 or 1, but for glass.
 
     Where a ray is marked so, light goes straight through glass, less what Fresnel, tint and Beer take. Paths
     find light that glass bends only where a lamp has an extent and the lit point sends paths on; everywhere
-    else glass would cast the shadow of a stone.
+    else glass would cast the shadow of a stone. Rough glass sends paths on from its own surface, which find
+    such light; only where none are sent (``through_frost``) does it let light through as if it were smooth.
     """
     share = np.ones((len(which), 3), np.float32)
     rays = shadow_rays(shadows, which)
@@ -51,6 +53,9 @@ def let_through(
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         cosines = (normals * rays.directions_world[left]).sum(axis=1)
         kept = meshes.materials.colours_linear[rows].copy()
+        if not through_frost:
+            rough = meshes.materials.roughness[rows] >= LEAST_FROST
+            kept[rough & (meshes.materials.iors[rows] != 1.0)] = 0.0
         for ior in np.unique(meshes.materials.iors[rows]):
             same = meshes.materials.iors[rows] == ior
             kept[same] *= 1.0 - fresnel(np.minimum(np.abs(cosines[same]), 1.0), float(ior))[0][:, None]

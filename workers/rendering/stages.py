@@ -43,6 +43,7 @@ class StagePlace:
         read: reads a file of Gaussians.
         background_srgb: display colour behind everything.
         threads: to use; 0 takes all.
+        say: told in a sentence what of a mesh file is not understood.
     """
 
     gaussians: FlatGaussians
@@ -52,6 +53,7 @@ class StagePlace:
     read: Callable[[Path], FlatGaussians]
     background_srgb: Float32[np.ndarray, "3"]
     threads: int
+    say: Callable[[str], None] = lambda _sentence: None
 
     def turntable(self, up_world: Float64[np.ndarray, "3"] | None = None) -> Turntable:
         """A circle round what the scene shows."""
@@ -101,7 +103,7 @@ def render_stage(
         size=SIZE_OF_RADIUS * place.turntable(up).radius, threads=place.threads,
     )  # fmt: skip
     stage = rested(stage, None if layers is None else layers.tracer, place.ray_of_pixel, place.folder)
-    meshes = stage_meshes(stage, place.folder, threads=place.threads)
+    meshes = stage_meshes(stage, place.folder, threads=place.threads, say=place.say)
     background = srgb_to_linear(place.background_srgb.astype(np.float64))
     tracer = PathTracer(LitScene(meshes, layers, background), stage.integrator, threads=place.threads)
     with counted_stage("render", listener) as progress:

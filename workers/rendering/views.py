@@ -88,7 +88,7 @@ def render_files(
         shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
         place = StagePlace(
             source.gaussians, source.settings, _full_size(options), options["stage"].parent,
-            lambda path: open_scene(path, say), background, options["threads"],
+            lambda path: open_scene(path, say), background, options["threads"], say,
         )  # fmt: skip
         film = fps if output.suffix.lower() == ".mp4" else None
         names = None if options.get("preview") else _FileNames(output, options["exr"])
