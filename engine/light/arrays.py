@@ -87,6 +87,8 @@ class Paths(NamedTuple):
         shade: sum over the first layer of coverage times the factor that the stage's lights give to it.
         coverage: 1 less what is seen of the background behind everything.
         things: what the Gaussians let through of the first mesh that the camera's ray meets; 0 without one.
+        albedo_linear: colour of that mesh, white where it mirrors or lets through, times the same share.
+        normals_world: its shading normal times the same share.
         densities: of the last direction over solid angle; 0 for the camera, mirrors and glass.
         inside: material that the path is in, -1 for air.
         marks: bits of :mod:`engine.light.kernels_path`.
@@ -104,6 +106,8 @@ class Paths(NamedTuple):
     shade: Float32[np.ndarray, "p 3"]
     coverage: Float32[np.ndarray, " p"]
     things: Float32[np.ndarray, " p"]
+    albedo_linear: Float32[np.ndarray, "p 3"]
+    normals_world: Float32[np.ndarray, "p 3"]
     densities: Float32[np.ndarray, " p"]
     inside: Int32[np.ndarray, " p"]
     marks: Int32[np.ndarray, " p"]
@@ -170,7 +174,7 @@ def new_paths(count: int) -> Paths:
         np.empty(count, np.uint32), np.empty(count, np.int32),
         vectors(), vectors(), vectors(), vectors(), vectors(),
         np.empty(count, np.float32), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
-        np.empty(count, np.float32),
+        vectors(), vectors(), np.empty(count, np.float32),
         np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.bool_),
     )  # fmt: skip
 

@@ -4,18 +4,20 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from engine.light.arrays import Paths, Rules, ShadowRays, View, new_paths, new_shadow_rays
+from engine.light.denoising import denoiser
 from engine.light.film import Film
 from engine.light.kernels_layer import add_layer_light, meet_layers
 from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
 from engine.light.layers import GaussianLayers
 from engine.light.shadows import let_through, shadow_rays
-from engine.light.stage import Integrator
-from engine.light.staging import LitMeshes
+from engine.light.stage import Integrator, Stage
+from engine.light.staging import LitMeshes, stage_meshes
 from engine.rays import ImageRays, RayBatch
 from engine.render.renderer import tile_order
 from engine.threads import use_threads
@@ -35,11 +37,13 @@ class LitScene:
         meshes: with materials, lights and surroundings.
         layers: the Gaussians; None without any.
         background_linear: radiance from where there is neither a mesh, nor Gaussians, nor an environment.
+        surroundings: the environment without meshes and lights, for the plate of layered pictures.
     """
 
     meshes: LitMeshes
     layers: GaussianLayers | None = None
     background_linear: Float64[np.ndarray, "3"] | None = None
+    surroundings: LitMeshes | None = None
 
 
 class PathTracer:
@@ -52,6 +56,9 @@ class PathTracer:
         scene: what there is.
         settings: how to trace.
         threads: for the kernels; 0 takes all.
+
+    Raises:
+        ConfigError: noise is to be taken away, and what can do so is not installed.
     """
 
     def __init__(self, scene: LitScene, settings: Integrator, *, threads: int = 0) -> None:
@@ -69,6 +76,13 @@ class PathTracer:
             scene.meshes.environment_visible,
             background.astype(np.float64),
         )
+        self._clean = denoiser() if settings.denoise else None
+        self._plate: PathTracer | None = None
+        if settings.layers:
+            plain = settings.model_copy(update={"layers": False, "denoise": False})
+            empty = scene.surroundings or stage_meshes(Stage(), Path(), threads=threads)
+            alone = LitScene(empty, scene.layers, scene.background_linear)
+            self._plate = PathTracer(alone, plain, threads=threads)
 
     def render(
         self,
@@ -81,19 +95,25 @@ class PathTracer:
             image: rays through the centres of its pixels.
             progress: told (batches done, batches in all).
         """
-        film = Film(image.height_px, image.width_px)
+        film = self._new_film(image)
         self.add_samples(film, image, 0, self._settings.samples, progress)
-        return film
+        return self._finished(film)
 
     def refine(self, image: ImageRays) -> Iterator[Film]:
         """The same film again and again, each time with about twice as many samples, until it has all."""
-        film = Film(image.height_px, image.width_px)
+        film = self._new_film(image)
         done = 0
         while done < self._settings.samples:
             more = min(max(1, done), self._settings.samples - done)
             self.add_samples(film, image, done, more)
             done += more
-            yield film
+            yield self._finished(film)
+
+    def _new_film(self, image: ImageRays) -> Film:
+        return Film(image.height_px, image.width_px, layered=self._plate is not None)
+
+    def _finished(self, film: Film) -> Film:
+        return film if self._clean is None else film.denoised(self._clean)
 
     def add_samples(
         self,
@@ -104,6 +124,8 @@ class PathTracer:
         progress: Progress = lambda _done, _total: None,
     ) -> None:
         """Add the samples ``first`` to ``first + count`` of every pixel to a film."""
+        if self._plate is not None and film.plate is not None:
+            self._plate.add_samples(film.plate, image, first, count)
         use_threads(self._threads)
         view = View(
             image.origin_world.astype(np.float64),

@@ -109,6 +109,8 @@ def start_paths(first, last, view, rules, first_pixel, per_pixel, first_sample, 
         paths.layer_srgb[k, :] = 0.0
         paths.shade[k, :] = 0.0
         paths.transmittance[k], paths.coverage[k], paths.things[k] = 1.0, 1.0, 0.0
+        paths.albedo_linear[k, :] = 0.0
+        paths.normals_world[k, :] = 0.0
         paths.densities[k], paths.inside[k] = 0.0, -1
         paths.marks[k], paths.alive[k] = CLEAR | STRAIGHT, True
 
@@ -347,8 +349,13 @@ def meet_surfaces(
             medium = materials.absorption[paths.inside[p]]
             for channel in range(3):
                 paths.weights[p, channel] *= math.exp(-medium[channel] * distances[k])
-        if paths.marks[p] & STRAIGHT and paths.things[p] == 0.0:
+        first_thing = paths.marks[p] & STRAIGHT != 0 and paths.things[p] == 0.0
+        if first_thing:
             paths.things[p] = paths.transmittance[p]
+            paths.albedo_linear[p, :] = paths.transmittance[p]
+            paths.normals_world[p, 0] = paths.transmittance[p] * n_x
+            paths.normals_world[p, 1] = paths.transmittance[p] * n_y
+            paths.normals_world[p, 2] = paths.transmittance[p] * n_z
         uv = surfaces.corner_uv[face]
         u_t = a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0]
         v_t = a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1]
@@ -368,6 +375,10 @@ def meet_surfaces(
         first_pair = PAIRS_OF_CAMERA + depth * PAIRS_OF_SURFACE
         key, sample = paths.keys[p], paths.samples[p]
         choice, roulette = uniform_pair(key, sample, first_pair + CHOICE)
+        if first_thing:
+            paths.normals_world[p, 0] = paths.transmittance[p] * s_x
+            paths.normals_world[p, 1] = paths.transmittance[p] * s_y
+            paths.normals_world[p, 2] = paths.transmittance[p] * s_z
         if depth >= rules.roulette_depth:
             w = paths.weights[p]
             stay = min(max(w[0], w[1], w[2]), 0.95)
@@ -392,6 +403,10 @@ def meet_surfaces(
         if kind == MIRROR:
             _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue)
             continue
+        if first_thing:
+            paths.albedo_linear[p, 0] = paths.transmittance[p] * red
+            paths.albedo_linear[p, 1] = paths.transmittance[p] * green
+            paths.albedo_linear[p, 2] = paths.transmittance[p] * blue
         # --- a surface that scatters: what lights send to it, and a direction to go on ---
         x, y, z = lifted(x, y, z, n_x, n_y, n_z)
         s_x, s_y, s_z = bumped_normal(

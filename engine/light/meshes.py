@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from scipy.spatial.transform import Rotation
 
 from engine.errors import ConfigError
 from engine.files import read_mesh
@@ -99,16 +100,25 @@ def turn_to(axis: str, up_world: Float64[np.ndarray, "3"]) -> Float64[np.ndarray
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
-def placed(points: Float64[np.ndarray, "n 3"], place: Placed) -> Float64[np.ndarray, "n 3"]:
-    """Points scaled, turned and moved."""
-    return points * np.array(place.scale) @ rotation_matrix(place.rotation_degrees).T + np.array(
-        place.position
-    )
+def upright_turn(axis: str, degrees: float, up_world: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The turn of :func:`turn_to`, and then one about up, anticlockwise seen from above."""
+    up = up_world / np.linalg.norm(up_world)
+    return np.asarray(Rotation.from_rotvec(np.radians(degrees) * up).as_matrix() @ turn_to(axis, up_world))
 
 
-def placed_normals(normals: Float64[np.ndarray, "n 3"], place: Placed) -> Float32[np.ndarray, "n 3"]:
+def placed(
+    points: Float64[np.ndarray, "n 3"], place: Placed, turn: Float64[np.ndarray, "3 3"] | None = None
+) -> Float64[np.ndarray, "n 3"]:
+    """Points scaled along their own axes, turned by a matrix to the world's, turned as stated, and moved."""
+    whole = rotation_matrix(place.rotation_degrees) @ (np.eye(3) if turn is None else turn)
+    return points * np.array(place.scale) @ whole.T + np.array(place.position)
+
+
+def placed_normals(
+    normals: Float64[np.ndarray, "n 3"], place: Placed, turn: Float64[np.ndarray, "3 3"]
+) -> Float32[np.ndarray, "n 3"]:
     """Normals of points that are :func:`placed`, unit vectors; NaN where one has no length."""
-    turned = normals / np.array(place.scale) @ rotation_matrix(place.rotation_degrees).T
+    turned = normals / np.array(place.scale) @ (rotation_matrix(place.rotation_degrees) @ turn).T
     lengths = np.linalg.norm(turned, axis=1, keepdims=True)
     return np.asarray((turned / np.where(lengths > 1e-12, lengths, np.nan)).astype(np.float32))
 

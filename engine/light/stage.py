@@ -166,7 +166,7 @@ class Placed(Part):
     Attributes:
         position: where its origin comes to lie.
         rotation_degrees: about the world's x, then y, then z axis.
-        scale: one factor, or one for each axis.
+        scale: one factor, or one for each axis of its own.
     """
 
     position: Vector = (0.0, 0.0, 0.0)
@@ -212,6 +212,7 @@ class StageMesh(Placed):
             stage's up.
         up_axis: which of the file's axes is turned to the stage's up; ``world`` leaves the file as it is.
             By default y for GLB (glTF says so) and world for the others.
+        turn_degrees: about the stage's up, anticlockwise seen from above, before ``rotation_degrees``.
         smooth_degrees: edges up to this angle are shaded as if they were round; 0 shows every facet. By
             default the normals of the file are taken, or 30 where it has none.
         material: what it is made of; by default what the file says of its materials and colours, or else a
@@ -222,6 +223,7 @@ class StageMesh(Placed):
     file: str | None = None
     shape: Literal["sphere", "cube", "plane"] | None = None
     up_axis: Literal["world", "x", "-x", "y", "-y", "z", "-z"] | None = None
+    turn_degrees: Finite = 0.0
     smooth_degrees: Annotated[float, Field(ge=0, le=180)] | None = None
     material: Material | None = None
     on: Rest | None = None

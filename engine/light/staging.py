@@ -23,7 +23,7 @@ from engine.light.meshes import (
     placed_normals,
     read_shape,
     simple_shape,
-    turn_to,
+    upright_turn,
 )
 from engine.light.stage import Diffuse, Glass, Light, PointLight, RectangleLight, Shining, Stage, StageMesh
 from engine.rays import RayBatch
@@ -156,12 +156,12 @@ class _Gathered:
 def _add_mesh(
     gathered: _Gathered, mesh: StageMesh, number: int, shape: Shape, up: Float64[np.ndarray, "3"], say: Say
 ) -> None:
-    turn = turn_to(up_axis(mesh), up)
-    corners = placed(shape.vertices @ turn.T, mesh)[shape.faces].astype(np.float32)
+    turn = upright_turn(up_axis(mesh), mesh.turn_degrees, up)
+    corners = placed(shape.vertices, mesh, turn)[shape.faces].astype(np.float32)
     degrees = SMOOTH_DEGREES if mesh.smooth_degrees is None else mesh.smooth_degrees
     normals = corner_normals(corners, degrees)
     if mesh.smooth_degrees is None and shape.normals is not None:
-        stated = placed_normals(shape.normals @ turn.T, mesh)[shape.faces]
+        stated = placed_normals(shape.normals, mesh, turn)[shape.faces]
         known = np.isfinite(stated).all(axis=(1, 2))
         normals[known] = stated[known]
     rows = np.empty(len(corners), np.int32)

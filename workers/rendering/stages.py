@@ -105,7 +105,11 @@ def render_stage(
     stage = rested(stage, None if layers is None else layers.tracer, place.ray_of_pixel, place.folder)
     meshes = stage_meshes(stage, place.folder, threads=place.threads, say=place.say)
     background = srgb_to_linear(place.background_srgb.astype(np.float64))
-    tracer = PathTracer(LitScene(meshes, layers, background), stage.integrator, threads=place.threads)
+    alone = stage_meshes(
+        stage.model_copy(update={"meshes": (), "lights": ()}), place.folder, threads=place.threads
+    )
+    scene = LitScene(meshes, layers, background, alone)
+    tracer = PathTracer(scene, stage.integrator, threads=place.threads)
     with counted_stage("render", listener) as progress:
         if file_of is None:
             render_preview(tracer, meshes, stage.integrator, shots[0], output, progress)

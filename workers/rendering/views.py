@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from engine.config import read_config
-from engine.errors import OutputError
+from engine.errors import ConfigError, OutputError
 from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
+from engine.light.stage import Stage
 from engine.light.stage_file import read_stage
 from engine.render.cameras import RenderCamera
 from engine.render.jobs import (
@@ -73,7 +74,7 @@ def render_files(
         OctasplatError: the source cannot be read or the output not written.
     """
     output: Path = options["output"]
-    stage = read_stage(options["stage"]) if options.get("stage") else None
+    stage = _read_stage(options) if options.get("stage") else None
     cameras, fps = None, options["fps"] or DEFAULT_FPS
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
@@ -91,7 +92,8 @@ def render_files(
             lambda path: open_scene(path, say), background, options["threads"], say,
         )  # fmt: skip
         film = fps if output.suffix.lower() == ".mp4" else None
-        names = None if options.get("preview") else _FileNames(output, options["exr"])
+        exr = options["exr"] or stage.integrator.layers
+        names = None if options.get("preview") else _FileNames(output, exr)
         return render_stage(stage, place, shots, output, names, film, listener)
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
@@ -102,6 +104,20 @@ def render_files(
             return (output,)
         shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
         return render_images(tracer, shots, _FileNames(output, options["exr"]), background, progress)
+
+
+def _read_stage(options: dict[str, Any]) -> Stage:
+    """The stage, with what the options say of its integrator.
+
+    Raises:
+        ConfigError: it cannot be read, or asks for layers in files that have none.
+    """
+    stage = read_stage(options["stage"])
+    asked = {key: True for key in ("layers", "denoise") if options.get(key)}
+    stage = stage.model_copy(update={"integrator": stage.integrator.model_copy(update=asked)})
+    if stage.integrator.layers and options["output"].suffix.lower() in (".png", ".mp4"):
+        raise ConfigError(f"{options['output']}: holds no layers; name a folder, or .exr files.")
+    return stage
 
 
 @dataclass(frozen=True)

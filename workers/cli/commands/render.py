@@ -58,6 +58,10 @@ AXES = ("x", "-x", "y", "-y", "z", "-z")
     help="Render with the meshes, lights and materials of a stage, see docs/light.md.",
 )
 @click.option("--preview", is_flag=True, help="Stage: the first image only, -o one file, finer and finer.")
+@click.option(
+    "--layers", is_flag=True, help="Stage: EXR files with background, shadow and things, for a compositor."
+)
+@click.option("--denoise", is_flag=True, help="Stage: take the noise from what light brings.")
 @threads_option
 @quiet_option
 def render(**options: Any) -> None:
@@ -78,6 +82,8 @@ def render(**options: Any) -> None:
         raise click.UsageError("--views needs the folder of a run; a file has --turntable and --path.")
     if mode == "views" and options["output"].suffix.lower() == ".mp4":
         raise click.UsageError("--views gives images; name a folder.")
+    if options["stage"] is None and (options["layers"] or options["denoise"]):
+        raise click.UsageError("--layers and --denoise go with --stage.")
     if options["preview"]:
         if options["stage"] is None or options["output"].suffix.lower() not in (".png", ".exr"):
             raise click.UsageError(
