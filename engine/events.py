@@ -8,7 +8,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
@@ -37,12 +37,13 @@ class StageStarted(Event):
 
 @dataclass(frozen=True)
 class StageProgress(Event):
-    """Step ``step`` of a stage that counts its steps is done."""
+    """Step ``step`` of a stage that counts its steps is done, and the share ``part`` of the next one."""
 
     kind: ClassVar[str] = "stage_progress"
     stage: str
     step: int
     total_steps: int
+    part: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class HeldOutMeasured(Event):
 
 @dataclass(frozen=True)
 class CheckpointWritten(Event):
-    """A checkpoint of ``iteration`` is safe on disk at ``path``."""
+    """A checkpoint of ``iteration``, or of so many images of a render, is safe on disk at ``path``."""
 
     kind: ClassVar[str] = "checkpoint_written"
     iteration: int
@@ -126,10 +127,9 @@ Listener = Callable[[Event], None]
 def event_from(kind: str, content: Mapping[str, Any]) -> Event | None:
     """The event that was written as JSON; None if there is no such kind, or it lacks something."""
     model = EVENT_KINDS.get(kind)
-    names = {field.name for field in fields(model)} if model is not None else set()
-    if model is None or not names <= content.keys():
+    if model is None or not {f.name for f in fields(model) if f.default is MISSING} <= content.keys():
         return None
-    return model(**{name: content[name] for name in names})
+    return model(**{field.name: content[field.name] for field in fields(model) if field.name in content})
 
 
 def ignore(_event: Event) -> None:

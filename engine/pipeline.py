@@ -36,6 +36,7 @@ from engine.files import ExportOptions, check_writable
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
 from engine.gaussians.model import FlatGaussians
+from engine.plain_colours import PlainScene
 from engine.poses import find_poses
 from engine.poses.find import read_record
 from engine.run_folder import (
@@ -174,7 +175,7 @@ def reconstruct(
             except Exception as error:  # noqa: BLE001 - raised below, after the files are written
                 unmeasured = error
         with stage("export", tell, len(config.exports)):
-            failed = _export(output, config, tell)
+            failed = _export(output, config, threads, tell)
         if unmeasured is not None:
             raise unmeasured
         if failed is not None:
@@ -399,18 +400,25 @@ def _placed(output: Path) -> dict[str, object]:
     return {"poses": {name: record[name] for name in ("placed", "photographs")}} if record else {}
 
 
-def _export(output: Path, config: ReconstructionConfig, tell: Listener) -> str | None:
+def _export(output: Path, config: ReconstructionConfig, threads: int, tell: Listener) -> str | None:
     """Write what is missing; returns what could not be written and why."""
     missing = [name for name in config.exports if not (output / name).exists()]
     if not missing:
         return None
     gaussians, _ = read_gaussian_ply(output / SCENE)
     options = ExportOptions(q=config.train.trace.q)
+    plain = PlainScene(
+        gaussians,
+        output,
+        threads=threads,
+        on_pass=lambda _done, _total: tell(StageProgress("export", 0, len(missing))),
+    )
     return export_files(
         gaussians,
         output,
         missing,
         options,
+        plain=lambda: plain.gaussians,
         on_done=lambda done: tell(StageProgress("export", done, len(missing))),
         on_loss=lambda text: tell(Warned(text)),
     )

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol, runtime_checkable
 
 from engine.errors import Cancelled
 from engine.events import Event, Listener, StageFinished, StageProgress, StageStarted
@@ -59,11 +60,23 @@ def stage(name: str, tell: Listener, steps: int = 0) -> Iterator[StageClock]:
     tell(StageFinished(name, clock.stop()))
 
 
+@runtime_checkable
+class Count(Protocol):
+    """Told how many steps of a stage are done, of how many, and what share of the next one."""
+
+    def __call__(self, done: int, total: int, part: float = 0.0) -> None:
+        """Hear it."""
+
+
 @contextmanager
-def counted_stage(name: str, tell: Listener, steps: int = 0) -> Iterator[Callable[[int, int], None]]:
-    """Announce a stage that counts; yields its progress callback (steps done, steps in all)."""
+def counted_stage(name: str, tell: Listener, steps: int = 0) -> Iterator[Count]:
+    """Announce a stage that counts; yields its progress callback."""
+
+    def count(done: int, total: int, part: float = 0.0) -> None:
+        tell(StageProgress(name, done, total, part))
+
     with stage(name, tell, steps):
-        yield lambda done, total: tell(StageProgress(name, done, total))
+        yield count
 
 
 def stopping(listener: Listener, should_stop: Callable[[], bool], message: str | None = None) -> Listener:

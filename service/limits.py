@@ -61,7 +61,9 @@ def ceilings_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]
     except ValueError:  # something has to be given
         return {}
     numbers = [
-        demand for demand in kind.demands(options, ()) if demand.of not in ("exports", "render_pixels")
+        demand
+        for demand in kind.demands(options, ())
+        if demand.of not in ("exports", "render_pixels", "render_paths")
     ]
     return {
         demand.path: settings.ceilings[demand.of] for demand in numbers if demand.path != "train.patch_side"

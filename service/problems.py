@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from starlette.exceptions import HTTPException
 
 from engine.errors import OctasplatError
+from engine.light.stage_file import stage_complaint, stage_keys
 from service.intake.faults import IntakeRefused
 from workers.records.errors import Conflict
 from workers.records.quotas import QuotaExceeded
@@ -206,6 +207,10 @@ async def _on_exception(request: Request, error: Exception) -> JSONResponse:
 
 
 def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
+    if fault["loc"][:1] == ("stage",):  # told as whoever reads a stage file would be told
+        keys = ("stage", *stage_keys(fault["loc"][1:]))
+        told = stage_complaint(fault["type"], keys, fault["msg"], fault.get("input"))
+        fault = {**fault, "loc": keys, "msg": told}
     where, *path = fault["loc"] or ("",)
     if prefix:
         path = [where, *path]

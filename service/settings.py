@@ -33,6 +33,7 @@ class ServiceSettings(WorkerSettings):
         max_side_px: ceiling of the longer side that photographs may be asked for.
         max_exports: ceiling of the files that one job writes in formats of its own.
         max_render_pixels: ceiling of the pixels of all images of a render together.
+        max_render_paths: ceiling of the pixels of all images of a stage together times the samples of each.
         max_priority: highest priority that whoever is no administrator may give.
         ping_seconds: how often a quiet stream of events gives a sign of life.
         max_streams: streams of events at once.
@@ -55,6 +56,7 @@ class ServiceSettings(WorkerSettings):
     max_side_px: int = Field(16_384, ge=16)
     max_exports: int = Field(20, ge=1)
     max_render_pixels: int = Field(4_000_000_000, ge=1)
+    max_render_paths: int = Field(40_000_000_000, ge=1)
     max_priority: int = Field(10, ge=-100, le=100)
     ping_seconds: float = Field(15.0, gt=0)
     max_streams: int = Field(500, gt=0)

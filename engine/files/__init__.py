@@ -4,7 +4,7 @@ The rest of the engine knows the functions that are named here, and no format.
 """
 
 from engine.files.channel_columns import ChannelChoice
-from engine.files.exporting import check_surface_path, export_scene, lost_channels, write_surface
+from engine.files.exporting import check_surface_path, export_losses, export_scene, write_surface
 from engine.files.mesh import Mesh
 from engine.files.options import ExportOptions
 from engine.files.reading import read_mesh, read_scene
@@ -34,12 +34,12 @@ __all__ = [
     "SurfaceWriter",
     "check_surface_path",
     "check_writable",
+    "export_losses",
     "export_scene",
     "exporter_for",
     "exporters",
     "importer_for",
     "importers",
-    "lost_channels",
     "read_mesh",
     "read_scene",
     "register",

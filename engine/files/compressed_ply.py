@@ -15,6 +15,7 @@ from engine.files.ply_container import PlyHeader, columns, read_ply, read_ply_he
 from engine.files.registry import Importer, register
 from engine.gaussians.flattening import GaussianCloud
 
+PATTERNS = ("*.compressed.ply",)
 CHUNK = 256
 SH_RANGE = 8.0
 """Higher coefficients lie in [-4, 4]."""
@@ -114,7 +115,7 @@ def _recognises(head: bytes) -> bool:
 register(
     Importer(
         "compressed-ply",
-        ("*.compressed.ply",),
+        PATTERNS,
         "compressed PLY of PlayCanvas and SuperSplat",
         read,
         _recognises,

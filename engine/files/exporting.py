@@ -14,7 +14,7 @@ def export_scene(
 ) -> tuple[Path, ...]:
     """Write ``gaussians`` to ``path`` in the format that its name or ``format`` says.
 
-    Formats without a place for named channels leave them out; :func:`lost_channels` tells.
+    Formats without a place for named channels or harmonics leave them out; :func:`export_losses` tells.
 
     Returns:
         Every file written, ``path`` first.
@@ -30,17 +30,23 @@ def export_scene(
         raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
 
 
-def lost_channels(gaussians: FlatGaussians, path: Path, format: str | None = None) -> str | None:
-    """A sentence that says which named channels :func:`export_scene` will leave out; None where it keeps all.
+def export_losses(gaussians: FlatGaussians, path: Path, format: str | None = None) -> tuple[str, ...]:
+    """What :func:`export_scene` will leave out, a sentence each.
 
     Raises:
         SceneFileError: there is no such format.
     """
     exporter = exporter_for(path, format)
-    if exporter.holds_channels or not gaussians.channels:
-        return None
-    names = ", ".join(gaussians.channels)
-    return f"The format {exporter.name} has no place for named channels; {names} will be left out."
+    lines = []
+    if gaussians.channels and not exporter.holds_channels:
+        names = ", ".join(gaussians.channels)
+        lines.append(f"The format {exporter.name} has no place for named channels; {names} will be left out.")
+    if gaussians.sh_degree > 0 and not exporter.holds_harmonics:
+        lines.append(
+            f"The format {exporter.name} has one colour for each Gaussian; how colours change with the "
+            "direction will be left out (octasplat export --colour chooses the one)."
+        )
+    return tuple(lines)
 
 
 def check_surface_path(path: Path, *, textured: bool) -> None:

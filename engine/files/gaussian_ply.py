@@ -263,5 +263,6 @@ register(
         "Gaussians as a 3DGS PLY, for splat viewers and for octasplat itself",
         _write,
         holds_channels=True,
+        holds_harmonics=True,
     )
 )

@@ -313,5 +313,6 @@ register(
         "Gaussians as glTF points with KHR_gaussian_splatting",
         write,
         holds_channels=True,
+        holds_harmonics=True,
     )
 )

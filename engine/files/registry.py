@@ -55,6 +55,7 @@ class Exporter(Entry):
         write: writes the Gaussians to the path and returns every file written, the path itself first.
         lacking: what is missing on this machine to write it, to be read after the file's name, or None.
         holds_channels: whether it writes named channels, too.
+        holds_harmonics: whether colours may change with the direction.
     """
 
     noun: ClassVar[str] = "export"
@@ -62,6 +63,7 @@ class Exporter(Entry):
     write: SceneWriter
     lacking: Callable[[], str | None] = lambda: None
     holds_channels: bool = False
+    holds_harmonics: bool = False
 
 
 @dataclass(frozen=True)

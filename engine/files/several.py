@@ -4,8 +4,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from engine.errors import NoSpaceLeft, OctasplatError
-from engine.files.exporting import export_scene, lost_channels
+from engine.files.exporting import export_losses, export_scene
 from engine.files.options import ExportOptions
+from engine.files.registry import exporter_for
 from engine.gaussians.model import FlatGaussians
 
 
@@ -14,6 +15,7 @@ def export_files(
     folder: Path,
     names: Sequence[str],
     options: ExportOptions,
+    plain: Callable[[], FlatGaussians],
     on_done: Callable[[int], None],
     on_loss: Callable[[str], None],
 ) -> str | None:
@@ -24,6 +26,7 @@ def export_files(
         folder: where to.
         names: of the files; they say the formats.
         options: of all of them.
+        plain: makes the scene for formats that have one colour for each Gaussian.
         on_done: told how many files have been dealt with, after each; it may raise to stop.
         on_loss: told in a sentence what of the scene a format cannot hold.
 
@@ -36,9 +39,10 @@ def export_files(
     failed: list[str] = []
     for done, name in enumerate(names, start=1):
         try:
-            if lost := lost_channels(gaussians, folder / name):
+            for lost in export_losses(gaussians, folder / name):
                 on_loss(lost)
-            export_scene(gaussians, folder / name, options)
+            chosen = gaussians if exporter_for(folder / name).holds_harmonics else plain()
+            export_scene(chosen, folder / name, options)
         except NoSpaceLeft:
             raise  # the others would find none either, and whoever makes room goes on from here
         except OctasplatError as error:

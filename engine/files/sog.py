@@ -263,5 +263,12 @@ register(
     )
 )
 register(
-    Exporter("sog", ("*.sog",), "SOG of PlayCanvas, the smallest; needs splat-transform", write, lacking)
+    Exporter(
+        "sog",
+        ("*.sog",),
+        "SOG of PlayCanvas, the smallest; needs splat-transform",
+        write,
+        lacking,
+        holds_harmonics=True,
+    )
 )

@@ -167,4 +167,12 @@ def _recognises(head: bytes) -> bool:
 
 
 register(Importer("spz", ("*.spz",), "SPZ of Niantic, versions 2 to 4", read, _recognises))
-register(Exporter("spz", ("*.spz",), "SPZ of Niantic, 15 bytes a Gaussian, for web viewers", write))
+register(
+    Exporter(
+        "spz",
+        ("*.spz",),
+        "SPZ of Niantic, 15 bytes a Gaussian, for web viewers",
+        write,
+        holds_harmonics=True,
+    )
+)

@@ -137,5 +137,6 @@ register(
         write,
         lacking,
         holds_channels=True,
+        holds_harmonics=True,
     )
 )

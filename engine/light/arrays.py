@@ -5,6 +5,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 
+from engine.trace.kernels_triangles import TriangleQuery
+from engine.trace.meshes import new_scratch
+
+BLOCK = 1024
+"""Rows that a thread works on at a time: few enough for the nearest cache."""
+PAIRS_OF_SURFACE = 5
+"""Pairs of uniform numbers that a path uses at each surface."""
+
 
 class Surfaces(NamedTuple):
     """All triangles of a stage.
@@ -134,6 +142,52 @@ class ShadowRays(NamedTuple):
     straight: Bool[np.ndarray, " n"]
 
 
+class MeshQueries(NamedTuple):
+    """What kernels ask Embree about the meshes of a stage.
+
+    Attributes:
+        closest: the nearest of all triangles.
+        any: whether there is any triangle.
+        any_obstacle: whether there is any that is not glass.
+        closest_glass: the nearest of glass; its scene is 0 where there is no glass.
+        glass_faces: rows in the surfaces of the faces of glass.
+    """
+
+    closest: TriangleQuery
+    any: TriangleQuery
+    any_obstacle: TriangleQuery
+    closest_glass: TriangleQuery
+    glass_faces: Int64[np.ndarray, " g"]
+
+
+class Scratch(NamedTuple):
+    """What one thread's kernels work in, ``b`` rows at a time.
+
+    Attributes:
+        embree: see :func:`engine.trace.meshes.new_scratch`.
+        keys: of paths.
+        samples: of paths.
+        numbers: pairs of uniform numbers.
+        rows: those of a block that something is done for.
+        starts: where their rays begin.
+        blocked: whether something is in their way.
+        distances: of what they met.
+        faces: likewise.
+        barycentrics: likewise.
+    """
+
+    embree: Float32[np.ndarray, " w"]
+    keys: UInt32[np.ndarray, " b"]
+    samples: Int32[np.ndarray, " b"]
+    numbers: Float64[np.ndarray, "d 2 b"]
+    rows: Int32[np.ndarray, " b"]
+    starts: Float32[np.ndarray, " b"]
+    blocked: Bool[np.ndarray, " b"]
+    distances: Float32[np.ndarray, " b"]
+    faces: Int32[np.ndarray, " b"]
+    barycentrics: Float32[np.ndarray, "b 2"]
+
+
 class View(NamedTuple):
     """A camera's rays.
 
@@ -185,3 +239,16 @@ def new_shadow_rays(count: int) -> ShadowRays:
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.float32),
         np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.bool_),
     )  # fmt: skip
+
+
+def new_scratches(threads: int) -> list[Scratch]:
+    """Memory for the kernels of so many threads."""
+    return [
+        Scratch(
+            new_scratch(1)[0], np.empty(BLOCK, np.uint32), np.empty(BLOCK, np.int32),
+            np.empty((PAIRS_OF_SURFACE - 1, 2, BLOCK)), np.empty(BLOCK, np.int32),
+            np.empty(BLOCK, np.float32), np.empty(BLOCK, np.bool_),
+            np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty((BLOCK, 2), np.float32),
+        )
+        for _ in range(threads)
+    ]  # fmt: skip

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.light.arrays import Paths
+from engine.light.kernels_film import add_up
 
 Tone = Literal["none", "reinhard", "filmic"]
 Filter = Callable[
@@ -25,6 +26,7 @@ Filter = Callable[
     Float32[np.ndarray, "h w 3"],
 ]
 """Takes noise from a linear image, guided by the colours and normals of surfaces where they are given."""
+_ONE = np.empty(0, np.float32)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _DARK = 1e-6
 
@@ -68,33 +70,39 @@ class Film:
         self._free = Film(height, width) if layered else None
 
     def add(
-        self, paths: Paths, pixels: Int64[np.ndarray, " n"], counted: Bool[np.ndarray, " p"] | None = None
+        self, paths: Paths, pixels: Int64[np.ndarray, " n"], counted: Float32[np.ndarray, " p"] | None = None
     ) -> None:
         """Add finished paths, equally many to each of ``pixels``, those of one pixel beside each other.
 
         Args:
             paths: to add.
             pixels: where they begin.
-            counted: which of them count; None for all.
+            counted: 1 for those that count, 0 for the others; None for all.
         """
         each = len(paths.keys) // len(pixels)
 
-        def total(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
-            if counted is not None:
-                values = values * counted.reshape(-1, *[1] * (values.ndim - 1))
-            return values.reshape(len(pixels), each, *values.shape[1:]).sum(axis=1, dtype=np.float64)
+        def add(
+            sums: Float64[np.ndarray, "..."],
+            values: Float32[np.ndarray, "..."],
+            factors: Float32[np.ndarray, " f"] = _ONE if counted is None else counted,
+        ) -> None:
+            add_up(values.reshape(len(values), -1), factors, each, pixels, sums.reshape(len(sums), -1))
 
-        self._layer[pixels] += total(paths.layer_srgb)
-        self._light[pixels] += total(paths.radiance_linear * paths.transmittance[:, None])
-        self._shade[pixels] += total(paths.shade)
-        self._albedo[pixels] += total(paths.albedo_linear)
-        self._normals[pixels] += total(paths.normals_world)
-        self._through[pixels] += total(paths.transmittance)
-        self._coverage[pixels] += total(paths.coverage)
-        self._things[pixels] += total(paths.things)
-        self._samples[pixels] += total(np.ones(len(paths.keys), np.float32))
+        through = paths.transmittance
+        add(self._layer, paths.layer_srgb)
+        add(self._light, paths.radiance_linear, through if counted is None else through * counted)
+        add(self._shade, paths.shade)
+        add(self._through, through)
+        add(self._coverage, paths.coverage)
+        if counted is not None:
+            add(self._samples, counted)
+            return
+        self._samples[pixels] += each
+        add(self._albedo, paths.albedo_linear)
+        add(self._normals, paths.normals_world)
+        add(self._things, paths.things)
         if self._free is not None:
-            self._free.add(paths, pixels, paths.things == 0.0)
+            self._free.add(paths, pixels, (paths.things == 0.0).astype(np.float32))
 
     def image(self, *, exposure: float = 0.0, tone: Tone = "none") -> StageImage:
         """The picture of all paths so far; ``exposure`` is in stops."""

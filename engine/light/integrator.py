@@ -5,17 +5,30 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from queue import Queue
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 
-from engine.light.arrays import Paths, Rules, ShadowRays, View, new_paths, new_shadow_rays
+from engine.light.arrays import (
+    BLOCK,
+    Paths,
+    Rules,
+    Scratch,
+    ShadowRays,
+    View,
+    new_paths,
+    new_scratches,
+    new_shadow_rays,
+)
 from engine.light.denoising import denoiser
 from engine.light.film import Film
+from engine.light.kernels_follow import follow_paths
 from engine.light.kernels_layer import add_layer_light, meet_layers
 from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
+from engine.light.kernels_shadows import let_through
 from engine.light.layers import GaussianLayers
-from engine.light.shadows import let_through, shadow_rays
 from engine.light.stage import Integrator, Stage
 from engine.light.staging import LitMeshes, stage_meshes
 from engine.rays import ImageRays, RayBatch
@@ -23,8 +36,12 @@ from engine.render.renderer import tile_order
 from engine.threads import use_threads
 
 PATHS_AT_ONCE = 1 << 18
+"""Paths that are traced together through Gaussians."""
+PATHS_OF_A_THREAD = 1 << 14
+"""Paths that a thread follows by itself among meshes alone."""
 LEAST_TILE = 64
 LEAST_ROWS = 8192
+NO_END = np.full(1, np.inf, np.float32)
 
 Progress = Callable[[int, int], None]
 
@@ -66,6 +83,7 @@ class PathTracer:
         self._settings = settings
         self._threads = use_threads(threads)
         self._pool = ThreadPoolExecutor(self._threads)
+        self._scratches = new_scratches(self._threads)
         background = np.zeros(3) if scene.background_linear is None else scene.background_linear
         self._rules = Rules(
             settings.seed,
@@ -135,21 +153,80 @@ class PathTracer:
             self._settings.focus_distance or 1.0,
         )
         order = tile_order(image.height_px, image.width_px)
+        together = PATHS_OF_A_THREAD if self._scene.layers is None else PATHS_AT_ONCE
         # Always the same cut, as what is traced together may differ in the last digit.
-        at_once = min(count, PATHS_AT_ONCE // LEAST_TILE)
-        pixels = PATHS_AT_ONCE // at_once // LEAST_TILE * LEAST_TILE
-        cuts = [
-            (top, min(pixels, len(order) - top), sample, min(at_once, count - sample))
-            for sample in range(0, count, at_once)
-            for top in range(0, len(order), pixels)
-        ]
-        for number, (top, many, sample, each) in enumerate(cuts):
-            progress(number, len(cuts))
-            paths = new_paths(many * each)
-            self._share(start_paths, many * each, view, self._rules, top, each, first + sample, order, paths)
-            self._follow(paths, image.rays.t_min[:1])
-            film.add(paths, order[top : top + many])
-        progress(len(cuts), len(cuts))
+        at_once = min(count, together // LEAST_TILE)
+        pixels = together // at_once // LEAST_TILE * LEAST_TILE
+        tops = range(0, len(order), pixels)
+        blocks = range(0, count, at_once)
+        done, whole = 0, len(tops) * len(blocks)
+        for sample in blocks:
+            batches = [
+                _Batch(top, order[top : top + pixels], min(at_once, count - sample), first + sample)
+                for top in tops
+            ]
+            work = self._follow_in_waves if self._scene.layers is not None else self._follow_side_by_side
+            for _ in work(film, view, order, image.rays.t_min[:1], batches):
+                progress(done, whole)
+                done += 1
+        progress(whole, whole)
+
+    def _follow_side_by_side(
+        self,
+        film: Film,
+        view: View,
+        order: Int64[np.ndarray, " n"],
+        near: Float32[np.ndarray, "1"],
+        batches: list["_Batch"],
+    ) -> Iterator[None]:
+        """Follow paths among meshes alone, a batch a thread; yields before each batch that is waited for."""
+        meshes = self._scene.meshes
+        given = (meshes.queries, meshes.surfaces, meshes.materials, meshes.lights)
+        environment = meshes.lights.environment_number
+        free: Queue[_Room] = Queue()
+        for scratch in self._scratches:
+            free.put(_Room.of(scratch))
+
+        def work(batch: _Batch) -> None:
+            room = free.get()
+            try:
+                paths = room.paths(len(batch.pixels) * batch.each)
+                follow_paths(
+                    len(paths.keys), room.scratch, view, self._rules, batch.top, batch.each,
+                    batch.first_sample, order, near, NO_END, paths, room.active, room.distances, room.faces,
+                    room.barycentrics, *given, environment, room.shadows, room.share,
+                )  # fmt: skip
+                film.add(paths, batch.pixels)
+            finally:
+                free.put(room)
+
+        tasks = [self._pool.submit(work, batch) for batch in batches]
+        try:
+            for task in tasks:
+                yield
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    def _follow_in_waves(
+        self,
+        film: Film,
+        view: View,
+        order: Int64[np.ndarray, " n"],
+        near: Float32[np.ndarray, "1"],
+        batches: list["_Batch"],
+    ) -> Iterator[None]:
+        """Follow paths among Gaussians, all threads on one batch; yields before each."""
+        for batch in batches:
+            yield
+            paths = new_paths(len(batch.pixels) * batch.each)
+            self._share(
+                start_paths, len(paths.keys), view, self._rules, batch.top, batch.each, batch.first_sample,
+                order, paths,
+            )  # fmt: skip
+            self._follow(paths, near)
+            film.add(paths, batch.pixels)
 
     def _follow(self, paths: Paths, near: Float32[np.ndarray, "1"]) -> None:
         """Follow paths to their ends; the camera sees nothing nearer than ``near``."""
@@ -183,17 +260,25 @@ class PathTracer:
             if len(active) == 0:
                 return
 
+    def _let_through(self, shadows: ShadowRays, *, through_frost: bool = False) -> Float32[np.ndarray, "n 3"]:
+        """The share of light that meshes let through on each ray."""
+        meshes, share = self._scene.meshes, np.empty_like(shadows.lit)
+        self._share(
+            let_through, len(share), meshes.queries, meshes.surfaces, meshes.materials, shadows,
+            through_frost, share,
+        )  # fmt: skip
+        return share
+
     def _add_surface_light(self, paths: Paths, active: Int32[np.ndarray, " n"], shadows: ShadowRays) -> None:
         """Add the light that reaches surfaces."""
-        asked = np.flatnonzero(shadows.lit.any(axis=1))
-        if len(asked) == 0:
-            return
-        share = let_through(self._scene.meshes, shadows, asked)
+        shadows.lost[:] = 0.0
+        share = self._let_through(shadows)
         layers = self._scene.layers
-        free = share.any(axis=1)
-        if layers is not None and layers.on_meshes is not None and free.any():
-            share[free] *= layers.on_meshes.transmittance(shadow_rays(shadows, asked[free]))[:, None]
-        self._share(add_lit, len(asked), paths, active[asked], shadows.lit[asked], share)
+        if layers is not None and layers.on_meshes is not None:
+            free = np.flatnonzero(share.any(axis=1))
+            if len(free):
+                share[free] *= layers.on_meshes.transmittance(_rays(shadows, free))[:, None]
+        self._share(add_lit, len(active), paths, active, shadows.lit, share)
 
     def _add_layer_light(
         self, paths: Paths, active: Int32[np.ndarray, " n"], shadows: ShadowRays, layers: GaussianLayers
@@ -202,15 +287,14 @@ class PathTracer:
         asked = np.flatnonzero(shadows.lit.any(axis=1) | shadows.lost.any(axis=1))
         if len(asked) == 0:
             return
-        share = let_through(self._scene.meshes, shadows, asked, through_frost=True)
+        share = self._let_through(shadows, through_frost=True)[asked]
         free, whole = share.any(axis=1), (share == 1.0).all(axis=1)
         through = np.ones((2, len(asked)), np.float32)
         for row, tracer in enumerate((layers.on_gaussians, layers.not_on_gaussians)):
             # What nobody keeps off needs no tracing where nothing else would count it.
             needed = free if row == 0 else ~whole | (layers.on_gaussians is not None)
             if tracer is not None and needed.any():
-                rays = shadow_rays(shadows, asked[needed], layers.shadow_bias)
-                through[row, needed] = tracer.transmittance(rays)
+                through[row, needed] = tracer.transmittance(_rays(shadows, asked[needed], layers.shadow_bias))
         self._share(
             add_layer_light, len(asked), paths, active[asked], shadows.lit[asked], shadows.lost[asked],
             share, through[0], through[1],
@@ -220,12 +304,55 @@ class PathTracer:
         """Let all threads work on the rows of a kernel. Numba's own loops cannot write to named tuples."""
         parts = max(1, min(self._threads, rows // LEAST_ROWS))
         cuts = [rows * part // parts for part in range(parts + 1)]
+        work = zip(pairwise(cuts), self._scratches, strict=False)
         if parts == 1:
-            kernel(0, rows, *arguments)
+            kernel(0, rows, self._scratches[0], *arguments)
             return
-        tasks = [self._pool.submit(kernel, *cut, *arguments) for cut in pairwise(cuts)]
+        tasks = [self._pool.submit(kernel, *cut, scratch, *arguments) for cut, scratch in work]
         for task in tasks:
             task.result()
+
+
+class _Batch(NamedTuple):
+    """Paths that are followed together: ``each`` of the pixels from place ``top`` on in their order."""
+
+    top: int
+    pixels: Int64[np.ndarray, " n"]
+    each: int
+    first_sample: int
+
+
+@dataclass(frozen=True)
+class _Room:
+    """Where one thread keeps the paths that it follows, taken once as fresh memory costs time."""
+
+    scratch: Scratch
+    whole: Paths
+    shadows: ShadowRays
+    active: Int32[np.ndarray, " b"]
+    distances: Float32[np.ndarray, " b"]
+    faces: Int32[np.ndarray, " b"]
+    barycentrics: Float32[np.ndarray, "b 2"]
+    share: Float32[np.ndarray, "b 3"]
+
+    @classmethod
+    def of(cls, scratch: Scratch) -> "_Room":
+        return cls(
+            scratch, new_paths(PATHS_OF_A_THREAD), new_shadow_rays(BLOCK), np.empty(BLOCK, np.int32),
+            np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty((BLOCK, 2), np.float32),
+            np.empty((BLOCK, 3), np.float32),
+        )  # fmt: skip
+
+    def paths(self, count: int) -> Paths:
+        """The first so many paths."""
+        return Paths(*(values[:count] for values in self.whole))
+
+
+def _rays(shadows: ShadowRays, which: Int64[np.ndarray, " n"], t_min: float = 0.0) -> RayBatch:
+    """Some of the shadow rays."""
+    return RayBatch(
+        shadows.origins_world[which], shadows.directions_world[which], t_min, shadows.t_max[which]
+    )
 
 
 def _axis(directions_world: Float32[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "3"]:

@@ -13,13 +13,13 @@ both directions: "A Microfacet Based Coupled Specular-Matte BRDF Model" (Kelemen
 
 import math
 
-from numba import njit
+from engine.trace.kernels_native import lean
 
 LEAST_ALPHA = 1e-3
 COUPLED, BURLEY = 0, 1
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def fresnel_dielectric(cos_o, eta):
     """Share of unpolarised light that a smooth surface reflects, and the cosine of the refracted ray.
 
@@ -35,14 +35,14 @@ def fresnel_dielectric(cos_o, eta):
     return 0.5 * (parallel * parallel + across * across), cos_t
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def schlick_weight(cosine):
     """(1 - cosine) to the power of 5."""
     x = min(max(1.0 - cosine, 0.0), 1.0)
     return x * x * x * x * x
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def ggx_density(cos_h, alpha):
     """The microfacet distribution D at a half vector of that cosine."""
     a2 = alpha * alpha
@@ -50,14 +50,14 @@ def ggx_density(cos_h, alpha):
     return a2 / (math.pi * x * x)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def ggx_masking(cosine, alpha):
     """Smith's G1: the share of the facets that face a direction and are seen from it."""
     c2 = cosine * cosine
     return 2.0 / (1.0 + math.sqrt(1.0 + alpha * alpha * max(1.0 - c2, 0.0) / max(c2, 1e-12)))
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def sample_visible_normal(o_x, o_y, o_z, alpha, u, v):
     """A normal of GGX as it is seen from ``o`` (o_z > 0)."""
     x, y, z = alpha * o_x, alpha * o_y, o_z
@@ -72,14 +72,14 @@ def sample_visible_normal(o_x, o_y, o_z, alpha, u, v):
     return h_x / length, h_y / length, h_z / length
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def sample_cosine(u, v):
     """A direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
     radius, angle = math.sqrt(u), 2.0 * math.pi * v
     return radius * math.cos(angle), radius * math.sin(angle), math.sqrt(max(1.0 - u, 0.0))
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def table_value(table, cosine, roughness):
     """Bilinear value of a table over (roughness, cosine), both from 0 to 1."""
     rows, columns = table.shape
@@ -92,7 +92,7 @@ def table_value(table, cosine, roughness):
     return low * (1.0 - y) + high * y
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def specular_share(o_z, red, green, blue, metallic, roughness, coat):
     """Probability with which a sample goes to the specular lobe rather than to the ground."""
     if metallic >= 1.0:
@@ -105,7 +105,7 @@ def specular_share(o_z, red, green, blue, metallic, roughness, coat):
     return min(max(specular / (specular + ground), 0.1), 0.9)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def opaque_value(
     o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, ground_kind, kept,
     mirror, coat, coat_mean,
@@ -155,7 +155,7 @@ def opaque_value(
     return f_r, f_g, f_b, pdf
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def opaque_sample(o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, choice, u, v):
     """A direction to the light, as dense as :func:`opaque_value` says; worth 0 below the surface."""
     share = specular_share(o_z, red, green, blue, metallic, roughness, coat)
@@ -167,7 +167,7 @@ def opaque_sample(o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, ch
     return twice * h_x - o_x, twice * h_y - o_y, twice * h_z - o_z
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def around(n_x, n_y, n_z):
     """Two unit vectors that make a right-handed frame with the unit vector n as its third axis.
 

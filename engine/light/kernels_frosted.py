@@ -20,12 +20,13 @@ from engine.light.kernels_bsdf import (
     sample_visible_normal,
 )
 from engine.light.kernels_random import SCALE, reversed_bits
+from engine.trace.kernels_native import lean
 
 LEAST_FROST = 0.03
 """Glass of less roughness is smooth."""
 
 
-@njit(error_model="numpy")
+@lean()
 def frosted_value(o_x, o_y, o_z, i_x, i_y, i_z, eta, alpha):
     """Value times cosine, and the density of :func:`frosted_sample` over solid angle."""
     if o_z <= 0.0 or i_z == 0.0:
@@ -52,7 +53,7 @@ def frosted_value(o_x, o_y, o_z, i_x, i_y, i_z, eta, alpha):
     return pdf * ggx_masking(abs(i_z), alpha), pdf
 
 
-@njit(error_model="numpy")
+@lean()
 def frosted_sample(o_x, o_y, o_z, eta, alpha, choice, u, v):
     """A direction to the light, as dense as :func:`frosted_value` says, or no direction at all (zeros).
 

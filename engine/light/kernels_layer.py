@@ -14,15 +14,13 @@ composited as such, into one layer of premultiplied colour g and transmittance T
 
 import math
 
-from numba import njit
-
+from engine.light.arrays import PAIRS_OF_SURFACE
 from engine.light.kernels_lights import FAR, adding_share, pick_light, sample_light
 from engine.light.kernels_path import (
     CLEAR,
     ENDED,
     LAYER_PLACE,
     PAIRS_OF_CAMERA,
-    PAIRS_OF_SURFACE,
     PICK,
     SHORT_OF_LIGHT,
     add_radiance,
@@ -30,6 +28,7 @@ from engine.light.kernels_path import (
 )
 from engine.light.kernels_random import uniform_pair
 from engine.light.kernels_surface import unit
+from engine.trace.kernels_native import lean
 
 NOTHING = 1e-6
 ONE_SURFACE = 0.05
@@ -37,7 +36,7 @@ SHADOWED, RELIT, AMBIENT = 0, 1, 2
 """Features of Gaussians: share that shadows take, share that is relit, and that times its ambient part."""
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def encode(linear):
     """The display value of a linear one (IEC 61966-2-1), also beyond 1."""
     if linear <= 0.0031308:
@@ -45,7 +44,7 @@ def encode(linear):
     return 1.055 * linear ** (1.0 / 2.4) - 0.055
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def decode(display):
     """The linear value of a display value, also beyond 1."""
     if display <= 0.04045:
@@ -53,9 +52,9 @@ def decode(display):
     return ((display + 0.055) / 1.055) ** 2.4
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@lean(cache=True, nogil=True)
 def meet_layers(
-    first, last, paths, active, depth, distances, faces,
+    first, last, scratch, paths, active, depth, distances, faces,
     rgb, transmittance, depth_median, depth_sum, normals, features,
     lights, environment, rules, absorption, spent_below, shadows,
 ):  # fmt: skip
@@ -66,8 +65,8 @@ def meet_layers(
     """
     for k in range(first, last):
         p = active[k]
-        shadows.lit[k, :] = 0.0
-        shadows.lost[k, :] = 0.0
+        for channel in range(3):
+            shadows.lit[k, channel] = shadows.lost[k, channel] = 0.0
         left = float(transmittance[k])
         share = 1.0 - left
         if share <= NOTHING:
@@ -157,8 +156,8 @@ def meet_layers(
             paths.alive[p], faces[k] = False, ENDED
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_layer_light(first, last, paths, active, lit, lost, free, through_casters, through_others):
+@lean(cache=True, nogil=True)
+def add_layer_light(first, last, scratch, paths, active, lit, lost, free, through_casters, through_others):
     """Add what shadow rays of layers brought.
 
     ``free`` is the share in each channel that meshes let through, ``through_casters`` and ``through_others``

@@ -11,18 +11,19 @@ from numba import njit
 
 from engine.light.kernels_bsdf import around
 from engine.light.kernels_texture import texture_value
+from engine.trace.kernels_native import lean
 
 POINT, SPOT, DIRECTIONAL, RECTANGLE, ENVIRONMENT, BALL, MESH = 0, 1, 2, 3, 4, 5, 6
 FAR = 1e30
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def luminance(red, green, blue):
     """Of linear Rec. 709 values."""
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _cone(lights, l, way_x, way_y, way_z):
     """How much of a spot's intensity goes a way (a unit vector from the light)."""
     axis = lights.axes[l]
@@ -32,7 +33,7 @@ def _cone(lights, l, way_x, way_y, way_z):
     return share * share
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def light_weight(lights, l, p_x, p_y, p_z):
     """About the irradiance that a light gives to a surface at p that faces it; 0 only where it gives none."""
     power = luminance(lights.rgb_linear[l, 0], lights.rgb_linear[l, 1], lights.rgb_linear[l, 2])
@@ -58,7 +59,7 @@ def light_weight(lights, l, p_x, p_y, p_z):
     return power / squared
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def pick_light(lights, p_x, p_y, p_z, u):
     """A light and the probability with which it is asked at p; -1 where none shines."""
     count = len(lights.kinds)
@@ -80,7 +81,7 @@ def pick_light(lights, p_x, p_y, p_z, u):
     return found, share
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def light_share(lights, wanted, p_x, p_y, p_z):
     """The probability with which :func:`pick_light` asks the light ``wanted`` at p."""
     total, own = 0.0, 0.0
@@ -92,7 +93,7 @@ def light_share(lights, wanted, p_x, p_y, p_z):
     return own / total if total > 0.0 else 0.0
 
 
-@njit(error_model="numpy")
+@lean()
 def adding_share(lights, p_x, p_y, p_z):
     """The probability with which :func:`pick_light` asks at p one of the lights that add theirs."""
     if not lights.some_add:
@@ -106,7 +107,7 @@ def adding_share(lights, p_x, p_y, p_z):
     return adding / total if total > 0.0 else 0.0
 
 
-@njit(error_model="numpy")
+@lean()
 def emitted(lights, l, u, v):
     """Linear radiance of a shining surface at texture coordinates."""
     rgb = lights.rgb_linear[l]
@@ -116,7 +117,7 @@ def emitted(lights, l, u, v):
     return rgb[0] * red, rgb[1] * green, rgb[2] * blue
 
 
-@njit(error_model="numpy")
+@lean()
 def seen_density(lights, l, o, distance, facing):
     """Density over solid angle with which :func:`sample_light` gives from o the place that a ray met.
 
@@ -132,14 +133,14 @@ def seen_density(lights, l, o, distance, facing):
     return distance * distance / (max(facing, 1e-9) * lights.areas[l])
 
 
-@njit(error_model="numpy")
+@lean()
 def _cap(squared_sine):
     """1 less the cosine of an angle below 90 degrees, without losing digits where it is small."""
     squared_sine = min(squared_sine, 1.0)
     return max(squared_sine / (1.0 + math.sqrt(1.0 - squared_sine)), 1e-12)
 
 
-@njit(error_model="numpy")
+@lean()
 def _sample_ball(lights, l, p_x, p_y, p_z, u, v):
     """A way from p to a ball of light, evenly over the solid angle that it fills."""
     way_x = lights.positions_world[l, 0] - p_x
@@ -169,7 +170,7 @@ def _sample_ball(lights, l, p_x, p_y, p_z, u, v):
     )
 
 
-@njit(error_model="numpy")
+@lean()
 def _sample_mesh(lights, l, p_x, p_y, p_z, u, v):
     """A way from p to a shining mesh, evenly over its area."""
     first, last = lights.mesh_rows[l, 0], lights.mesh_rows[l, 1]
@@ -208,7 +209,7 @@ def _sample_mesh(lights, l, p_x, p_y, p_z, u, v):
     return way_x, way_y, way_z, distance, red, green, blue, squared / (cosine * lights.areas[l])
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def sample_light(lights, l, p_x, p_y, p_z, u, v):
     """A way from p to a light: unit direction, distance, linear radiance, density over solid angle.
 
@@ -250,7 +251,7 @@ def sample_light(lights, l, p_x, p_y, p_z, u, v):
     return way_x, way_y, way_z, distance, rgb[0] * falloff, rgb[1] * falloff, rgb[2] * falloff, 0.0
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _environment_place(lights, d_x, d_y, d_z):
     """Where a direction lies in the map, (u, v) from 0 to 1, and the sine of its angle to up."""
     frame = lights.environment_frame
@@ -261,7 +262,7 @@ def _environment_place(lights, d_x, d_y, d_z):
     return 0.5 + math.atan2(right, forward) / (2.0 * math.pi), math.atan2(sine, up) / math.pi, sine
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def environment_radiance(lights, d_x, d_y, d_z):
     """Linear radiance from a direction: bilinear between the map's pixels, round at its sides."""
     radiance = lights.environment_linear
@@ -294,7 +295,7 @@ def environment_radiance(lights, d_x, d_y, d_z):
     return red, green, blue
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def environment_density(lights, d_x, d_y, d_z):
     """Density over solid angle with which :func:`sample_environment` gives a direction."""
     shares = lights.environment_shares
@@ -304,7 +305,7 @@ def environment_density(lights, d_x, d_y, d_z):
     return shares[j, i] * width * height / (2.0 * math.pi * math.pi * max(sine, 1e-9))
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _step(sums, u):
     """The step of a cumulative sum from 0 to 1 in which u lies, and how far in."""
     low, high = 0, len(sums) - 1
@@ -318,7 +319,7 @@ def _step(sums, u):
     return low, min(max((u - sums[low]) / span, 0.0), 1.0 - 1e-9) if span > 0.0 else 0.5
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def sample_environment(lights, u, v):
     """A direction, likelier where the map is brighter, and its density over solid angle."""
     height, width = lights.environment_shares.shape

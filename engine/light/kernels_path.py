@@ -8,8 +8,8 @@ several threads can share the work.
 import math
 
 import numpy as np
-from numba import njit
 
+from engine.light.arrays import BLOCK, PAIRS_OF_SURFACE
 from engine.light.kernels_bsdf import (
     around,
     fresnel_dielectric,
@@ -29,7 +29,7 @@ from engine.light.kernels_lights import (
     sample_light,
     seen_density,
 )
-from engine.light.kernels_random import pixel_key, uniform_pair
+from engine.light.kernels_random import fill_pairs, pixel_key
 from engine.light.kernels_surface import (
     DIFFUSE,
     GLASS,
@@ -45,6 +45,7 @@ from engine.light.kernels_surface import (
     unit,
     vertex_colour,
 )
+from engine.trace.kernels_native import lean
 
 CLEAR = 1
 """Mark: every surface so far passed on all light in one direction; the first layer goes on."""
@@ -55,13 +56,27 @@ STRAIGHT = 4
 
 ENDED = -2
 """In place of a face: the ray ended in front of what it would have met."""
-PAIRS_OF_CAMERA, PAIRS_OF_SURFACE = 2, 5
+PAIRS_OF_CAMERA = 2
 CHOICE, DIRECTION, PICK, PLACE, LAYER_PLACE = 0, 1, 2, 3, 4
 SHORT_OF_LIGHT = 1.0 - 1e-4
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def start_paths(first, last, view, rules, first_pixel, per_pixel, first_sample, order, paths):
+@lean(forceinline=True)
+def _camera_numbers(scratch, rules, first_pixel, per_pixel, first_sample, order, place, number, count):
+    """Keys, sample numbers and the camera's uniform numbers of ``count`` paths, at most a block of them."""
+    count = min(count, BLOCK)
+    key = pixel_key(rules.seed, order[first_pixel + place])
+    for n in range(count):
+        if number == per_pixel:
+            place, number = place + 1, 0
+            key = pixel_key(rules.seed, order[first_pixel + place])
+        scratch.keys[n], scratch.samples[n] = key, first_sample + number
+        number += 1
+    fill_pairs(scratch.keys, scratch.samples, count, 0, scratch.numbers[:PAIRS_OF_CAMERA])
+
+
+@lean(cache=True, nogil=True)
+def start_paths(first, last, scratch, view, rules, first_pixel, per_pixel, first_sample, order, paths):
     """Paths of pixels ``order[first_pixel]`` and on, ``per_pixel`` to each, numbered from ``first_sample``.
 
     Beside a pixel's centre the direction follows the slopes between the neighbours, which is right for any
@@ -69,15 +84,27 @@ def start_paths(first, last, view, rules, first_pixel, per_pixel, first_sample, 
     """
     height, width, _ = view.directions_world.shape
     across_x, across_y, across_z, up_x, up_y, up_z = around(view.axis[0], view.axis[1], view.axis[2])
+    numbers = scratch.numbers
+    place, number = first // per_pixel, first % per_pixel - 1
+    pixel = order[first_pixel + place]
+    y, x = pixel // width, pixel % width
     for k in range(first, last):
-        pixel, sample = order[first_pixel + k // per_pixel], first_sample + k % per_pixel
-        key = pixel_key(rules.seed, pixel)
-        paths.keys[k], paths.samples[k] = key, sample
-        y, x = pixel // width, pixel % width
+        n = (k - first) % BLOCK
+        number += 1
+        if number == per_pixel:
+            place, number = place + 1, 0
+        if n == 0:
+            _camera_numbers(
+                scratch, rules, first_pixel, per_pixel, first_sample, order, place, number, last - k
+            )
+        if n == 0 or number == 0:
+            pixel = order[first_pixel + place]
+            y, x = pixel // width, pixel % width
+        paths.keys[k], paths.samples[k] = scratch.keys[n], scratch.samples[n]
         centre = view.directions_world[y, x]
         d_x, d_y, d_z = float(centre[0]), float(centre[1]), float(centre[2])
         if rules.anti_aliasing:
-            u, v = uniform_pair(key, sample, 0)
+            u, v = numbers[0, 0, n], numbers[0, 1, n]
             left, right = max(x - 1, 0), min(x + 1, width - 1)
             high, low = max(y - 1, 0), min(y + 1, height - 1)
             along = (u - 0.5) / max(right - left, 1)
@@ -90,7 +117,7 @@ def start_paths(first, last, view, rules, first_pixel, per_pixel, first_sample, 
             d_x, d_y, d_z = unit(d_x, d_y, d_z)
         o_x, o_y, o_z = view.origin_world[0], view.origin_world[1], view.origin_world[2]
         if view.aperture > 0.0:
-            u, v = uniform_pair(key, sample, 1)
+            u, v = numbers[1, 0, n], numbers[1, 1, n]
             radius, angle = 0.5 * view.aperture * math.sqrt(u), 2.0 * math.pi * v
             a, b = radius * math.cos(angle), radius * math.sin(angle)
             l_x, l_y, l_z = a * across_x + b * up_x, a * across_y + b * up_y, a * across_z + b * up_z
@@ -104,18 +131,16 @@ def start_paths(first, last, view, rules, first_pixel, per_pixel, first_sample, 
             d_y,
             d_z,
         )
-        paths.weights[k, :] = 1.0
-        paths.radiance_linear[k, :] = 0.0
-        paths.layer_srgb[k, :] = 0.0
-        paths.shade[k, :] = 0.0
+        for channel in range(3):
+            paths.weights[k, channel], paths.radiance_linear[k, channel] = 1.0, 0.0
+            paths.layer_srgb[k, channel], paths.shade[k, channel] = 0.0, 0.0
+            paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
         paths.transmittance[k], paths.coverage[k], paths.things[k] = 1.0, 1.0, 0.0
-        paths.albedo_linear[k, :] = 0.0
-        paths.normals_world[k, :] = 0.0
         paths.densities[k], paths.inside[k] = 0.0, -1
         paths.marks[k], paths.alive[k] = CLEAR | STRAIGHT, True
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def beyond(lights, environment, rules, marks, d_x, d_y, d_z):
     """Linear radiance from behind everything; ``environment`` is the number of that light or -1."""
     if environment >= 0 and (rules.environment_visible or not marks & STRAIGHT):
@@ -124,7 +149,7 @@ def beyond(lights, environment, rules, marks, d_x, d_y, d_z):
     return background[0], background[1], background[2]
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def add_radiance(paths, p, red, green, blue, clamp):
     """Add light to a path, no more than ``clamp`` of it where it comes by way of scattering."""
     if paths.marks[p] & SCATTERED:
@@ -136,7 +161,7 @@ def add_radiance(paths, p, red, green, blue, clamp):
     paths.radiance_linear[p, 2] += blue
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _leave(paths, p, x, y, z, d_x, d_y, d_z, density):
     """Send a path on."""
     paths.origins_world[p, 0], paths.origins_world[p, 1], paths.origins_world[p, 2] = x, y, z
@@ -144,7 +169,7 @@ def _leave(paths, p, x, y, z, d_x, d_y, d_z, density):
     paths.densities[p] = density
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _miss(paths, p, lights, environment, rules):
     """A path ends behind everything."""
     d = paths.directions_world[p]
@@ -162,7 +187,7 @@ def _miss(paths, p, lights, environment, rules):
     add_radiance(paths, p, share * w[0] * red, share * w[1] * green, share * w[2] * blue, rules.clamp)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _light_seen(paths, p, lights, l, distance, facing, u, v, rules):
     """A path meets a shining surface; ``facing`` is the cosine to its front, (u, v) the place on a mesh."""
     if facing <= 0.0:
@@ -177,7 +202,7 @@ def _light_seen(paths, p, lights, l, distance, facing, u, v, rules):
     add_radiance(paths, p, share * w[0] * red, share * w[1] * green, share * w[2] * blue, rules.clamp)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue):
     """Reflect a path."""
     d = paths.directions_world[p]
@@ -194,7 +219,7 @@ def _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue):
     _leave(paths, p, x, y, z, r_x, r_y, r_z, 0.0)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def _glass(paths, p, materials, m, entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice):
     """Reflect a path at glass or let it through, by chance as Fresnel says."""
     d = paths.directions_world[p]
@@ -223,7 +248,31 @@ def _glass(paths, p, materials, m, entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s
     _leave(paths, p, x, y, z, t_x, t_y, t_z, 0.0)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
+def _fill_numbers(scratch, paths, active, faces, first, last, first_pair):
+    """The uniform numbers of those of the rows ``first`` to ``last``, at most a block, that meet a face."""
+    count = 0
+    for k in range(first, last):
+        if faces[k] >= 0:
+            p = active[k]
+            scratch.keys[count], scratch.samples[count] = paths.keys[p], paths.samples[p]
+            count += 1
+    fill_pairs(scratch.keys, scratch.samples, count, first_pair, scratch.numbers)
+
+
+@lean(forceinline=True)
+def _guide(paths, p, red, green, blue, n_x, n_y, n_z):
+    """Note colour and normal of the first mesh that the camera's ray meets, as far as it is seen."""
+    share = paths.things[p]
+    paths.albedo_linear[p, 0] = share * red
+    paths.albedo_linear[p, 1] = share * green
+    paths.albedo_linear[p, 2] = share * blue
+    paths.normals_world[p, 0] = share * n_x
+    paths.normals_world[p, 1] = share * n_y
+    paths.normals_world[p, 2] = share * n_z
+
+
+@lean()
 def _ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, blue, clamp):
     """Ask a light: what it brings if nothing is in its way, no more than ``clamp``."""
     most = max(red, green, blue)
@@ -237,10 +286,10 @@ def _ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, blue, clamp):
     shadows.t_max[k] = distance * SHORT_OF_LIGHT if distance < FAR else np.inf
 
 
-@njit(error_model="numpy")
+@lean()
 def _frosted_glass(
     paths, p, k, materials, m, entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice,
-    lights, rules, shadows, first_pair,
+    lights, rules, shadows, numbers, n,
 ):  # fmt: skip
     """What lights send to rough glass, and a way on that its facets reflect or refract."""
     d = paths.directions_world[p]
@@ -256,13 +305,12 @@ def _frosted_glass(
         gain = 1.0 / table_value(materials.coat[materials.coats[m] + (0 if entering else 1)], o_z, roughness)
     front_x, front_y, front_z = lifted(x, y, z, n_x, n_y, n_z)
     back_x, back_y, back_z = lifted(x, y, z, -n_x, -n_y, -n_z)
-    key, sample, w = paths.keys[p], paths.samples[p], paths.weights[p]
+    w = paths.weights[p]
     clamp = rules.clamp if paths.marks[p] & SCATTERED else np.inf
     if len(lights.kinds):
-        pick, _ = uniform_pair(key, sample, first_pair + PICK)
-        l, share = pick_light(lights, x, y, z, pick)
+        l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
         if l >= 0:
-            u, v = uniform_pair(key, sample, first_pair + PLACE)
+            u, v = numbers[PLACE, 0, n], numbers[PLACE, 1, n]
             w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
             i_z = w_x * s_x + w_y * s_y + w_z * s_z
             if i_z * (w_x * n_x + w_y * n_y + w_z * n_z) > 0.0 and l_r + l_g + l_b > 0.0:
@@ -285,7 +333,7 @@ def _frosted_glass(
                         w[1] * l_g * factor * (tint[1] if through else 1.0),
                         w[2] * l_b * factor * (tint[2] if through else 1.0), clamp,
                     )  # fmt: skip
-    u, v = uniform_pair(key, sample, first_pair + DIRECTION)
+    u, v = numbers[DIRECTION, 0, n], numbers[DIRECTION, 1, n]
     i_x, i_y, i_z = frosted_sample(o_x, o_y, o_z, eta, alpha, choice, u, v)
     value, pdf = frosted_value(o_x, o_y, o_z, i_x, i_y, i_z, eta, alpha)
     w_x = i_x * a_x + i_y * b_x + i_z * s_x
@@ -306,10 +354,11 @@ def _frosted_glass(
         _leave(paths, p, front_x, front_y, front_z, w_x, w_y, w_z, pdf)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@lean(cache=True, nogil=True)
 def meet_surfaces(
     first,
     last,
+    scratch,
     paths,
     active,
     depth,
@@ -328,16 +377,23 @@ def meet_surfaces(
     Adds light that they run into, turns them to where they go on, and writes what they ask of lights into
     ``shadows``, a row a ray. Paths that end are not alive any more.
     """
+    numbers = scratch.numbers
+    first_pair = PAIRS_OF_CAMERA + depth * PAIRS_OF_SURFACE
+    n = 0
     for k in range(first, last):
+        if (k - first) % BLOCK == 0:
+            _fill_numbers(scratch, paths, active, faces, k, min(k + BLOCK, last), first_pair)
+            n = -1
         p = active[k]
         face = faces[k]
-        shadows.lit[k, :] = 0.0
+        shadows.lit[k, 0] = shadows.lit[k, 1] = shadows.lit[k, 2] = 0.0
         if face == ENDED:
             continue
         if face < 0:
             _miss(paths, p, lights, environment, rules)
             paths.alive[p] = False
             continue
+        n += 1
         d = paths.directions_world[p]
         b, c = float(barycentrics[k, 0]), float(barycentrics[k, 1])
         a = 1.0 - b - c
@@ -352,10 +408,7 @@ def meet_surfaces(
         first_thing = paths.marks[p] & STRAIGHT != 0 and paths.things[p] == 0.0
         if first_thing:
             paths.things[p] = paths.transmittance[p]
-            paths.albedo_linear[p, :] = paths.transmittance[p]
-            paths.normals_world[p, 0] = paths.transmittance[p] * n_x
-            paths.normals_world[p, 1] = paths.transmittance[p] * n_y
-            paths.normals_world[p, 2] = paths.transmittance[p] * n_z
+            _guide(paths, p, 1.0, 1.0, 1.0, n_x, n_y, n_z)
         uv = surfaces.corner_uv[face]
         u_t = a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0]
         v_t = a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1]
@@ -372,13 +425,9 @@ def meet_surfaces(
         s_x, s_y, s_z = shading_normal(
             surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d[0], d[1], d[2]
         )
-        first_pair = PAIRS_OF_CAMERA + depth * PAIRS_OF_SURFACE
-        key, sample = paths.keys[p], paths.samples[p]
-        choice, roulette = uniform_pair(key, sample, first_pair + CHOICE)
         if first_thing:
-            paths.normals_world[p, 0] = paths.transmittance[p] * s_x
-            paths.normals_world[p, 1] = paths.transmittance[p] * s_y
-            paths.normals_world[p, 2] = paths.transmittance[p] * s_z
+            _guide(paths, p, 1.0, 1.0, 1.0, s_x, s_y, s_z)
+        choice, roulette = numbers[CHOICE, 0, n], numbers[CHOICE, 1, n]
         if depth >= rules.roulette_depth:
             w = paths.weights[p]
             stay = min(max(w[0], w[1], w[2]), 0.95)
@@ -390,7 +439,7 @@ def meet_surfaces(
         if kind == GLASS and materials.roughness[m] >= LEAST_FROST and materials.iors[m] != 1.0:
             _frosted_glass(
                 paths, p, k, materials, m, facing >= 0.0, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice,
-                lights, rules, shadows, first_pair,
+                lights, rules, shadows, numbers, n,
             )  # fmt: skip
             continue
         if kind == GLASS:
@@ -403,29 +452,14 @@ def meet_surfaces(
         if kind == MIRROR:
             _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue)
             continue
-        if first_thing:
-            paths.albedo_linear[p, 0] = paths.transmittance[p] * red
-            paths.albedo_linear[p, 1] = paths.transmittance[p] * green
-            paths.albedo_linear[p, 2] = paths.transmittance[p] * blue
         # --- a surface that scatters: what lights send to it, and a direction to go on ---
         x, y, z = lifted(x, y, z, n_x, n_y, n_z)
         s_x, s_y, s_z = bumped_normal(
-            materials,
-            m,
-            surfaces.corners_world[face],
-            uv,
-            u_t,
-            v_t,
-            n_x,
-            n_y,
-            n_z,
-            s_x,
-            s_y,
-            s_z,
-            d[0],
-            d[1],
-            d[2],
-        )
+            materials, m, surfaces.corners_world[face], uv, u_t, v_t,
+            n_x, n_y, n_z, s_x, s_y, s_z, d[0], d[1], d[2],
+        )  # fmt: skip
+        if first_thing:
+            _guide(paths, p, red, green, blue, s_x, s_y, s_z)
         a_x, a_y, a_z, b_x, b_y, b_z = around(s_x, s_y, s_z)
         o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
         o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
@@ -433,10 +467,9 @@ def meet_surfaces(
         coat, coat_mean = materials.coat[materials.coats[m]], materials.coat_means[materials.coats[m]]
         ior, ground, kept = materials.iors[m], materials.grounds[m], materials.kept[m] != 0
         if len(lights.kinds):
-            pick, _ = uniform_pair(key, sample, first_pair + PICK)
-            l, share = pick_light(lights, x, y, z, pick)
+            l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
             if l >= 0:
-                u, v = uniform_pair(key, sample, first_pair + PLACE)
+                u, v = numbers[PLACE, 0, n], numbers[PLACE, 1, n]
                 w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
                 i_z = w_x * s_x + w_y * s_y + w_z * s_z
                 if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
@@ -463,7 +496,7 @@ def meet_surfaces(
                     )
                     clamp = rules.clamp if paths.marks[p] & SCATTERED else np.inf
                     _ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, l_r, l_g, l_b, clamp)
-        u, v = uniform_pair(key, sample, first_pair + DIRECTION)
+        u, v = numbers[DIRECTION, 0, n], numbers[DIRECTION, 1, n]
         if kind == DIFFUSE:
             i_x, i_y, i_z = sample_cosine(u, v)
             pdf = i_z / math.pi
@@ -490,9 +523,10 @@ def meet_surfaces(
         _leave(paths, p, x, y, z, w_x, w_y, w_z, pdf)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_lit(first, last, paths, active, lit, share):
+@lean(cache=True, nogil=True)
+def add_lit(first, last, scratch, paths, active, lit, share):
     """Add what shadow rays brought: ``lit`` times the share of it that got through."""
     for k in range(first, last):
-        for channel in range(3):
-            paths.radiance_linear[active[k], channel] += lit[k, channel] * share[k, channel]
+        if share[k, 0] + share[k, 1] + share[k, 2] > 0.0:
+            for channel in range(3):
+                paths.radiance_linear[active[k], channel] += lit[k, channel] * share[k, channel]

@@ -9,11 +9,13 @@ cannot matter.
 import numpy as np
 from numba import njit
 
+from engine.trace.kernels_native import lean
+
 SCALE = 2.0**-32
 BELOW_ONE = 1.0 - 2.0**-24
 
 
-@njit(error_model="numpy", inline="always")
+@lean(inline="always")
 def hashed(x):
     """32 well mixed bits of a uint32."""
     x = np.uint32(x)
@@ -22,7 +24,7 @@ def hashed(x):
     return np.uint32(x ^ (x >> np.uint32(16)))
 
 
-@njit(error_model="numpy")
+@lean()
 def reversed_bits(x):
     """The bits of a uint32 in the opposite order."""
     x = np.uint32(x)
@@ -41,7 +43,7 @@ def reversed_bits(x):
     )
 
 
-@njit(error_model="numpy")
+@lean()
 def _upwards(x, seed):
     """Change each bit by a hash of the bits below it (Laine and Karras)."""
     x = np.uint32(x + seed)
@@ -51,7 +53,7 @@ def _upwards(x, seed):
     return np.uint32(x ^ np.uint32(x * np.uint32(0x8D22F6E6)))
 
 
-@njit(error_model="numpy")
+@lean()
 def sobol_pair(index):
     """The first two dimensions of Sobol's sequence, as uint32 fractions."""
     first = reversed_bits(index)
@@ -64,13 +66,13 @@ def sobol_pair(index):
     return first, second
 
 
-@njit(error_model="numpy")
+@lean()
 def pixel_key(seed, pixel):
     """What the numbers of a pixel begin from."""
     return hashed(np.uint32(hashed(np.uint32(seed)) + np.uint32(0x9E3779B9) * np.uint32(pixel)))
 
 
-@njit(error_model="numpy")
+@lean()
 def uniform_pair(key, sample, pair):
     """Two numbers in [0, 1) for number ``sample`` (below 65,536) in the pair of dimensions ``pair``."""
     seed = hashed(np.uint32(key + np.uint32(0x85EBCA6B) * np.uint32(pair + 1)))
@@ -88,3 +90,16 @@ def fill_uniform(seed, pixels, samples, pair, out):
     """The numbers of many (pixel, sample), for tests and for what draws them outside of the kernels."""
     for i in range(len(pixels)):
         out[i, 0], out[i, 1] = uniform_pair(pixel_key(seed, pixels[i]), samples[i], pair)
+
+
+@lean()
+def fill_pairs(keys, samples, count, first, numbers):
+    """:func:`uniform_pair` of ``count`` paths in the pairs of dimensions from ``first`` on.
+
+    ``numbers`` (pairs, 2, count or more) gets them. The loops go through without a branch, so that the
+    compiler does many paths at a time.
+    """
+    for pair in range(len(numbers)):
+        u, v = numbers[pair, 0], numbers[pair, 1]
+        for k in range(count):
+            u[k], v[k] = uniform_pair(keys[k], samples[k], first + pair)

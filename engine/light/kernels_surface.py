@@ -2,15 +2,14 @@
 
 import math
 
-from numba import njit
-
 from engine.light.kernels_texture import texture_value
+from engine.trace.kernels_native import lean
 
 DIFFUSE, MIRROR, GLASS, OPAQUE, LIGHT = 0, 1, 2, 3, 4
 OFFSET = 5e-6
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def hit_point(corners, a, b, c):
     """The point with weights a, b, c of the corners."""
     return (
@@ -20,14 +19,14 @@ def hit_point(corners, a, b, c):
     )
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def unit(x, y, z):
     """The vector with length 1."""
     length = max(math.sqrt(x * x + y * y + z * z), 1e-30)
     return x / length, y / length, z / length
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def face_normal(corners):
     """Unit normal of a triangle, on the side from which its corners run anticlockwise."""
     u_x, u_y, u_z = (
@@ -43,14 +42,14 @@ def face_normal(corners):
     return unit(u_y * v_z - u_z * v_y, u_z * v_x - u_x * v_z, u_x * v_y - u_y * v_x)
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def lifted(p_x, p_y, p_z, n_x, n_y, n_z):
     """The point a little off a surface along n, so that rounding does not put it behind the surface."""
     step = OFFSET * max(abs(p_x), abs(p_y), abs(p_z), 1e-3)
     return p_x + step * n_x, p_y + step * n_y, p_z + step * n_z
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def material_at(materials, m, u, v):
     """Base colour, metallic and roughness of material ``m`` at texture coordinates."""
     red, green, blue = (
@@ -70,7 +69,7 @@ def material_at(materials, m, u, v):
     return red, green, blue, metallic, roughness
 
 
-@njit(error_model="numpy")
+@lean()
 def vertex_colour(surfaces, face, a, b, c):
     """The colour of the corners of a face at a place, white where no mesh has colours of its own."""
     if len(surfaces.corner_rgb_linear) == 0:
@@ -78,7 +77,7 @@ def vertex_colour(surfaces, face, a, b, c):
     return hit_point(surfaces.corner_rgb_linear[face], a, b, c)
 
 
-@njit(error_model="numpy")
+@lean()
 def bumped_normal(materials, m, corners, uv, u, v, n_x, n_y, n_z, s_x, s_y, s_z, d_x, d_y, d_z):
     """The shading normal s turned as the normal texture says; n is the face's, on the viewer's side.
 
@@ -128,7 +127,7 @@ def bumped_normal(materials, m, corners, uv, u, v, n_x, n_y, n_z, s_x, s_y, s_z,
     return x, y, z
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def shading_normal(normals, a, b, c, n_x, n_y, n_z, d_x, d_y, d_z):
     """The interpolated normal on the side of n; n itself where the viewer would see it from behind."""
     s_x, s_y, s_z = hit_point(normals, a, b, c)
@@ -140,7 +139,7 @@ def shading_normal(normals, a, b, c, n_x, n_y, n_z, d_x, d_y, d_z):
     return s_x, s_y, s_z
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def reflected(d_x, d_y, d_z, n_x, n_y, n_z):
     """The direction d after a mirror with the normal n."""
     twice = 2.0 * (d_x * n_x + d_y * n_y + d_z * n_z)

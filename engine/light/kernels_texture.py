@@ -2,10 +2,10 @@
 
 import math
 
-from numba import njit
+from engine.trace.kernels_native import lean
 
 
-@njit(error_model="numpy")
+@lean(forceinline=True)
 def texture_value(materials, texture, u, v):
     """Bilinear linear value of a texture that repeats."""
     first, height, width = (

@@ -1,9 +1,10 @@
 """Stage files: TOML read and checked, and a commented one written. Imports neither torch nor numba."""
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -66,6 +67,18 @@ def named_files(stage: Stage) -> Iterator[tuple[str, str]]:
                 yield f"meshes[{number}].material.{key}", texture
 
 
+def with_files(stage: Stage, names: Mapping[str, str]) -> Stage:
+    """The stage with its files under other names, by those that they have."""
+    content = stage.model_dump(mode="json")
+    for key, name in named_files(stage):
+        *path, last = key.replace("[", ".").replace("]", "").split(".")
+        place: Any = content
+        for part in path:
+            place = place[int(part) if part.isdigit() else part]
+        place[last] = names.get(name, name)
+    return Stage.model_validate(content)
+
+
 @dataclass(frozen=True)
 class StageFacts:
     """What a first stage of a scene is fitted to.
@@ -114,19 +127,33 @@ def _vector(values: tuple[float, ...]) -> str:
 def _complaint(error: ValidationError) -> str:
     """The first thing that is wrong, with the key as one would look for it in the file."""
     first = error.errors()[0]
-    key = ""
-    for part in first["loc"]:
-        if isinstance(part, int):
-            key += f"[{part}]"
-        # The kinds of a union stand in the location too, but are no keys of the file.
-        elif not (key and part in _KINDS):
-            key += f".{part}" if key else str(part)
-    if first["type"] == "extra_forbidden":
+    return stage_complaint(first["type"], stage_keys(first["loc"]), first["msg"], first.get("input"))
+
+
+def stage_keys(location: Sequence[int | str]) -> tuple[int | str, ...]:
+    """Where pydantic finds a fault in a stage, as the keys of the file.
+
+    The kinds of a union stand in the location too, but are no keys.
+    """
+    return tuple(part for number, part in enumerate(location) if number == 0 or part not in _KINDS)
+
+
+def stage_complaint(kind: str, keys: Sequence[int | str], message: str, given: object) -> str:
+    """One of pydantic's faults as a sentence.
+
+    Args:
+        kind: of the fault, as pydantic calls it.
+        keys: where it is.
+        message: pydantic's own.
+        given: what is there.
+    """
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in keys).removeprefix(".")
+    if kind == "extra_forbidden":
         return f"there is no key {key}; see docs/light.md for those that there are."
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] in ("too_long", "missing", "value_error"):
+    message = message.removeprefix("Value error, ")
+    if kind in ("too_long", "missing", "value_error"):
         return f"{key or 'the stage'}: {message}."
-    return f"{key}: {message} (it is {str(first.get('input'))[:60]})."
+    return f"{key}: {message} (it is {str(given)[:60]})."
 
 
 _KINDS = (

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from engine.colour import srgb_to_linear
 from engine.errors import ConfigError
-from engine.light.arrays import Materials, Surfaces
+from engine.light.arrays import Materials, MeshQueries, Surfaces
 from engine.light.environment import EnvironmentMap, environment_frame, read_environment
 from engine.light.file_materials import FileMaterial, file_material
 from engine.light.kernels_surface import GLASS
@@ -56,6 +56,18 @@ class LitMeshes:
     obstacles: TriangleScene | None = None
     glass: TriangleScene | None = None
     glass_faces: Int64[np.ndarray, " g"] | None = None
+
+    @property
+    def queries(self) -> MeshQueries:
+        """What kernels ask Embree; good while this lives."""
+        if self.obstacles is None or self.glass is None or self.glass_faces is None:
+            every = self.triangles.any_query
+            no_glass = self.triangles.closest_query._replace(scene=0)
+            return MeshQueries(self.triangles.closest_query, every, every, no_glass, np.empty(0, np.int64))
+        return MeshQueries(
+            self.triangles.closest_query, self.triangles.any_query, self.obstacles.any_query,
+            self.glass.closest_query, self.glass_faces,
+        )  # fmt: skip
 
 
 def stage_meshes(

@@ -1,6 +1,6 @@
-"""Series of images of a scene: its photographs' views, turntables and paths, to image files or a video."""
+"""What is rendered of a scene: its photographs' views, turntables and paths, each image a shot."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,21 +11,18 @@ from jaxtyping import Float32, Float64, Int64
 from engine.gaussians.model import FlatGaussians
 from engine.rays import ImageRays
 from engine.render.cameras import RenderCamera, focal_from_fov
+from engine.render.framing import fitting_distance, seen_bounds
 from engine.render.images import exr_layers, write_exr, write_png
 from engine.render.names import render_names
 from engine.render.paths import Turntable, fit_turntable
-from engine.render.renderer import RenderedImage, render_rays
-from engine.render.video import VideoWriter
+from engine.render.renderer import render_rays
 from engine.scene import Camera, PosedView, Viewpoints
 from engine.trace.protocol import Tracer
-
-Progress = Callable[[int, int], None]
 
 DEFAULT_FOV_Y_DEGREES = 50.0
 _FOV_RANGE_DEGREES = (20.0, 90.0)
 _ROWS_OF_RAYS = 1 << 18
-_SPREAD_QUANTILE = 0.8
-_ELEVATION_DEGREES = 20.0
+ELEVATION_DEGREES = 20.0
 
 
 @dataclass(frozen=True)
@@ -39,6 +36,13 @@ class Shot:
 
     name: str
     rays: Callable[[], ImageRays]
+
+
+Paint = Callable[[Shot, Path, Callable[[float], None]], None]
+"""Renders a shot and writes it to a file, whose suffix says the format; told the share that is done.
+
+It raises :class:`engine.errors.OutputError` where the file cannot be written.
+"""
 
 
 def view_shots(
@@ -105,92 +109,52 @@ def gaussian_turntable(
     *,
     up_world: Float64[np.ndarray, "3"] | None = None,
     fov_y_degrees: float = DEFAULT_FOV_Y_DEGREES,
+    aspect: float = 1.0,
+    elevation_degrees: float = ELEVATION_DEGREES,
 ) -> Turntable:
-    """A turntable for a scene of which nothing but its Gaussians is known.
-
-    The centre is their median weighted by opacity; the camera looks down on it by 20 degrees from where four
-    fifths of all opacity fit into the image.
+    """A turntable for a scene of which nothing but its Gaussians is known: all that is seen of it fits.
 
     Args:
         gaussians: the scene.
         up_world: up; by default -y, as in most scenes that COLMAP made.
         fov_y_degrees: of the camera.
+        aspect: width over height of the images.
+        elevation_degrees: of the camera above the middle.
     """
-    up = np.array([0.0, -1.0, 0.0]) if up_world is None else up_world / np.linalg.norm(up_world)
-    points, weights = gaussians.means_world.astype(np.float64), gaussians.opacities
-    centre = np.array([_weighted_quantile(points[:, axis], weights, 0.5) for axis in range(3)])
-    spread = _weighted_quantile(np.linalg.norm(points - centre, axis=1), weights, _SPREAD_QUANTILE)
-    if not spread > 0:  # a single Gaussian, or all in one place
-        spread = float(np.median(gaussians.scales.max(axis=1)))
-    distance = spread / np.sin(np.radians(fov_y_degrees) / 2)
-    elevation = np.radians(_ELEVATION_DEGREES)
-    return Turntable(centre, up, float(distance * np.cos(elevation)), float(distance * np.sin(elevation)))
+    up = np.array([0.0, -1.0, 0.0]) if up_world is None else up_world
+    bounds = seen_bounds(gaussians, up)
+    distance = fitting_distance(bounds, elevation_degrees, fov_y_degrees, aspect)
+    elevation = np.radians(elevation_degrees)
+    radius, height = distance * np.cos(elevation), distance * np.sin(elevation)
+    return Turntable(bounds.centre_world, bounds.up_world, float(radius), float(height))
 
 
-def render_images(
-    tracer: Tracer,
-    shots: Sequence[Shot],
-    file_of: Callable[[int, Shot], Path],
-    background: Float32[np.ndarray, "3"],
-    progress: Progress = lambda _done, _total: None,
-) -> tuple[Path, ...]:
-    """Render each shot to a file of its own.
+def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"], *, transparent: bool = False) -> Paint:
+    """What renders a shot of a scene to a file.
+
+    ``.exr`` gets linear R, G, B, alpha A, the expected distance Z (0 where nothing is) and the world normal
+    N.x, N.y, N.z; anything else gets 8-bit display colours.
 
     Args:
         tracer: with the scene built.
-        shots: what to render.
-        file_of: the file of a shot, given its number and itself. ``.exr`` gets linear R, G, B, alpha A, the
-            expected distance Z (0 where nothing is) and the world normal N.x, N.y, N.z; anything else gets
-            8-bit display colours.
         background: display colour behind the scene.
-        progress: told (images done, images in all).
-
-    Returns:
-        The files.
-
-    Raises:
-        OutputError: a file cannot be written.
+        transparent: PNG get straight colours and alpha; the background should be black.
     """
-    paths = []
-    for number, shot, image in _rendered(tracer, shots, background, progress):
-        path = file_of(number, shot)
+
+    def paint(shot: Shot, path: Path, _part: Callable[[float], None]) -> None:
+        image = render_rays(tracer, shot.rays(), background)
         if path.suffix.lower() == ".exr":
             layers = exr_layers(
                 image.rgb_srgb, alpha=image.alpha, depth=image.depth, normals_world=image.normal_world
             )
             write_exr(path, layers)
+        elif transparent:
+            straight = image.rgb_srgb / np.maximum(image.alpha, 1e-6)[..., None]
+            write_png(path, np.clip(straight, 0, 1), image.alpha)
         else:
             write_png(path, image.rgb_srgb)
-        paths.append(path)
-    return tuple(paths)
 
-
-def render_video(
-    tracer: Tracer,
-    cameras: Sequence[RenderCamera],
-    path: Path,
-    fps: float,
-    background: Float32[np.ndarray, "3"],
-    progress: Progress = lambda _done, _total: None,
-) -> None:
-    """Render cameras of one image size as the frames of a video.
-
-    Raises:
-        OutputError: the video cannot be written.
-    """
-    first = cameras[0]
-    with VideoWriter(path, fps, first.width_px, first.height_px) as video:
-        for _, _, image in _rendered(tracer, camera_shots(cameras), background, progress):
-            video.write(image.rgb_srgb)
-
-
-def _rendered(
-    tracer: Tracer, shots: Sequence[Shot], background: Float32[np.ndarray, "3"], progress: Progress
-) -> Iterator[tuple[int, Shot, RenderedImage]]:
-    progress(0, len(shots))
-    for number, shot in enumerate(shots):
-        yield number, shot, render_rays(tracer, shot.rays(), background)
-        progress(number + 1, len(shots))
+    return paint
 
 
 def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:
@@ -205,11 +169,3 @@ def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:
         world = directions @ view.rotation_cam_from_world
         directions_world[top : top + rows] = world.reshape(-1, width, 3)
     return ImageRays.of(view.origin_world, directions_world, near_world)
-
-
-def _weighted_quantile(
-    values: Float64[np.ndarray, " n"], weights: Float32[np.ndarray, " n"], quantile: float
-) -> float:
-    order = np.argsort(values)
-    sums = np.cumsum(weights[order], dtype=np.float64)
-    return float(values[order[np.searchsorted(sums, quantile * sums[-1])]])

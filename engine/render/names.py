@@ -19,3 +19,11 @@ def render_names(photographs: Sequence[str]) -> tuple[str, ...]:
     ]
     unique = len({name.casefold() for name in names}) == len(names)
     return tuple(names if unique else photographs)
+
+
+def names_by_number(pattern: Path) -> bool:
+    """Whether a file name has one place for a number, as ``frame_%04d.png``."""
+    try:
+        return bool(pattern.name % 0 != pattern.name % 1)
+    except (TypeError, ValueError):
+        return False

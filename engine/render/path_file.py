@@ -3,15 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from engine.errors import ConfigError, OutputError
 from engine.render.cameras import RenderCamera, focal_from_fov
+from engine.render.paths import PosePath
 from engine.writing import write_json
 
+MAX_FRAMES = 100_000
 _RIGID_TOLERANCE = 1e-3
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -56,7 +58,27 @@ class _File(BaseModel):
     width: Annotated[int, Field(gt=0, le=16384)]
     height: Annotated[int, Field(gt=0, le=16384)]
     fps: _Positive = 30.0
-    frames: Annotated[list[_Frame], Field(min_length=1)]
+    frames: Annotated[list[_Frame] | None, Field(min_length=1)] = None
+    keys: Annotated[list[_Frame] | None, Field(min_length=2)] = None
+    seconds: _Positive | None = None
+    closed: bool = False
+    ease: Literal["none", "in-out"] = "none"
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> "_File":
+        if (self.frames is None) == (self.keys is None):
+            raise ValueError("needs either frames or keys")
+        if (self.keys is None) != (self.seconds is None):
+            raise ValueError("keys need seconds, and frames have none")
+        if self.frames is not None and (self.closed or self.ease != "none"):
+            raise ValueError("closed and ease go with keys")
+        if self.closed and self.ease != "none":
+            raise ValueError(
+                "a closed path goes on where it began, so it cannot slow down there; leave out ease"
+            )
+        if self.seconds is not None and self.seconds * self.fps > MAX_FRAMES:
+            raise ValueError(f"seconds and fps make more than {MAX_FRAMES:,} frames")
+        return self
 
 
 def read_camera_path(path: Path) -> CameraPath:
@@ -73,7 +95,11 @@ def read_camera_path(path: Path) -> CameraPath:
         raise ConfigError(
             f"The camera path {path} is not valid: {_first(error)} (docs/cameras.md tells the format)."
         ) from error
-    return CameraPath(content.fps, tuple(_camera(content, frame) for frame in content.frames))
+    given = tuple(_camera(content, frame) for frame in content.frames or content.keys or ())
+    try:
+        return CameraPath(content.fps, given if content.frames else _between_keys(content, given))
+    except ConfigError as error:
+        raise ConfigError(f"The camera path {path} is not valid: {error}") from None
 
 
 def write_camera_path(path: Path, camera_path: CameraPath) -> None:
@@ -114,6 +140,24 @@ def _camera(content: _File, frame: _Frame) -> RenderCamera:
         fx, fy = frame.fx, frame.fy  # type: ignore[assignment]
     return RenderCamera.from_pose(
         pose, content.width, content.height, fx_px=fx, fy_px=fy, cx_px=frame.cx, cy_px=frame.cy
+    )
+
+
+def _between_keys(content: _File, keys: tuple[RenderCamera, ...]) -> tuple[RenderCamera, ...]:
+    """Cameras in equal steps of time along a smooth path through the keys, as are their lenses."""
+    assert content.seconds is not None
+    path = PosePath(np.stack([key.world_from_cam for key in keys]), content.closed)
+    frames = max(2, round(content.seconds * content.fps))
+    times = np.linspace(0.0, 1.0, frames, endpoint=not content.closed)
+    if content.ease == "in-out":
+        times = times * times * (3.0 - 2.0 * times)
+    lenses = np.array([[key.fx_px, key.fy_px, key.cx_px, key.cy_px] for key in keys])
+    if content.closed:
+        lenses = np.concatenate([lenses, lenses[:1]])
+    between = np.stack([np.interp(times, path.key_times, lens) for lens in lenses.T], axis=1)
+    return tuple(
+        RenderCamera.from_pose(pose, content.width, content.height, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy)
+        for pose, (fx, fy, cx, cy) in zip(path.at(times), between.tolist(), strict=True)
     )
 
 

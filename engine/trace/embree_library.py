@@ -84,6 +84,18 @@ def occluded1_address() -> int:
     return _address("rtcOccluded1")
 
 
+@cache
+def intersect8_address() -> int:
+    """Address of rtcIntersect8, for eight rays through triangles."""
+    return _address("rtcIntersect8")
+
+
+@cache
+def occluded8_address() -> int:
+    """Address of rtcOccluded8."""
+    return _address("rtcOccluded8")
+
+
 def _address(name: str) -> int:
     address = ctypes.cast(getattr(library(), name), ctypes.c_void_p).value
     assert address is not None

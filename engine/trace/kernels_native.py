@@ -36,17 +36,33 @@ float64_pointer = _pointer_cast(types.float64)
 uint64_pointer = _pointer_cast(types.uint64)
 
 
+def _call(context, builder, args):
+    """Call the address ``args[0]`` with the others as pointers."""
+    pointer = ir.IntType(8).as_pointer()
+    function_type = ir.FunctionType(ir.VoidType(), [pointer] * (len(args) - 1))
+    address = builder.inttoptr(args[0], function_type.as_pointer())
+    builder.call(address, [builder.inttoptr(argument, pointer) for argument in args[1:]])
+    return context.get_dummy_value()
+
+
 @intrinsic
 def call_with_three_pointers(typingctx, function, first, second, third):
     """Call ``void function(void*, void*, void*)`` at a run-time address."""
     signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp)
 
     def codegen(context, builder, sig, args):
-        pointer = ir.IntType(8).as_pointer()
-        function_type = ir.FunctionType(ir.VoidType(), [pointer, pointer, pointer])
-        address = builder.inttoptr(args[0], function_type.as_pointer())
-        builder.call(address, [builder.inttoptr(argument, pointer) for argument in args[1:]])
-        return context.get_dummy_value()
+        return _call(context, builder, args)
+
+    return signature, codegen
+
+
+@intrinsic
+def call_with_four_pointers(typingctx, function, first, second, third, fourth):
+    """Call ``void function(void*, void*, void*, void*)`` at a run-time address."""
+    signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        return _call(context, builder, args)
 
     return signature, codegen
 

@@ -1,77 +1,116 @@
-"""Rays through triangles: Embree's own tests, called in a loop."""
+"""Rays through triangles: Embree's own tests of eight rays at a time, called in a loop.
+
+Embree gives each ray of eight what it would give that ray alone.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_native import call_with_three_pointers
+from engine.trace.kernels_native import call_with_four_pointers, lean
 
-# --- RTCRayHit in 32-bit words ---
-T_NEAR, T_FAR, MASK, ID, FLAGS = 3, 8, 9, 10, 11
+LANES = 8
+# --- RTCRayHit8: a row of eight 32-bit words each ---
+ORIGIN, T_NEAR, DIRECTION, TIME, T_FAR, MASK, ID, FLAGS = 0, 3, 4, 7, 8, 9, 10, 11
 U, V, FACE, GEOMETRY, INSTANCE = 15, 16, 17, 18, 19
-RAY_WORDS = 32
+# --- behind it in the scratch memory: which lanes count, and RTCIntersectArguments ---
+VALID, ARGUMENTS = 24, 25
+SCRATCH_ROWS = 26
+COHERENT = 1 << 16
+EVERY_FEATURE = -1
 NO_HIT = -1
 
 
-@njit(error_model="numpy")
-def _write_ray(words, origins, directions, t_min, t_max, r):
-    """Fill in the query of ray ``r``; a single origin or limit stands for all rays."""
+class TriangleQuery(NamedTuple):
+    """Addresses of a function of Embree for eight rays, and of the scene that it is to search."""
+
+    function: int
+    scene: int
+
+
+@lean()
+def _ask(query, origins, directions, t_min, t_max, which, k, last, coherent, words):
+    """Search along rays ``k`` and the next ones before ``last``; a single origin or limit stands for all."""
     whole = words.view(np.int32)
-    o = r if len(origins) > 1 else 0
-    for axis in range(3):
-        words[axis] = origins[o, axis]
-        words[4 + axis] = directions[r, axis]
-    words[7] = np.float32(0.0)
-    words[T_NEAR] = t_min[r if len(t_min) > 1 else 0]
-    words[T_FAR] = t_max[r if len(t_max) > 1 else 0]
-    whole[MASK], whole[ID], whole[FLAGS] = -1, 0, 0
-    whole[FACE], whole[GEOMETRY], whole[INSTANCE] = NO_HIT, NO_HIT, NO_HIT
+    for lane in range(LANES):
+        at = min(k + lane, last - 1)
+        r = which[at] if len(which) else at
+        o = r if len(origins) > 1 else 0
+        for axis in range(3):
+            words[(ORIGIN + axis) * LANES + lane] = origins[o, axis]
+            words[(DIRECTION + axis) * LANES + lane] = directions[r, axis]
+        near, far = t_min[r if len(t_min) > 1 else 0], t_max[r if len(t_max) > 1 else 0]
+        words[T_NEAR * LANES + lane] = near
+        words[T_FAR * LANES + lane] = far
+        words[TIME * LANES + lane] = np.float32(0.0)
+        whole[MASK * LANES + lane] = -1
+        whole[ID * LANES + lane] = 0
+        whole[FLAGS * LANES + lane] = 0
+        whole[FACE * LANES + lane] = NO_HIT
+        whole[GEOMETRY * LANES + lane] = NO_HIT
+        whole[INSTANCE * LANES + lane] = NO_HIT
+        whole[VALID * LANES + lane] = -1 if k + lane < last and near <= far else 0
+    whole[ARGUMENTS * LANES] = COHERENT if coherent else 0
+    whole[ARGUMENTS * LANES + 1] = EVERY_FEATURE
+    for word in range(2, 8):
+        whole[ARGUMENTS * LANES + word] = 0
+    address = words.ctypes.data
+    call_with_four_pointers(
+        query.function, address + 4 * VALID * LANES, query.scene, address, address + 4 * ARGUMENTS * LANES
+    )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@lean(cache=True, nogil=True)
 def closest_hits(
-    intersect1, scene, origins, directions, t_min, t_max, first, last, distances, faces, barycentrics
-):
-    """The first triangle on rays ``first`` to ``last``."""
-    words = np.empty(RAY_WORDS, np.float32)
-    whole = words.view(np.int32)
-    for r in range(first, last):
-        _write_ray(words, origins, directions, t_min, t_max, r)
-        call_with_three_pointers(intersect1, scene, words.ctypes.data, 0)
-        faces[r] = whole[FACE]
-        hit = whole[FACE] != NO_HIT
-        distances[r] = words[T_FAR] if hit else np.float32(np.inf)
-        barycentrics[r, 0] = words[U] if hit else np.float32(0.0)
-        barycentrics[r, 1] = words[V] if hit else np.float32(0.0)
+    query, origins, directions, t_min, t_max, which, first, last, coherent, scratch,
+    distances, faces, barycentrics,
+):  # fmt: skip
+    """The first triangle on each ray; rows ``first`` to ``last`` of the results get it.
+
+    ``which`` says the ray of each row and is empty where they are the same; ``coherent`` whether neighbours
+    go about one way. ``scratch`` is one thread's own 26 rows of 8 words, which begin on a cache line.
+    """
+    whole = scratch.view(np.int32)
+    for k in range(first, last, LANES):
+        _ask(query, origins, directions, t_min, t_max, which, k, last, coherent, scratch)
+        for lane in range(min(LANES, last - k)):
+            face = whole[FACE * LANES + lane]
+            faces[k + lane] = face
+            hit = face != NO_HIT
+            distances[k + lane] = scratch[T_FAR * LANES + lane] if hit else np.float32(np.inf)
+            barycentrics[k + lane, 0] = scratch[U * LANES + lane] if hit else np.float32(0.0)
+            barycentrics[k + lane, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def any_hits(occluded1, scene, origins, directions, t_min, t_max, first, last, occluded):
-    """Whether any triangle lies on rays ``first`` to ``last``."""
-    words = np.empty(RAY_WORDS, np.float32)
-    for r in range(first, last):
-        _write_ray(words, origins, directions, t_min, t_max, r)
-        empty = not words[T_NEAR] <= words[T_FAR]  # Embree would call this a hit
-        call_with_three_pointers(occluded1, scene, words.ctypes.data, 0)
-        occluded[r] = words[T_FAR] == -np.inf and not empty
+@lean(cache=True, nogil=True)
+def any_hits(query, origins, directions, t_min, t_max, which, first, last, scratch, occluded):
+    """Whether any triangle lies on each ray; see :func:`closest_hits`."""
+    for k in range(first, last, LANES):
+        _ask(query, origins, directions, t_min, t_max, which, k, last, False, scratch)
+        for lane in range(min(LANES, last - k)):
+            occluded[k + lane] = scratch[T_FAR * LANES + lane] == -np.inf
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def closest_hits_side_by_side(
-    intersect1, scene, origins, directions, t_min, t_max, chunks, distances, faces, barycentrics
+    query, origins, directions, t_min, t_max, which, scratch, distances, faces, barycentrics
 ):
-    """:func:`closest_hits` on all rays and several threads."""
-    count = len(directions)
+    """:func:`closest_hits` on all rays and several threads; ``scratch`` has a row for each chunk of them."""
+    count, chunks = len(directions), len(scratch)
     for c in prange(chunks):
         closest_hits(
-            intersect1, scene, origins, directions, t_min, t_max,
-            c * count // chunks, (c + 1) * count // chunks, distances, faces, barycentrics,
+            query, origins, directions, t_min, t_max, which, c * count // chunks, (c + 1) * count // chunks,
+            False, scratch[c], distances, faces, barycentrics,
         )  # fmt: skip
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def any_hits_side_by_side(occluded1, scene, origins, directions, t_min, t_max, chunks, occluded):
+def any_hits_side_by_side(query, origins, directions, t_min, t_max, which, scratch, occluded):
     """:func:`any_hits` on all rays and several threads."""
-    count = len(directions)
+    count, chunks = len(directions), len(scratch)
     for c in prange(chunks):
-        first, last = c * count // chunks, (c + 1) * count // chunks
-        any_hits(occluded1, scene, origins, directions, t_min, t_max, first, last, occluded)
+        any_hits(
+            query, origins, directions, t_min, t_max, which, c * count // chunks, (c + 1) * count // chunks,
+            scratch[c], occluded,
+        )  # fmt: skip

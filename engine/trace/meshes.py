@@ -8,8 +8,12 @@ from jaxtyping import Bool, Float, Float32, Int, Int32
 
 from engine.rays import RayBatch
 from engine.threads import use_threads
-from engine.trace.embree_library import Device, MeshScene, intersect1_address, occluded1_address
+from engine.trace.cpu.memory import aligned_empty
+from engine.trace.embree_library import Device, MeshScene, intersect8_address, occluded8_address
 from engine.trace.kernels_triangles import (
+    LANES,
+    SCRATCH_ROWS,
+    TriangleQuery,
     any_hits,
     any_hits_side_by_side,
     closest_hits,
@@ -79,28 +83,46 @@ class TriangleScene:
         count = len(rays)
         distances, faces = np.empty(count, np.float32), np.empty(count, np.int32)
         barycentrics = np.empty((count, 2), np.float32)
-        query = (intersect1_address(), self._scene.handle, *_arrays(rays))
+        query = (self.closest_query, *_arrays(rays), _EACH)
         if self._threads == 1:
-            closest_hits(*query, 0, count, distances, faces, barycentrics)
+            closest_hits(*query, 0, count, False, new_scratch(1)[0], distances, faces, barycentrics)
         else:
             use_threads(self._threads)
-            closest_hits_side_by_side(*query, self._chunks(count), distances, faces, barycentrics)
+            closest_hits_side_by_side(*query, self._scratch(count), distances, faces, barycentrics)
         return TriangleHits(distances, faces, barycentrics)
 
     def occluded(self, rays: RayBatch) -> Bool[np.ndarray, " r"]:
         """Whether any triangle lies between ``t_min`` and ``t_max`` of each ray; cheaper than the first."""
         count = len(rays)
         found = np.empty(count, np.bool_)
-        query = (occluded1_address(), self._scene.handle, *_arrays(rays))
+        query = (self.any_query, *_arrays(rays), _EACH)
         if self._threads == 1:
-            any_hits(*query, 0, count, found)
+            any_hits(*query, 0, count, new_scratch(1)[0], found)
         else:
             use_threads(self._threads)
-            any_hits_side_by_side(*query, self._chunks(count), found)
+            any_hits_side_by_side(*query, self._scratch(count), found)
         return found
 
-    def _chunks(self, count: int) -> int:
-        return max(1, min(count, CHUNKS_PER_THREAD * self._threads))
+    @property
+    def closest_query(self) -> TriangleQuery:
+        """What :func:`engine.trace.kernels_triangles.closest_hits` is to ask; good while this lives."""
+        return TriangleQuery(intersect8_address(), self._scene.handle)
+
+    @property
+    def any_query(self) -> TriangleQuery:
+        """What :func:`engine.trace.kernels_triangles.any_hits` is to ask; good while this lives."""
+        return TriangleQuery(occluded8_address(), self._scene.handle)
+
+    def _scratch(self, rays: int) -> Float32[np.ndarray, "c w"]:
+        return new_scratch(max(1, min(rays, CHUNKS_PER_THREAD * self._threads)))
+
+
+_EACH = np.empty(0, np.int32)
+
+
+def new_scratch(chunks: int) -> Float32[np.ndarray, "c w"]:
+    """Memory in which kernels ask Embree, a row for each that runs at the same time."""
+    return aligned_empty((chunks, SCRATCH_ROWS * LANES))
 
 
 def _arrays(rays: RayBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

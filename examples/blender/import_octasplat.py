@@ -174,10 +174,14 @@ def add_cameras(path):
     scene, camera = bpy.context.scene, new_camera()
     scene.render.resolution_x, scene.render.resolution_y = width, height
     scene.render.fps = max(1, round(content.get("fps", 30)))
-    scene.frame_start, scene.frame_end = 1, len(content["frames"])
+    poses = content.get("frames") or content["keys"]
+    # Between the keys of a path Blender goes its own way, with the same keys at the same times.
+    frames = max(len(poses), round(content.get("seconds", 0) * scene.render.fps))
+    scene.frame_start, scene.frame_end = 1, frames
     camera.rotation_mode = "QUATERNION"
     last = None
-    for number, frame in enumerate(content["frames"], start=1):
+    for place, frame in enumerate(poses):
+        number = 1 + round(place * (frames - 1) / max(1, len(poses) - 1))
         if "fov_y_degrees" in frame:
             fx = fy = height / 2 / math.tan(math.radians(frame["fov_y_degrees"]) / 2)
         else:

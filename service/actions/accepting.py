@@ -1,7 +1,7 @@
 """Jobs taken on: new ones, and those that are tried again."""
 
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -10,6 +10,7 @@ from engine.errors import ConfigError
 from service.actions.access import owned_job, refuse_while_draining
 from service.actions.asked import accepted_kind, input_problem, resolved
 from service.actions.jobs import job_view
+from service.actions.named_files import check_named_files
 from service.auth import Principal
 from service.idempotency import fingerprint, once
 from service.limits import check_ceilings, check_priority, estimate_job
@@ -45,6 +46,7 @@ class _Inputs:
     dataset_id: uuid.UUID | None
     source_id: uuid.UUID | None
     options: BaseModel
+    files_id: uuid.UUID | None = None
 
 
 async def accept_job(
@@ -102,7 +104,7 @@ async def retry_job(
         async def make() -> uuid.UUID:
             await check_new_job(connection, owner, service.settings.quota)
             job = await owned_job(connection, who, job_id, lock=True)
-            options, estimate = await _revised(connection, service, job, asked)
+            options, estimate = await _revised(connection, service, who, job, asked)
             await rows.retry_job(
                 connection,
                 service.slips,
@@ -136,6 +138,7 @@ async def _make_job(connection: Connection, service: Service, who: Principal, as
         source_id=inputs.source_id,
         label=new.label,
         estimate=_stored(estimate_job(kind, inputs.options, sizes, workers)),
+        files_id=inputs.files_id,
         traceparent=asked.traceparent,
     )
     job_id = (await rows.create_job(connection, service.slips, made)).id
@@ -153,9 +156,11 @@ async def _make_job(connection: Connection, service: Service, who: Principal, as
 
 async def _inputs(connection: Connection, who: Principal, asked: _Asked) -> _Inputs:
     """What the job works on, checked."""
-    if asked.kind.needs == "result":
-        return await _source(connection, who, asked)
-    return await _dataset(connection, who, asked)
+    needed = _source if asked.kind.needs == "result" else _dataset
+    inputs = await needed(connection, who, asked)
+    files_id = asked.new.files_id
+    await check_named_files(connection, who, asked.kind, inputs.options, files_id)
+    return replace(inputs, files_id=files_id)
 
 
 async def _source(connection: Connection, who: Principal, asked: _Asked) -> _Inputs:
@@ -180,6 +185,8 @@ async def _dataset(connection: Connection, who: Principal, asked: _Asked) -> _In
     dataset = await get_dataset(connection, new.dataset_id, lock=True)
     if dataset is None or not who.owns(dataset.owner):
         raise input_problem("dataset_id", "There is no such dataset.")
+    if dataset.holds != "photographs":
+        raise input_problem("dataset_id", "The dataset holds no photographs; give it as files_id.")
     if dataset.state != "committed":
         raise Problem(409, "dataset-open", "The dataset is not committed yet; POST to its /commit first.")
     if kind.needs_poses(asked.options) and not dataset.has_poses:
@@ -189,7 +196,7 @@ async def _dataset(connection: Connection, who: Principal, asked: _Asked) -> _In
 
 
 async def _revised(
-    connection: Connection, service: Service, job: Job, asked: RetryRequest
+    connection: Connection, service: Service, who: Principal, job: Job, asked: RetryRequest
 ) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     """The options of a job that is tried again, checked, and their estimate; None leaves them as they are."""
     workers = await workers_of(connection, job.queue, service.settings.stale_seconds)
@@ -206,6 +213,7 @@ async def _revised(
     except ValidationError as error:
         raise refused_options(error) from None
     check_writable(kind, options, job.queue, workers)
+    await check_named_files(connection, who, kind, options, job.files_id)
     sizes = await photograph_sizes(connection, job.dataset_id) if job.dataset_id is not None else []
     check_ceilings(kind, options, sizes, service.settings)
     if not asked.options:

@@ -11,6 +11,7 @@ from service.auth import Principal
 from service.idempotency import fingerprint, once
 from service.intake.dataset import DatasetFile as IntakeFile
 from service.intake.dataset import DatasetSummary, check_dataset
+from service.intake.inputs import check_inputs
 from service.schemas.datasets import DatasetChange, NewDataset
 from service.state import Service
 from workers.records import datasets as rows
@@ -31,9 +32,9 @@ async def create_dataset(
 
         async def make() -> uuid.UUID:
             await check_new_dataset(connection, who.owner, service.settings.quota)
-            return (await rows.create_dataset(connection, who.owner, new.name)).id
+            return (await rows.create_dataset(connection, who.owner, new.name, new.holds)).id
 
-        request = fingerprint("dataset", new.model_dump())
+        request = fingerprint("dataset", new.model_dump(exclude=set() if new.holds == "files" else {"holds"}))
         dataset_id, _ = await once(connection, who, key, request, make)
         return await owned_dataset(connection, who, dataset_id)
 
@@ -102,19 +103,27 @@ async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
         if before.state == "committed":
             return before
         files = await rows.files_of(connection, dataset_id)
-    summary: DatasetSummary | None = None
+    summary: DatasetSummary | dict[str, Any] | None = None
     try:
-        summary = await asyncio.to_thread(check_dataset, service.storage, [_for_intake(f) for f in files])
+        known = [_for_intake(f) for f in files]
+        if before.holds == "files":
+            summary = check_inputs(known)
+        else:
+            summary = await asyncio.to_thread(check_dataset, service.storage, known)
     finally:
         # Whatever happens, the dataset must not stay closed.
         dataset = await asyncio.shield(_end_check(service, dataset_id, summary))
     return dataset
 
 
-async def _end_check(service: Service, dataset_id: uuid.UUID, summary: DatasetSummary | None) -> Dataset:
+async def _end_check(
+    service: Service, dataset_id: uuid.UUID, summary: DatasetSummary | dict[str, Any] | None
+) -> Dataset:
     async with service.pool.connection() as connection:
         if summary is None:
             return await rows.end_check(connection, dataset_id, sound=False)
+        if isinstance(summary, dict):
+            return await rows.end_check(connection, dataset_id, sound=True, facts=summary)
         facts: dict[str, Any] = asdict(summary)
         photographs, has_poses = facts.pop("photographs"), facts.pop("has_model")
         return await rows.end_check(

@@ -8,9 +8,17 @@ from typing import TypeVar
 from service.actions.access import open_dataset, owned_dataset, refuse_while_draining, sought
 from service.actions.parts import Part, cut
 from service.auth import Principal
+from service.intake.dataset import check_file_content
+from service.intake.inputs import check_input_content, check_input_name
 from service.intake.names import check_file_name
-from service.intake.receive import ReceivedArchive, ReceivedFile, receive_archive, receive_file
-from service.problems import not_found
+from service.intake.receive import (
+    ContentCheck,
+    ReceivedArchive,
+    ReceivedFile,
+    receive_archive,
+    receive_file,
+)
+from service.problems import Problem, not_found
 from service.state import Service
 from workers.queue.storing import Note
 from workers.records import datasets as rows
@@ -106,10 +114,10 @@ async def put_file(
         QuotaExceeded: its owner may not store as much.
         StorageError: it is not as announced, or there is no room.
     """
-    check_file_name(path)
     refuse_while_draining(service)
     async with service.pool.connection() as connection:
         dataset = await open_dataset(connection, who, dataset_id)
+        check = _name_checked(dataset, path)
         known = await rows.get_file(connection, dataset_id, path)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
     if known is not None and upload.sha256 == known.sha256:
@@ -126,6 +134,7 @@ async def put_file(
             size_bytes=upload.size_bytes,
             limits=service.settings.upload_limits(),
             max_bytes=left,
+            check=check,
         )
 
     async with service.room.upload(upload.size_bytes) as note:
@@ -148,6 +157,8 @@ async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, u
     async with service.pool.connection() as connection:
         dataset = await open_dataset(connection, who, dataset_id)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
+    if dataset.holds == "files":
+        raise Problem(409, "holds-files", "Files that options name are sent one by one, not as an archive.")
 
     def receive() -> Awaitable[ReceivedArchive]:
         return receive_archive(
@@ -164,6 +175,15 @@ async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, u
         received = await _within_quota(receive, left)
         files = await _enter(service, dataset, note, received.files)
     return PutArchive(files, received.left_out)
+
+
+def _name_checked(dataset: Dataset, path: str) -> ContentCheck:
+    """What looks at the content of a file whose name is taken; raises IntakeRefused where it is not."""
+    if dataset.holds == "files":
+        check_input_name(path)
+        return check_input_content
+    check_file_name(path)
+    return check_file_content
 
 
 async def _within_quota(receive: Callable[[], Awaitable[Received]], left: int | None) -> Received:

@@ -5,7 +5,7 @@ import base64
 import binascii
 import re
 import tempfile
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -13,7 +13,7 @@ from typing import BinaryIO
 from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
 from service.intake.dataset import DatasetLimits, check_file_content
 from service.intake.faults import Fault, IntakeRefused
-from service.intake.images import ImageHeader
+from service.intake.images import ImageHeader, ImageLimits
 from workers.store.counting import CountingWriter
 from workers.store.os_errors import told
 from workers.store.protocol import Blob, BlobWriter, Storage
@@ -73,6 +73,8 @@ class UploadLimits:
 
 
 DEFAULT_LIMITS = UploadLimits()
+ContentCheck = Callable[[Storage, str, str, ImageLimits], ImageHeader | None]
+"""Looks at content that is stored, given its name, digest and limits; see :func:`receive_file`."""
 
 
 def parse_digest(repr_digest: str | None) -> str | None:
@@ -148,6 +150,7 @@ async def receive_file(
     size_bytes: int | None = None,
     limits: UploadLimits = DEFAULT_LIMITS,
     max_bytes: int | None = None,
+    check: ContentCheck = check_file_content,
 ) -> ReceivedFile:
     """Take in one file of a dataset. It is stored, but belongs to nothing yet.
 
@@ -159,6 +162,7 @@ async def receive_file(
         size_bytes: length that was announced.
         limits: what is taken.
         max_bytes: a lower limit than that of ``limits``, e.g. what a quota leaves.
+        check: looks at the content.
 
     Raises:
         IntakeRefused: the header of the image is refused, or nothing came for too long.
@@ -167,7 +171,7 @@ async def receive_file(
     most = limits.max_file_bytes if max_bytes is None else min(limits.max_file_bytes, max_bytes)
     writer = await asyncio.to_thread(storage.begin, sha256=sha256, size_bytes=size_bytes, max_bytes=most)
     blob = await receive(stream, writer, idle_seconds=limits.idle_seconds)
-    header = await asyncio.to_thread(check_file_content, storage, path, blob.sha256, limits.dataset.image)
+    header = await asyncio.to_thread(check, storage, path, blob.sha256, limits.dataset.image)
     return ReceivedFile(path, blob, header_facts(header))
 
 

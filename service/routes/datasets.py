@@ -42,7 +42,7 @@ FilePath = Annotated[str, Path(max_length=1000, description="Such as images/0001
 async def create_dataset(
     new: NewDataset, who: Writer, service: ServiceDep, response: Response, key: IdempotencyKey = None
 ) -> DatasetView:
-    """Make a dataset to put photographs into."""
+    """Make a dataset to put photographs into, or files that the options of jobs name."""
     dataset = await actions.create_dataset(service, who, new, key=key)
     response.headers["Location"] = f"/v1/datasets/{dataset.id}"
     return DatasetView.of(dataset)

@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, Strict
-from workers.records.rows import Dataset, DatasetFile, DatasetState
+from workers.records.rows import Dataset, DatasetFile, DatasetHolds, DatasetState
 
 
 class NewDataset(Strict):
@@ -16,6 +16,11 @@ class NewDataset(Strict):
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"name": "fox"}]})
 
     name: str = Field("", max_length=200, description="What you call it.")
+    holds: DatasetHolds = Field(
+        "photographs",
+        description="`files` takes what the options of a job name, such as the meshes, textures and "
+        "surroundings of a stage, under names of your own; jobs get them by `files_id`.",
+    )
 
 
 class DatasetChange(Strict):
@@ -36,6 +41,7 @@ class DatasetView(BaseModel):
                 {
                     "id": EXAMPLE_ID,
                     "name": "fox",
+                    "holds": "photographs",
                     "state": "committed",
                     "has_poses": True,
                     "photographs": 50,
@@ -51,6 +57,7 @@ class DatasetView(BaseModel):
 
     id: uuid.UUID
     name: str
+    holds: DatasetHolds
     state: DatasetState = Field(description="`open` takes files, `committed` never changes again.")
     has_poses: bool = Field(description="Whether it holds a COLMAP model; if not, ask for `poses: auto`.")
     photographs: int

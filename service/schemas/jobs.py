@@ -22,6 +22,18 @@ class NewJob(Strict):
             "examples": [
                 {"dataset_id": EXAMPLE_ID, "options": {"preset": "fast"}},
                 {"kind": "export", "source_id": EXAMPLE_ID, "options": {"files": ["scene.glb"]}},
+                {
+                    "kind": "render",
+                    "source_id": EXAMPLE_ID,
+                    "files_id": EXAMPLE_ID,
+                    "options": {
+                        "frames": 60,
+                        "stage": {
+                            "meshes": [{"file": "chair.glb", "material": {"kind": "mirror"}}],
+                            "lights": [{"kind": "directional", "direction": [0, 1, 0], "irradiance": 2}],
+                        },
+                    },
+                },
             ]
         },
     )
@@ -29,6 +41,9 @@ class NewJob(Strict):
     kind: str = Field("reconstruct", max_length=40, description="One of GET /v1/options.")
     dataset_id: uuid.UUID | None = Field(None, description="A committed dataset, for kinds that need one.")
     source_id: uuid.UUID | None = Field(None, description="A job that succeeded, for kinds that work on one.")
+    files_id: uuid.UUID | None = Field(
+        None, description="A committed dataset that holds the files which the options name."
+    )
     options: dict[str, Any] = Field(default_factory=dict, description="See GET /v1/options/{kind}.")
     label: str | None = Field(None, max_length=200)
     queue: str = Field("cpu", pattern="^[a-z][a-z0-9_-]{0,40}$", description="Workers that take this queue.")
@@ -91,6 +106,7 @@ class JobView(BaseModel):
                     "kind": "reconstruct",
                     "dataset_id": EXAMPLE_ID,
                     "source_id": None,
+                    "files_id": None,
                     "label": "fox, first try",
                     "options": {"preset": "fast"},
                     "queue": "cpu",
@@ -134,6 +150,7 @@ class JobView(BaseModel):
     kind: str
     dataset_id: uuid.UUID | None
     source_id: uuid.UUID | None
+    files_id: uuid.UUID | None = None
     label: str | None
     options: dict[str, Any] = Field(description="Every setting, resolved when the job was accepted.")
     queue: str

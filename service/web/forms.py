@@ -43,6 +43,7 @@ _TITLES = {
     "render": "Render a video or images",
 }
 """What to do with a result, shorter than the kinds say it; a kind that is not here keeps its own title."""
+_FORMS_OF_THEIR_OWN = ("stage", "photographs")
 _SHORT = re.compile(r"\b(sh|ssim|l1|l2|fov)\b", re.IGNORECASE)
 _CHOICES = {
     ("poses", "given"): "use the COLMAP model",
@@ -193,6 +194,8 @@ def _walk(
     for name, raw in schema["properties"].items():
         given = _resolved(root, raw)
         path = f"{prefix}{name}"
+        if path in _FORMS_OF_THEIR_OWN:
+            continue
         if "oneOf" in given:  # one of several sections, told apart by their kind
             yield from _variants(root, given, path, presets)
         elif "properties" in given:

@@ -24,6 +24,7 @@ from service.schemas.jobs import JobChange, RetryRequest
 from service.state import Service, ServiceDep
 from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
 from service.web.forms import options_form
+from service.web.light import light_form
 from service.web.reading import job_counts, job_detail, job_lines, photographs_of
 from service.web.results import (
     CONFIG,
@@ -46,6 +47,7 @@ router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
 PAGE_LENGTH = 30
 MAX_DATASETS = 50
+MAX_PICTURES = 24
 Shown = Literal["all", "active", "done", "failed"]
 Cursor = Annotated[str | None, Query(max_length=200)]
 
@@ -84,6 +86,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     metrics, config = await asyncio.to_thread(
         lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)]
     )
+    figures = measured(metrics, artifacts, photographs)
     preview = detail.line.job.preview or {}
     shown = f"images/{preview.get('view')}"
     extra = [kind for kind in job_kinds() if kind.needs == "result" and _fits(kind.source_files, by_name)]
@@ -92,7 +95,11 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         "job.html",
         who,
         detail=detail,
-        measured=measured(metrics, artifacts, photographs),
+        measured=figures,
+        light=light_form(figures, artifacts, photographs, service.settings) if who.may("write") else None,
+        pictures=[row for row in artifacts if row.name.startswith("views/") and row.name.endswith(".png")][
+            :MAX_PICTURES
+        ],
         groups=downloads(artifacts),
         scene=by_name.get(SCENE),
         report=by_name.get(REPORT),
@@ -148,7 +155,7 @@ async def show_new(
         "new.html",
         who,
         form=options_form(kind, unwritable_formats(workers), ceilings_by_path(kind, service.settings)),
-        datasets=[row for row in datasets.rows if row.state == "committed"],
+        datasets=[row for row in datasets.rows if row.state == "committed" and row.holds == "photographs"],
         chosen=dataset,
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),
         max_file_bytes=service.settings.max_upload_bytes,

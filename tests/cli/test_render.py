@@ -9,6 +9,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from engine.colour import linear_to_srgb
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world, write_gaussian_ply
 from engine.render.images import read_channels, read_image
 
@@ -163,10 +164,57 @@ def test_what_is_no_camera_path_names_the_document(run, octasplat, tmp_path):
         ["-o", "some_%d.png", "--exr"],
         ["-o", "out", "--turntable", "--views", "all"],
         ["-o", "out", "--turntable", "--frames", "3", "--seconds", "3"],
+        ["-o", "one.mp4", "--camera", "0", "0", "1"],
+        ["-o", "one.png", "--camera", "0", "0", "1", "--distance", "3"],
+        ["-o", "out", "--views", "all", "--look-at", "0", "0", "1"],
+        ["-o", "one.mp4", "--turntable", "--background", "transparent"],
     ],
 )
 def test_contradictions_are_usage_errors(run, octasplat, arguments):
     assert octasplat("render", run.output, *arguments).exit_code == 2
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_one_camera_makes_one_file(run, octasplat, tmp_path, bare):
+    source = run.output / "scene.ply" if bare else run.output
+    result = octasplat(
+        "render", source, "-o", tmp_path / "still.png", "--camera", 3, 3, 2, "--look-at", 0, 0, 0,
+        "--up", "z", "--background", "transparent", *SIZE,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["still.png"]
+    image = read_image(tmp_path / "still.png")
+    assert image.shape == (24, 32, 4)
+    assert image[..., 3].min() < 0.1 < 0.9 < image[..., 3].max()
+    # Over black it is the picture with a black background.
+    result = octasplat(
+        "render", source, "-o", tmp_path / "%d.exr", "--camera", 3, 3, 2, "--look-at", 0, 0, 0, "--up", "z",
+        "--background", "black", *SIZE,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    black = linear_to_srgb(np.stack([read_channels(tmp_path / "0.exr")[name] for name in "RGB"], axis=-1))
+    np.testing.assert_allclose(image[..., :3] * image[..., 3:], black, atol=0.02)
+
+
+def test_distance_and_elevation_of_a_turntable(run, octasplat, tmp_path):
+    depths = []
+    for distance in (20, 40):
+        result = octasplat(
+            "render", run.output / "scene.ply", "-o", tmp_path / f"{distance}.exr", "--turntable",
+            "--frames", 1, "--distance", distance, "--elevation", 80, "--look-at", 0, 0, 0,
+            "--up", "z", *SIZE,
+        )  # fmt: skip
+        assert result.exit_code == 0, result.output
+        layers = read_channels(tmp_path / f"{distance}.exr")
+        depths.append(np.median(layers["Z"][layers["A"] > 0.5]))
+    assert depths[1] - depths[0] == pytest.approx(20, rel=0.05)
+
+
+def test_several_images_do_not_go_to_one_file(run, octasplat, tmp_path):
+    path = write_path(tmp_path / "cameras.json", np.eye(4), frames=2)
+    result = octasplat("render", run.output, "-o", tmp_path / "one.png", "--path", path)
+    assert result.exit_code == 1 and "one_%04d.png" in result.stderr
+    assert not (tmp_path / "one.png").exists()
 
 
 def test_views_of_a_bare_ply_are_refused(run, octasplat, tmp_path):

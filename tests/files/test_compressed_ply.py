@@ -6,9 +6,10 @@ import pytest
 from cloud_difference import difference
 
 from engine.errors import SceneFileError
-from engine.files import importer_for, read_scene
+from engine.files import export_scene, exporter_for, importer_for, read_scene
 from engine.files.ply_container import PlyWriteElement, write_ply
 from engine.gaussians.flattening import GaussianCloud
+from engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., GaussianCloud]
 CHUNK = 256
@@ -91,6 +92,36 @@ def test_values_come_back_within_their_quantum(
         opacity=0.502 / 255,
         sh=max(0.502 / 255 / SH_C0, 8 / 512 * 1.001),
     )
+
+
+@pytest.mark.parametrize(("degree", "count"), [(0, 1), (3, 3000)])
+def test_what_we_write_comes_back(tmp_path: Path, degree: int, count: int) -> None:
+    random = np.random.default_rng(7)
+    scene = FlatGaussians(
+        random.uniform(-3, 3, (count, 3)).astype(np.float32),
+        random.standard_normal((count, 4)).astype(np.float32),
+        random.uniform(-6, -1, (count, 2)).astype(np.float32),
+        random.uniform(-4, 4, count).astype(np.float32),
+        random.uniform(-1, 1, (count, (degree + 1) ** 2, 3)).astype(np.float32),
+    )
+    assert exporter_for(tmp_path / "a.compressed.ply").name == "compressed-ply"
+    export_scene(scene, tmp_path / "a.compressed.ply")
+    back, report = read_scene(tmp_path / "a.compressed.ply")
+    assert (len(back), report.sh_degree, report.flattened) == (count, degree, 0)
+    # Sorted along a curve; the nearest of ours in place is the same one, once each.
+    distances = np.linalg.norm(back.means_world[:, None] - scene.means_world[None], axis=2)
+    ours = distances.argmin(axis=1)
+    assert len(np.unique(ours)) == count
+    scene = scene.select(ours)
+    # The chunks are compact, so that steps are far smaller than those of the whole scene, 6 / 1023.
+    np.testing.assert_allclose(back.means_world, scene.means_world, atol=0.5 * 6 / 1023)
+    assert count == 1 or np.abs(back.means_world - scene.means_world).mean() < 0.2 * 6 / 1023
+    np.testing.assert_allclose(back.log_scales, scene.log_scales, atol=0.5 * 5 / 1023 * 1.001)
+    np.testing.assert_allclose(back.opacities, scene.opacities, atol=0.502 / 255)
+    np.testing.assert_allclose(back.sh[:, 0], scene.sh[:, 0], atol=0.502 / 255 / SH_C0)
+    np.testing.assert_allclose(back.sh[:, 1:], scene.sh[:, 1:], atol=8 / 512 * 1.001)
+    normals = np.abs(np.sum(back.rotations[:, :, 0] * scene.rotations[:, :, 0], axis=1))
+    assert np.degrees(np.arccos(np.clip(normals, -1, 1))).max() < 0.25
 
 
 def test_older_files_without_bounds_of_colours(make_cloud: Make, tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def test_layers_are_written_as_channels_that_compositors_know(tmp_path: Path) ->
     (tmp_path / "stage.toml").write_text(
         "[[meshes]]\nshape = 'sphere'\nscale = 0.2\nposition = [0.5, -0.2, 0.5]\n[integrator]\nsamples = 1\n"
     )
-    common = ["--stage", str(tmp_path / "stage.toml"), "--turntable", "--frames", "1", "--width", "32"]
+    common = ["--stage", str(tmp_path / "stage.toml"), "--turntable", "--frames", "2", "--width", "32"]
     render = ["render", str(tmp_path / "scene.ply"), *common, "--height", "24", "--layers", "-o"]
     done = CliRunner().invoke(cli, [*render, str(tmp_path / "out")])
     assert done.exit_code == 0, done.output

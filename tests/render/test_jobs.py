@@ -66,17 +66,34 @@ def cloud(means, opacity_logits):
 
 
 @pytest.mark.parametrize("up", [None, np.array([0.0, 0.0, 2.0])])
-def test_turntable_of_gaussians_shows_most_of_them(up):
+def test_turntable_of_gaussians_shows_all_of_them(up):
     middle = np.array([3.0, -2.0, 7.0])
     means = middle + np.random.default_rng(3).standard_normal((2000, 3))
     gaussians = cloud(means, 2.0)
     table = gaussian_turntable(gaussians, up_world=up, fov_y_degrees=40)
-    np.testing.assert_allclose(table.centre_world, middle, atol=0.1)
+    np.testing.assert_allclose(table.centre_world, middle, atol=0.5)
     np.testing.assert_allclose(table.up_world, [0, -1, 0] if up is None else [0, 0, 1])
     assert table.height > 0
     for camera in turntable_cameras(table, 3, 64, 64, 40):
         pixels = camera.project(means)
-        assert ((pixels > 0) & (pixels < 64)).all(axis=1).mean() > 0.7
+        assert ((pixels > 0) & (pixels < 64)).all(axis=1).mean() > 0.99
+
+
+@pytest.mark.parametrize("aspect", [0.5, 2.0])
+def test_what_is_tall_or_wide_fits_and_fills_the_image(aspect):
+    # A pole and a plate, as far as a cylinder around them goes.
+    rng = np.random.default_rng(5)
+    for extent in ((0.3, 3.0, 0.3), (3.0, 0.3, 3.0)):
+        around = rng.uniform(-1, 1, (4000, 3)) * extent
+        strays = np.array([[40.0, 0, 0], [0, -90.0, 0]])
+        gaussians = cloud(np.concatenate([around, strays]), 4.0)
+        table = gaussian_turntable(gaussians, fov_y_degrees=40, aspect=aspect)
+        reach = 0.0
+        for camera in turntable_cameras(table, 8, int(64 * aspect), 64, 40):
+            pixels = camera.project(around) / [64 * aspect, 64]
+            assert ((pixels > 0) & (pixels < 1)).all(axis=1).mean() > 0.99
+            reach = max(reach, np.abs(2 * pixels - 1).max())
+        assert reach > 0.75, "the camera stands too far away"
 
 
 def test_faint_gaussians_do_not_move_the_turntable():
@@ -84,7 +101,7 @@ def test_faint_gaussians_do_not_move_the_turntable():
     solid, haze = rng.standard_normal((300, 3)), 50 + rng.standard_normal((300, 3))
     gaussians = cloud(np.concatenate([solid, haze]), 3.0)
     gaussians.opacity_logits[300:] = -6
-    assert np.linalg.norm(gaussian_turntable(gaussians).centre_world) < 0.5
+    assert np.linalg.norm(gaussian_turntable(gaussians).centre_world) < 1
 
 
 def test_a_single_gaussian_has_a_turntable():

@@ -80,3 +80,55 @@ def test_cameras_of_two_sizes_make_no_path(path):
     cameras = tuple(RenderCamera.from_pose(np.eye(4), width, 5, fy_px=5.0) for width in (5, 6))
     with pytest.raises(ConfigError, match="one image size"):
         write_camera_path(path, CameraPath(30.0, cameras))
+
+
+def keys(**more):
+    poses = [np.eye(4), np.eye(4), np.eye(4)]
+    for number, pose in enumerate(poses):
+        pose[0, 3] = 2.0 * number
+    keys = [{"camera_to_world": pose.tolist(), "fov_y_degrees": 90} for pose in poses]
+    return {"width": 40, "height": 30, "fps": 10, "seconds": 2, "keys": keys} | more
+
+
+def test_keys_are_joined_smoothly(path):
+    path.write_text(json.dumps(keys()))
+    cameras = read_camera_path(path).cameras
+    places = np.array([camera.centre_world for camera in cameras])
+    assert len(cameras) == 20
+    # Keys in a line and equally far apart are passed at one pace.
+    np.testing.assert_allclose(places, np.linspace([0, 0, 0], [4, 0, 0], 20), atol=1e-6)
+    path.write_text(json.dumps(keys(ease="in-out")))
+    eased = np.array([camera.centre_world[0] for camera in read_camera_path(path).cameras])
+    time = np.linspace(0, 1, 20)
+    np.testing.assert_allclose(eased, 4 * time**2 * (3 - 2 * time), atol=1e-6)
+
+
+def test_lenses_change_between_keys_and_a_closed_path_comes_back(path):
+    text = keys()
+    text["keys"][1] = {**text["keys"][1], "fov_y_degrees": None, "fx": 30, "fy": 30}
+    path.write_text(json.dumps(text | {"seconds": 2.1}))
+    focal = [camera.fy_px for camera in read_camera_path(path).cameras]
+    assert (focal[0], focal[10], focal[20]) == pytest.approx((15, 30, 15))
+    text["keys"][2]["camera_to_world"][1][3] = 3.0
+    path.write_text(json.dumps(text | {"closed": True}))
+    places = np.array([camera.centre_world for camera in read_camera_path(path).cameras])
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert np.linalg.norm(places[0] - places[-1]) < 2 * steps.max()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seconds": None}, "keys need seconds"),
+        ({"frames": content()["frames"]}, "either frames or keys"),
+        ({"keys": None, "frames": content()["frames"]}, "frames have none"),
+        ({"seconds": 1e9}, "more than 100,000 frames"),
+        ({"closed": True, "ease": "in-out"}, "leave out ease"),
+        ({"keys": keys()["keys"][:2], "closed": True}, "at least 3 poses"),
+    ],
+)
+def test_keys_that_make_no_path_are_refused(path, change, message):
+    path.write_text(json.dumps(keys(**change)))
+    with pytest.raises(ConfigError, match=message) as error:
+        read_camera_path(path)
+    assert str(path) in str(error.value)

@@ -217,7 +217,6 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
                 ("export", {"files": ["again.glb", "cloud.ply"]}, {"again.glb", "cloud.ply"}),
                 ("evaluate", {}, {"metrics.json", "report.html", "renders/view_000.png"}),
                 ("render", {"frames": 3, "width_px": 32, "height_px": 32}, {"turntable.mp4"}),
-                ("render", {"mode": "views", "format": "png"}, {"views/view_000.png"}),
             ):
                 body = {"kind": kind, "source_id": job["id"], "options": options}
                 other = watch_job(
@@ -226,6 +225,24 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
                 assert other["state"] == "succeeded", other
                 artifacts = api.get(f"/v1/jobs/{other['id']}/artifacts")["artifacts"]
                 assert {artifact["name"] for artifact in artifacts} == expected
+            (tmp_path / "thing.obj").write_text("v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n")
+            stage = tmp_path / "stage.toml"
+            stage.write_text('[[meshes]]\nfile = "thing.obj"\n[integrator]\nsamples = 1\n')
+            words = (
+                "--stage",
+                stage,
+                "--set",
+                "mode=views",
+                "--set",
+                "format=png",
+                "--label",
+                "lit",
+                "--wait",
+            )
+            command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit", "--server", api.address)
+            lit = CliRunner().invoke(cli, [str(word) for word in command])
+            assert lit.exit_code == 0 and "Rendered 1 image in" in lit.output, lit.output
+            assert (tmp_path / "lit" / "views" / "view_000.png").is_file()
             with pytest.raises(ServiceError, match="no result nothing"):
                 download_results(api, job["id"], tmp_path, names=("nothing",))
     finally:

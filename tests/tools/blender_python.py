@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 SCRIPTS = Path(__file__).with_name("blender")
-IMPORT_SCRIPT = Path(__file__).resolve().parents[2] / "examples" / "blender" / "import_octasplat.py"
+_EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "blender"
+IMPORT_SCRIPT = _EXAMPLES / "import_octasplat.py"
+EXPORT_PATH_SCRIPT = _EXAMPLES / "export_camera_path.py"
 
 
 def run_blender(script: Path, *arguments: object, fails: bool = False) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_python import IMPORT_SCRIPT, SCRIPTS, run_blender
+from blender_python import EXPORT_PATH_SCRIPT, IMPORT_SCRIPT, SCRIPTS, run_blender
 from shell_scene import our_view, psnr_db, shell_cameras, shell_scene, write_shell_cameras
 
 from engine.files import ExportOptions, export_scene
@@ -14,6 +14,7 @@ from engine.files.ply_container import read_ply
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii
 from engine.render.images import read_image
+from engine.render.path_file import read_camera_path
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 
@@ -49,6 +50,18 @@ def test_cycles_draws_what_we_draw(scene: FlatGaussians, blend: Path, tmp_path: 
     image = tmp_path / "cycles.png"
     run_blender(SCRIPTS / "render_blend.py", blend, image, frame + 1)
     assert psnr_db(image, our_view(scene, shell_cameras()[frame])) >= 55.0
+
+
+def test_the_camera_comes_back_as_a_path(blend: Path, tmp_path: Path) -> None:
+    run_blender(EXPORT_PATH_SCRIPT, tmp_path / "path.json", "--blend", blend)
+    given, back = (
+        read_camera_path(path) for path in (blend.with_name("cameras.json"), tmp_path / "path.json")
+    )
+    assert len(back.cameras) == len(given.cameras) > 1
+    for one, other in zip(given.cameras, back.cameras, strict=True):
+        np.testing.assert_allclose(other.world_from_cam, one.world_from_cam, atol=1e-5)
+        for name in ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px"):
+            assert getattr(other, name) == pytest.approx(getattr(one, name), rel=1e-5), name
 
 
 def test_the_script_renders_by_itself_and_finds_a_camera(scene: FlatGaussians, tmp_path: Path) -> None:

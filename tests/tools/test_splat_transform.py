@@ -86,7 +86,8 @@ def test_we_read_its_files_as_it_does(
 
 
 @pytest.mark.parametrize(
-    ("name", "version", "degrees"), [("a.splat", 3, 0.95), ("a.spz", 3, 0.1), ("a.spz", 4, 0.1)]
+    ("name", "version", "degrees"),
+    [("a.splat", 3, 0.95), ("a.spz", 3, 0.1), ("a.spz", 4, 0.1), ("a.compressed.ply", 3, 0.1)],
 )
 def test_it_reads_our_files_as_we_do(
     convert: Convert, scene: FlatGaussians, tmp_path: Path, name: str, version: int, degrees: float

@@ -232,6 +232,13 @@ const steps = {
         found.place = await page.locator(".place").textContent();
         await page.keyboard.press("KeyF");
         found.flies = await page.getAttribute("[data-do=fly]", "aria-pressed");
+        // Two cameras make a path, saved as a file.
+        await page.keyboard.press("KeyK");
+        await page.keyboard.press("KeyN");
+        await page.keyboard.press("KeyK");
+        const [saved] = await Promise.all([page.waitForEvent("download"), page.click("[data-do=save-path]")]);
+        found.path = readFileSync(await saved.path(), "utf8");
+        await page.locator("#viewer canvas").focus();
         await page.keyboard.press("KeyR");
         for (let k = 0; k < 20 && !found.back; k++) found.back = (await still()) === start;
         await tabTo(() => document.activeElement.closest("thead") !== null);
@@ -253,6 +260,55 @@ const steps = {
         await tabTo(() => document.activeElement.id === "start", 200);
         await page.keyboard.press("Enter");
         found.complaint = await page.locator("#faults").textContent();
+        return found;
+    },
+
+    /** A stage by form: a mesh placed in a picture, tried, and rendered. */
+    async light() {
+        const found = {};
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await page.waitForSelector("#light[data-ready=yes]");
+        await shot(page, "light_form");
+        const text = () => page.textContent(".stage-text");
+        found.first = await text();
+        await page.selectOption("#light-thing", "file");
+        await page.setInputFiles("#light-mesh", job.mesh);
+        await page.waitForFunction(() => document.querySelector(".stage-text").textContent.includes("thing.obj"));
+        await page.selectOption("#light-light", "lamp");
+        await page.check("[name=floor]");
+        const box = await page.locator(".spot-picture").boundingBox();
+        await page.mouse.click(box.x + 0.25 * box.width, box.y + 0.75 * box.height);
+        await page.focus("#light-y");
+        await page.keyboard.press("ArrowUp"); // the picture, by keys
+        found.placed = await text();
+        // Files that cannot be what they say are refused as they are sent.
+        await page.setInputFiles("#light-sky", { name: "sky.hdr", mimeType: "", buffer: Buffer.from("no picture") });
+        await page.focus("[data-do=preview]");
+        await page.keyboard.press("Enter");
+        await page.waitForSelector("#light .fault:not([hidden])");
+        found.refused = await page.textContent("#light .fault");
+        await page.setInputFiles("#light-sky", []);
+        await page.click("[data-do=preview]");
+        await page.waitForSelector("figure.preview:not([hidden])");
+        found.took = await page.textContent(".light-state");
+        found.preview = await page.evaluate(async () => {
+            const image = document.querySelector("figure.preview img");
+            await image.decode();
+            return [image.naturalWidth, image.naturalHeight];
+        });
+        await shot(page, "light_preview");
+        await page.click("#light summary");
+        const [download] = await Promise.all([page.waitForEvent("download"), page.click("#light a[download]")]);
+        found.saved = { name: download.suggestedFilename(), same: readFileSync(await download.path(), "utf8") === await text() };
+        found.nameless = await nameless(page);
+        await page.click("[data-do=views]");
+        await page.waitForURL((url) => !url.pathname.endsWith(job.job));
+        found.job = page.url().split("/").pop();
+        await page.waitForSelector(".pictures img");
+        found.pictures = await page.locator(".pictures img").evaluateAll((images) => Promise.all(images.map(async (image) => { image.loading = "eager"; await image.decode(); return image.naturalWidth; })));
+        await shot(page, "light_result");
+        found.left = await page.evaluate(() => fetch("/v1/jobs?label=preview of light").then((answer) => answer.json()).then(({ jobs }) => jobs.length));
         return found;
     },
 

@@ -9,9 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from web_bench import ROOT, Browse, Service, StartService
 
+from engine.light.stage_file import parse_stage
+from engine.render.path_file import read_camera_path
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.train.config import preset
 
@@ -151,13 +154,51 @@ def test_the_result(flow: Flow, watched: dict[str, Any], browse: Browse) -> None
     assert found["viewerReady"] and found["complaints"] == []
 
 
-def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse) -> None:
+def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path) -> None:
+    mesh = tmp_path / "a thing.obj"
+    mesh.write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nv 0 0 2\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    found = browse("light", flow.service.url, job=flow.job, mesh=str(mesh))
+    before, stage = (
+        parse_stage(found[name].replace("a_thing.obj", "x.obj"), name) for name in ("first", "placed")
+    )
+    assert before.meshes[0].shape == "sphere" and before.lights[0].kind == "directional"
+    thing, floor = stage.meshes
+    assert thing.file == "x.obj" and floor.shape == "plane" and stage.lights[0].kind == "rectangle"
+    assert thing.on is not None and thing.on.pixel == pytest.approx((0.25 * 96, 0.745 * 72), abs=1)
+    assert found["refused"].startswith("'sky.hdr' is not an image") and found["refused"].count("sky.hdr") == 1
+    assert found["preview"] == [96, 72] and found["took"].startswith("The preview took ")
+    assert len(found["pictures"]) == 2 and set(found["pictures"]) == {96}
+    job = flow.service.ask("GET", f"/v1/jobs/{found['job']}")
+    assert (job["kind"], job["source_id"], job["state"]) == ("render", flow.job, "succeeded")
+    assert len(job["options"]["stage"]["meshes"]) == 2
+    files = flow.service.ask("GET", f"/v1/datasets/{job['files_id']}/files")["files"]
+    assert [file["path"] for file in files] == ["a_thing.obj"]
+    assert found["saved"] == {"name": "stage.toml", "same": True}
+    assert found["left"] == 0 and found["nameless"] == []
+    assert [
+        text for text in found["complaints"] if "422" not in text
+    ] == []  # one file is meant to be refused
+
+
+def test_by_keyboard_alone(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_path: Path) -> None:
     found = browse("keyboard", flow.service.url, job=flow.job)
     assert found["first"] == "Skip to the content"
     assert found["keepsFocus"]
     assert all(found["changes"].values()), found["changes"]
     assert found["place"].startswith("view_")
     assert found["flies"] == "true" and found["back"]
+    (tmp_path / "path.json").write_text(found["path"])
+    cameras = read_camera_path(tmp_path / "path.json").cameras
+    assert len(cameras) == 60 and cameras[0].height_px == 720
+    views = {
+        view["name"]: view for view in flow.service.ask("GET", f"/jobs/{flow.job}/cameras.json")["views"]
+    }
+    # The first key is where the photograph was taken from that the place names.
+    np.testing.assert_allclose(
+        cameras[0].centre_world, views[found["place"].split(" ")[0]]["position"], atol=1e-4
+    )
+    forward = cameras[0].rotation_cam_from_world[2]
+    np.testing.assert_allclose(forward, views[found["place"].split(" ")[0]]["forward"], atol=1e-4)
     assert found["sorted"] == "descending"
     assert found["cut"] == "0%"
     assert found["chooser"] is True

@@ -17,7 +17,7 @@ from engine.errors import ConfigError, SceneFileError
 from engine.files import Mesh, export_scene, exporter_for, read_mesh
 from engine.gaussians.model import FlatGaussians
 from engine.writing import write_json
-from workers.cli.scene_files import open_scene, warn_of_lost_channels
+from workers.cli.scene_files import open_scene, warn_of_losses
 
 Say = Callable[[str], None]
 
@@ -99,7 +99,7 @@ def targets_for(output: Path, sources: Sequence[Path], inputs: Sequence[Path]) -
 def write_scene(gaussians: FlatGaussians, target: Path, say: Say, *, warn: bool = True) -> None:
     """Write a scene in the format of its name and tell so, and with ``warn`` what the format leaves out."""
     if warn:
-        warn_of_lost_channels(gaussians, target)
+        warn_of_losses(gaussians, target)
     export_scene(gaussians, target)
     say(f"Wrote {target} ({len(gaussians):,} Gaussians).")
 

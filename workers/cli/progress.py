@@ -64,7 +64,10 @@ class Bars:
         if isinstance(event, StageStarted):
             self._begin(event)
         elif isinstance(event, StageProgress):
-            self._move(event.step, event.total_steps)
+            left = self._state.seconds_left
+            self._move(
+                event.step, event.total_steps, "" if left is None else f"{clock(left)} left", event.part
+            )
         elif isinstance(event, TrainingProgress):
             self.bars.detail = training_state(event, self._state.held_out)
             self._move(event.iteration, event.total_iterations, f"{clock(event.seconds_left)} left")
@@ -80,9 +83,10 @@ class Bars:
             DOING.get(event.stage, event.stage), total=event.total_steps or None, count="", left=""
         )
 
-    def _move(self, step: int, total: int, left: str = "") -> None:
+    def _move(self, step: int, total: int, left: str = "", part: float = 0.0) -> None:
         if self._task is not None:
-            self.bars.update(self._task, completed=step, total=total, count=f"{step}/{total}", left=left)
+            done, count = step + part, f"{step}/{total}"
+            self.bars.update(self._task, completed=done, total=total, count=count, left=left)
 
     def _end(self) -> None:
         self.bars.detail = ""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from engine.files import lost_channels
+from engine.files import export_losses
 from engine.gaussians.model import FlatGaussians
 from workers.telling.losses import open_scene as read_telling
 
@@ -34,11 +34,11 @@ def speaker_of_losses(quiet: bool) -> Callable[[str], None]:
     return say
 
 
-def warn_of_lost_channels(gaussians: FlatGaussians, target: Path, format_name: str | None = None) -> None:
-    """Tell on stderr which named channels of a scene the format of ``target`` will leave out.
+def warn_of_losses(gaussians: FlatGaussians, target: Path, format_name: str | None = None) -> None:
+    """Tell on stderr what of a scene the format of ``target`` will leave out.
 
     Raises:
         SceneFileError: there is no such format.
     """
-    if text := lost_channels(gaussians, target, format_name):
+    for text in export_losses(gaussians, target, format_name):
         click.echo(f"Warning: {text}", err=True)

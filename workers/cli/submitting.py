@@ -9,7 +9,7 @@ import click
 from workers.cli.progress import show_progress
 from workers.client import submission
 from workers.client.api import TOKEN, Api
-from workers.client.submission import JobFailed, Submission
+from workers.client.submission import Derivation, JobFailed, Submission
 from workers.telling.wording import run_summary
 
 DEMO_OUTPUT = Path("octasplat-demo")
@@ -19,10 +19,15 @@ def submit(api: Api, what: Submission, *, quiet: bool = False) -> dict[str, Any]
     """Upload what is missing and queue the job; returns the job."""
     with show_progress(quiet=quiet) as listener:
         job = submission.submit(api, what, listener)
-    if not quiet and job.get("estimate"):
-        click.echo(f"Estimate: {job['estimate']['text']}, within a factor of two.", err=True)
-    for note in job.get("notes", ()):
-        click.echo(f"Note: {note}", err=True)
+    _tell_of(job, quiet=quiet)
+    return job
+
+
+def derive(api: Api, what: Derivation, *, quiet: bool = False) -> dict[str, Any]:
+    """Send the files that are named and queue a job on the results of another; returns the job."""
+    with show_progress(quiet=quiet) as listener:
+        job = submission.derive(api, what, listener)
+    _tell_of(job, quiet=quiet)
     return job
 
 
@@ -40,9 +45,9 @@ def fetch(api: Api, job_id: str, folder: Path, names: tuple[str, ...] = (), *, q
         click.echo(f"Saved {len(paths)} file{'s' if len(paths) > 1 else ''} in {folder}.")
 
 
-def submit_and_wait(api: Api, what: Submission, output: Path, *, quiet: bool = False) -> None:
+def submit_and_wait(api: Api, what: Submission | Derivation, output: Path, *, quiet: bool = False) -> None:
     """All of it, and a summary at the end."""
-    job = submit(api, what, quiet=quiet)
+    job = derive(api, what, quiet=quiet) if isinstance(what, Derivation) else submit(api, what, quiet=quiet)
     if not quiet:
         click.echo(f"Queued as job {job['id']}.")
     try:
@@ -58,6 +63,14 @@ def submit_and_wait(api: Api, what: Submission, output: Path, *, quiet: bool = F
     if not quiet and (output / "metrics.json").exists():
         for line in run_summary(output, job["options"].get("exports", ())):
             click.echo(line)
+
+
+def _tell_of(job: dict[str, Any], *, quiet: bool) -> None:
+    """What to know of a job that was queued."""
+    if not quiet and job.get("estimate"):
+        click.echo(f"Estimate: {job['estimate']['text']}, within a factor of two.", err=True)
+    for note in job.get("notes", ()):
+        click.echo(f"Note: {note}", err=True)
 
 
 def run_demo(address: str, output: Path = DEMO_OUTPUT) -> None:

@@ -2,17 +2,19 @@
 
 import uuid
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from engine.errors import OctasplatError
 from engine.events import Listener, Warned, ignore
+from engine.light.stage_file import named_files, read_stage, with_files
 from engine.stages import counted_stage
 from workers.client.api import Api
 from workers.client.download import download_results
-from workers.client.upload import upload_scene
+from workers.client.upload import upload_files, upload_scene
 from workers.client.watch import watch_job
+from workers.store.names import NameRefused, check_name
 
 
 class JobFailed(OctasplatError):
@@ -63,6 +65,75 @@ def submit(api: Api, what: Submission, listener: Listener = ignore) -> dict[str,
         "queue": what.queue,
         "priority": what.priority,
     }
+    job: dict[str, Any] = api.post("/v1/jobs", body)
+    return job
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """A job on the results of a finished one.
+
+    Attributes:
+        source_id: the finished job.
+        kind: of the job, such as ``render``; GET /v1/options has them.
+        options: of the kind.
+        files: files that the options name, by these names.
+        label: what to call the job.
+        queue: which workers.
+        priority: higher goes first.
+    """
+
+    source_id: str
+    kind: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, Path] = field(default_factory=dict)
+    label: str | None = None
+    queue: str = "cpu"
+    priority: int = 0
+
+
+def with_stage(what: Derivation, stage: Path) -> Derivation:
+    """The same with a stage and the files that it names.
+
+    Files that lie elsewhere than in or below the stage's folder, or whose names a service does not take, are
+    sent under other ones.
+
+    Raises:
+        ConfigError: the stage cannot be used, or a file that it names is not there.
+    """
+    read = read_stage(stage)
+    names: dict[str, str] = {}
+    for _, name in named_files(read):
+        try:
+            names[name] = check_name(name)
+        except NameRefused:
+            names[name] = check_name(f"elsewhere/{len(names)}/{Path(name).name}")
+    files = {sent: stage.parent / name for name, sent in names.items()}
+    options = {**what.options, "stage": with_files(read, names).model_dump(mode="json")}
+    return replace(what, options=options, files={**what.files, **files})
+
+
+def derive(api: Api, what: Derivation, listener: Listener = ignore) -> dict[str, Any]:
+    """Send the files that the options name, and queue a job on the results of another; returns the job.
+
+    Raises:
+        ServiceError: something is refused.
+        Unreachable: the service does not answer.
+    """
+    body = {
+        "kind": what.kind,
+        "source_id": what.source_id,
+        "options": dict(what.options),
+        "label": what.label,
+        "queue": what.queue,
+        "priority": what.priority,
+    }
+    if what.files:
+        with counted_stage("upload", listener) as progress:
+            sent = upload_files(
+                api, what.files, name="stage", progress=lambda d, t: progress(d >> 10, t >> 10)
+            )
+        body["files_id"] = sent["id"]
     job: dict[str, Any] = api.post("/v1/jobs", body)
     return job
 

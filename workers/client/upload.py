@@ -5,7 +5,7 @@ import hashlib
 import threading
 import urllib.parse
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,18 +80,50 @@ def upload_scene(
     return dataset
 
 
-def _dataset_for(api: Api, name: str, files: Iterable[LocalFile]) -> dict[str, Any]:
+def upload_files(
+    api: Api,
+    files: Mapping[str, Path],
+    *,
+    name: str = "",
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> dict[str, Any]:
+    """Send files that the options of a job name; the same call again goes on with the same dataset.
+
+    Args:
+        api: the service.
+        files: where they are, by the names that the options call them.
+        name: what to call the dataset.
+        progress: told (bytes done, bytes in all).
+
+    Returns:
+        The dataset, committed; a job gets it as ``files_id``.
+
+    Raises:
+        ServiceError: the service refuses it; the text names the files.
+    """
+    local = [LocalFile(called, path, path.stat().st_size) for called, path in sorted(files.items())]
+    dataset = _dataset_for(api, name, local, holds="files")
+    if dataset["state"] == "open":
+        _send_missing(api, dataset["id"], local, progress)
+        dataset = api.post(f"/v1/datasets/{dataset['id']}/commit")
+    return dataset
+
+
+def _dataset_for(
+    api: Api, name: str, files: Iterable[LocalFile], holds: str = "photographs"
+) -> dict[str, Any]:
     """The dataset that was made for just these files, or a new one."""
-    digest = hashlib.sha256(name.encode())
+    digest = hashlib.sha256(f"{holds}\0{name}".encode() if holds == "files" else name.encode())
     for file in files:
         facts = file.path.stat()
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
+    body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
     try:
-        found: dict[str, Any] = api.post("/v1/datasets", {"name": name}, key=f"scene-{digest.hexdigest()}")
+        found: dict[str, Any] = api.post("/v1/datasets", body, key=f"scene-{digest.hexdigest()}")
     except ServiceError as error:
         if error.status != 404:  # it was deleted since
             raise
-        found = api.post("/v1/datasets", {"name": name}, key=uuid.uuid4().hex)
+        found = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
     return found
 
 

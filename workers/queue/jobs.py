@@ -36,6 +36,7 @@ class NewJob:
     label: str | None = None
     traceparent: str | None = None
     estimate: Mapping[str, Any] | None = None
+    files_id: uuid.UUID | None = None
 
 
 async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
@@ -46,18 +47,18 @@ async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
         await connection.execute(
             """
             INSERT INTO jobs (id, owner, kind, dataset_id, source_id, label, options, queue, priority, slip,
-                              traceparent, estimate)
-            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
+                              traceparent, estimate, files_id)
+            VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s)
             """,
             [
                 job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
                 Jsonb(dict(new.options)), new.queue, new.priority, slip, new.traceparent,
-                None if new.estimate is None else Jsonb(dict(new.estimate)),
+                None if new.estimate is None else Jsonb(dict(new.estimate)), new.files_id,
             ],
         )  # fmt: skip
-        if new.dataset_id is not None:
+        for dataset_id in filter(None, (new.dataset_id, new.files_id)):
             await connection.execute(
-                "UPDATE datasets SET used_at = now(), expires_at = NULL WHERE id = %s", [new.dataset_id]
+                "UPDATE datasets SET used_at = now(), expires_at = NULL WHERE id = %s", [dataset_id]
             )
         await add_event(connection, job_id, 0, "state", {"state": "queued"})
         return await _existing(connection, job_id)

@@ -10,15 +10,18 @@ from psycopg.types.json import Jsonb
 from workers.records.database import Connection
 from workers.records.errors import Conflict
 from workers.records.ids import new_id
-from workers.records.rows import Dataset, DatasetFile
+from workers.records.rows import Dataset, DatasetFile, DatasetHolds
 from workers.records.sizes import Sizes
 
 
-async def create_dataset(connection: Connection, owner: str, name: str) -> Dataset:
+async def create_dataset(
+    connection: Connection, owner: str, name: str, holds: DatasetHolds = "photographs"
+) -> Dataset:
     """A new dataset that takes files."""
     dataset_id = new_id()
     await connection.execute(
-        "INSERT INTO datasets (id, owner, name) VALUES (%s, %s, %s)", [dataset_id, owner, name]
+        "INSERT INTO datasets (id, owner, name, holds) VALUES (%s, %s, %s, %s)",
+        [dataset_id, owner, name, holds],
     )
     dataset = await get_dataset(connection, dataset_id)
     assert dataset is not None
@@ -215,7 +218,7 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
         if await get_dataset(connection, dataset_id, lock=True) is None:
             raise KeyError(dataset_id)
         cursor = await connection.execute(
-            "SELECT count(*) AS n FROM jobs WHERE dataset_id = %s", [dataset_id]
+            "SELECT count(*) AS n FROM jobs WHERE %s IN (dataset_id, files_id)", [dataset_id]
         )
         row = await cursor.fetchone()
         if row and row["n"]:

@@ -7,13 +7,14 @@ from typing import Any, Literal
 
 JobState = Literal["queued", "running", "canceling", "succeeded", "failed", "canceled"]
 DatasetState = Literal["open", "checking", "committed"]
+DatasetHolds = Literal["photographs", "files"]
 STATES: tuple[JobState, ...] = ("queued", "running", "canceling", "succeeded", "failed", "canceled")
 TERMINAL: frozenset[str] = frozenset({"succeeded", "failed", "canceled"})
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Photographs, and perhaps their poses, that jobs work on.
+    """Photographs, and perhaps their poses, that jobs work on; or other files that their options name.
 
     Attributes:
         id: UUIDv7.
@@ -29,6 +30,7 @@ class Dataset:
         used_at: when a job last asked for it.
         expires_at: when retention may remove it.
         version: counts changes.
+        holds: photographs, or files that the options of jobs name.
     """
 
     id: uuid.UUID
@@ -44,6 +46,7 @@ class Dataset:
     used_at: datetime
     expires_at: datetime | None
     version: int
+    holds: DatasetHolds = "photographs"
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ class Job:
         preview: newest preview picture: ``sha256``, ``step`` and ``view``, the photograph it answers to.
         estimate: what it was reckoned to take when it was accepted, see
             :class:`workers.work.kinds.estimates.Estimate`.
+        files_id: dataset of the files that its options name.
         traceparent: W3C trace context of the request.
         pinned: never removed by retention.
         created_at: when it was accepted.
@@ -136,6 +140,7 @@ class Job:
     expires_at: datetime | None
     version: int
     estimate: dict[str, Any] | None = None
+    files_id: uuid.UUID | None = None
 
     @property
     def is_over(self) -> bool:

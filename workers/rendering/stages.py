@@ -14,11 +14,11 @@ from engine.gaussians.model import FlatGaussians
 from engine.light.integrator import LitScene, PathTracer
 from engine.light.layers import stage_layers
 from engine.light.placing import rested, scene_facts
-from engine.light.rendering import render_preview, render_stage_images, render_stage_video
-from engine.light.stage import Stage
+from engine.light.rendering import refuse_cameras_in_glass, render_preview, stage_paint
+from engine.light.stage import Integrator, Stage
 from engine.light.stage_file import StageFacts, write_first_stage
 from engine.light.staging import stage_meshes
-from engine.render.jobs import Shot, gaussian_turntable, scene_turntable
+from engine.render.jobs import Paint, Shot, gaussian_turntable, scene_turntable
 from engine.render.paths import Turntable
 from engine.scene.model import Viewpoints
 from engine.stages import counted_stage
@@ -83,19 +83,26 @@ class StagePlace:
         return view.origin_world, direction @ view.rotation_cam_from_world
 
 
-def render_stage(
-    stage: Stage,
-    place: StagePlace,
-    shots: Sequence[Shot],
-    output: Path,
-    file_of: Callable[[int, Shot], Path] | None,
-    fps: float | None,
-    listener: Listener,
-) -> tuple[Path, ...]:
-    """Render a stage: images, a film where ``fps`` is given, or a preview where ``file_of`` is None.
+@dataclass(frozen=True)
+class PaintedStage:
+    """A stage that is ready to be rendered.
+
+    Attributes:
+        paint: renders a shot to a file.
+        tracer: of the stage.
+        settings: how to trace.
+    """
+
+    paint: Paint
+    tracer: PathTracer
+    settings: Integrator
+
+
+def painted_stage(stage: Stage, place: StagePlace, shots: Sequence[Shot]) -> PaintedStage:
+    """A stage made ready, for cameras that were looked at.
 
     Raises:
-        OctasplatError: something of the stage cannot be used, or the output not written.
+        OctasplatError: something of the stage cannot be used, or a camera stands in glass.
     """
     up = np.array(stage.up)
     layers = stage_layers(
@@ -104,20 +111,26 @@ def render_stage(
     )  # fmt: skip
     stage = rested(stage, None if layers is None else layers.tracer, place.ray_of_pixel, place.folder)
     meshes = stage_meshes(stage, place.folder, threads=place.threads, say=place.say)
+    refuse_cameras_in_glass(meshes, shots)
     background = srgb_to_linear(place.background_srgb.astype(np.float64))
-    alone = stage_meshes(
+    surroundings = stage_meshes(
         stage.model_copy(update={"meshes": (), "lights": ()}), place.folder, threads=place.threads
     )
-    scene = LitScene(meshes, layers, background, alone)
+    scene = LitScene(meshes, layers, background, surroundings)
     tracer = PathTracer(scene, stage.integrator, threads=place.threads)
-    with counted_stage("render", listener) as progress:
-        if file_of is None:
-            render_preview(tracer, meshes, stage.integrator, shots[0], output, progress)
-            return (output,)
-        if fps is not None:
-            render_stage_video(tracer, meshes, stage.integrator, shots, output, fps, progress)
-            return (output,)
-        return render_stage_images(tracer, meshes, stage.integrator, shots, file_of, progress)
+    return PaintedStage(stage_paint(tracer, stage.integrator), tracer, stage.integrator)
+
+
+def preview_stage(stage: PaintedStage, shot: Shot, output: Path, listener: Listener) -> tuple[Path, ...]:
+    """Render one shot, finer and finer; returns its file.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with counted_stage("render", listener) as count:
+        render_preview(stage.tracer, stage.settings, shot, output, lambda d, of: count(0, 1, d / of))
+        count(1, 1)
+    return (output,)
 
 
 def first_stage(place: StagePlace, up_world: Float64[np.ndarray, "3"] | None, path: Path) -> StageFacts:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,33 +15,30 @@ from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
 from engine.light.stage import Stage
-from engine.light.stage_file import read_stage
-from engine.render.cameras import RenderCamera
+from engine.light.stage_file import named_files
+from engine.render.identity import identity_of
 from engine.render.jobs import (
-    DEFAULT_FOV_Y_DEGREES,
+    Paint,
     Shot,
     camera_shots,
-    gaussian_turntable,
-    render_images,
-    render_video,
-    scene_fov_y_degrees,
-    scene_turntable,
-    turntable_cameras,
+    scene_paint,
     view_shots,
 )
+from engine.render.kept import KeptImages
+from engine.render.names import names_by_number
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
+from engine.render.series import Kept, render_film, render_series
 from engine.run_folder import CONFIG, SCENE, is_run, run_viewpoints
 from engine.scene.model import Viewpoints
 from engine.scene.views_file import SplitViewpoints
 from engine.stages import counted_stage
 from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
-from workers.rendering.stages import StagePlace, render_stage
+from workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
+from workers.rendering.stages import StagePlace, painted_stage, preview_stage
 from workers.telling.losses import open_scene
 
-DEFAULT_FPS = 30.0
-DEFAULT_FRAMES = 120
 ANY_SIDE_PX = 1 << 30
 """A cap that no photograph reaches."""
 
@@ -56,68 +54,151 @@ class _Source:
     viewpoints: SplitViewpoints | None = None
 
 
+@dataclass(frozen=True)
+class SetStage:
+    """A stage, and the folder that the names of its files are relative to."""
+
+    stage: Stage
+    folder: Path
+
+    def identity(self) -> tuple[object, ...]:
+        """What of it decides how a picture looks: itself and the content of its files."""
+        return self.stage, [self.folder / name for _, name in named_files(self.stage)]
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Where finished images wait for the others, and whether earlier ones are gone on with.
+
+    Attributes:
+        resume: go on with the images of a render that was stopped.
+        or_anew: where those are of another render, forget them rather than refuse.
+        frames: folder of a film's frames; None puts them beside the film.
+        on_kept: told how many images are safe on disk.
+    """
+
+    resume: bool = False
+    or_anew: bool = False
+    frames: Path | None = None
+    on_kept: Kept = lambda _count: None
+
+
 def render_files(
-    mode: str, options: dict[str, Any], listener: Listener, say: Callable[[str], None]
+    mode: str,
+    options: dict[str, Any],
+    listener: Listener,
+    say: Callable[[str], None],
+    stage: SetStage | None = None,
+    keeping: Keeping = Keeping(),
 ) -> tuple[Path, ...]:
     """Render as the options of the command say.
 
     Args:
-        mode: ``views``, ``turntable`` or ``camera_path``.
+        mode: ``views``, ``turntable``, ``camera_path`` or ``camera``.
         options: the options of the command by parameter name.
         listener: hears the progress.
         say: told in a sentence what reading a scene has lost.
+        stage: what the scene is set on.
+        keeping: how a render that is stopped goes on.
 
     Returns:
         The files written.
 
     Raises:
-        OctasplatError: the source cannot be read or the output not written.
+        OctasplatError: the source cannot be read, or the output not written; or there are images of another
+            render where this one is to go on.
     """
     output: Path = options["output"]
-    stage = _read_stage(options) if options.get("stage") else None
+    if stage is not None:
+        stage = replace(stage, stage=_as_asked(stage.stage, options))
     cameras, fps = None, options["fps"] or DEFAULT_FPS
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
         cameras, fps = path.cameras, options["fps"] or path.fps
     source = _read_run(options) if is_run(options["source"]) else _read_file(options, say)
-    if mode == "turntable":
-        cameras = _turntable(source, options, fps)
+    if mode in ("turntable", "camera"):
+        cameras = cameras_of_options(source.gaussians, source.viewpoints, options, fps)
     if cameras is not None:
         cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
-    background = background_colour(options["background"] or source.background)
+    shots = camera_shots(cameras) if cameras is not None else _views(source, options)
+    _check_one_file(output, 1 if options.get("preview") else len(shots))
+    transparent = options["background"] == "transparent"
+    background = background_colour("black" if transparent else options["background"] or source.background)
+    exr = options["exr"] or (stage is not None and stage.stage.integrator.layers)
+    series = _Series(output, shots, fps, exr, keeping)
+    what = source.gaussians, source.settings, background, transparent, cameras, stage and stage.identity()
+    of_views = None if cameras is not None else (source.viewpoints, source.near_world)
     if stage is not None:
-        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
         place = StagePlace(
-            source.gaussians, source.settings, _full_size(options), options["stage"].parent,
+            source.gaussians, source.settings, _full_size(options), stage.folder,
             lambda path: open_scene(path, say), background, options["threads"], say,
         )  # fmt: skip
-        film = fps if output.suffix.lower() == ".mp4" else None
-        exr = options["exr"] or stage.integrator.layers
-        names = None if options.get("preview") else _FileNames(output, exr)
-        return render_stage(stage, place, shots, output, names, film, listener)
+        set_up = partial(painted_stage, stage.stage, place, shots)
+        if options.get("preview"):
+            return preview_stage(set_up(), shots[0], output, listener)
+        kept = series.kept(identity_of(*what, of_views, place.photographs))
+        return series.render(set_up().paint, kept, listener)
+    kept = series.kept(identity_of(*what, of_views))
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
-    background = background_colour(options["background"] or source.background)
-    with counted_stage("render", listener) as progress:
-        if cameras is not None and output.suffix.lower() == ".mp4":
-            render_video(tracer, cameras, output, fps, background, progress)
-            return (output,)
-        shots = camera_shots(cameras) if cameras is not None else _views(source, options["views"])
-        return render_images(tracer, shots, _FileNames(output, options["exr"]), background, progress)
+    return series.render(scene_paint(tracer, background, transparent=transparent), kept, listener)
 
 
-def _read_stage(options: dict[str, Any]) -> Stage:
-    """The stage, with what the options say of its integrator.
+def _as_asked(stage: Stage, options: dict[str, Any]) -> Stage:
+    """The stage with what the options say of its integrator.
 
     Raises:
-        ConfigError: it cannot be read, or asks for layers in files that have none.
+        ConfigError: it asks for layers in files that have none.
     """
-    stage = read_stage(options["stage"])
     asked = {key: True for key in ("layers", "denoise") if options.get(key)}
-    stage = stage.model_copy(update={"integrator": stage.integrator.model_copy(update=asked)})
-    if stage.integrator.layers and options["output"].suffix.lower() in (".png", ".mp4"):
+    integrator = stage.integrator.model_copy(update=asked)
+    if integrator.layers and options["output"].suffix.lower() in (".png", ".mp4"):
         raise ConfigError(f"{options['output']}: holds no layers; name a folder, or .exr files.")
-    return stage
+    return stage.model_copy(update={"integrator": integrator})
+
+
+@dataclass(frozen=True)
+class _Series:
+    """Images or a film to write."""
+
+    output: Path
+    shots: tuple[Shot, ...]
+    fps: float
+    exr: bool
+    keeping: Keeping
+
+    @property
+    def is_film(self) -> bool:
+        return self.output.suffix.lower() == ".mp4"
+
+    def kept(self, identity: str) -> KeptImages:
+        """What there is already of images that look as ``identity`` says."""
+        keeping, output = self.keeping, self.output
+        folder = output.parent if output.suffix.lower() in (".png", ".exr") else output
+        if self.is_film:
+            folder = keeping.frames or output.with_name(f"{output.name}.frames")
+        return KeptImages(folder, identity, resume=keeping.resume, or_anew=keeping.or_anew)
+
+    def render(self, paint: Paint, kept: KeptImages, listener: Listener) -> tuple[Path, ...]:
+        """Do so; returns the files."""
+        on_kept = self.keeping.on_kept
+        with counted_stage("render", listener) as count:
+            if self.is_film:
+                render_film(self.shots, self.output, self.fps, paint, kept, count, on_kept)
+                return (self.output,)
+            names = _FileNames(self.output, self.exr)
+            return render_series(self.shots, names, paint, kept, count, on_kept)
+
+
+def _check_one_file(output: Path, images: int) -> None:
+    """Refuse the name of one image where there are several.
+
+    Raises:
+        ConfigError: they would all be one file.
+    """
+    if images > 1 and output.suffix.lower() in (".png", ".exr") and not names_by_number(output):
+        pattern = f"{output.stem}_%04d{output.suffix}"
+        raise ConfigError(f"{output} names one image for {images}; write a pattern such as {pattern}.")
 
 
 @dataclass(frozen=True)
@@ -129,6 +210,8 @@ class _FileNames:
 
     def __call__(self, number: int, shot: Shot) -> Path:
         if self.output.suffix.lower() in (".png", ".exr"):
+            if not names_by_number(self.output):
+                return self.output
             return self.output.with_name(self.output.name % number)
         return self.output / f"{shot.name}{'.exr' if self.exr else '.png'}"
 
@@ -174,7 +257,7 @@ def stage_place(
         found.gaussians, found.settings, _full_size(options), source.parent,
         lambda path: open_scene(path, say), background_colour(found.background), 0,
     )  # fmt: skip
-    return place, None if up is None else _axis(up)
+    return place, None if up is None else axis_named(up)
 
 
 def _full_size(options: dict[str, Any]) -> Viewpoints | None:
@@ -184,31 +267,18 @@ def _full_size(options: dict[str, Any]) -> Viewpoints | None:
     return run_viewpoints(options["source"], scene=options["scene"], max_side=ANY_SIDE_PX)
 
 
-def _turntable(source: _Source, options: dict[str, Any], fps: float) -> tuple[RenderCamera, ...]:
-    frames: int = options["frames"] or DEFAULT_FRAMES
-    if options["seconds"]:
-        frames = max(1, round(options["seconds"] * fps))
-    fov: float | None = options["fov"]
-    if source.viewpoints is not None:
-        table = scene_turntable(source.viewpoints)
-        fov = fov or scene_fov_y_degrees(source.viewpoints)
-    else:
-        fov = fov or DEFAULT_FOV_Y_DEGREES
-        table = gaussian_turntable(source.gaussians, up_world=_axis(options["up"] or "-y"), fov_y_degrees=fov)
-    return turntable_cameras(table, frames, options["width"], options["height"], fov)
-
-
-def _axis(name: str) -> Float64[np.ndarray, "3"]:
-    axis = np.eye(3)["xyz".index(name[-1])]
-    return -axis if name.startswith("-") else axis
-
-
-def _views(source: _Source, which: str | None) -> tuple[Shot, ...]:
+def _views(source: _Source, options: dict[str, Any]) -> tuple[Shot, ...]:
     viewpoints = source.viewpoints
     assert viewpoints is not None
+    names = {view.name: number for number, view in enumerate(viewpoints.views)}
+    if asked := options.get("photographs"):
+        missing = [name for name in asked if name not in names]
+        if missing:
+            raise ConfigError(f"{missing[0]}: the run has no photograph of this name.")
+        return view_shots(viewpoints, np.array([names[name] for name in asked]), source.near_world)
     every = np.arange(len(viewpoints.views))
     chosen = {"train": viewpoints.train_indices, "all": every}
-    indices = chosen.get(which or "held-out", viewpoints.test_indices)
+    indices = chosen.get(options["views"] or "held-out", viewpoints.test_indices)
     if len(indices) == 0:
         raise OutputError("The run held out no views; ask for --views train or all.")
     return view_shots(viewpoints, indices, source.near_world)

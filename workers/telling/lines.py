@@ -13,6 +13,7 @@ from engine.events import (
     Warned,
 )
 from engine.stages import DOING
+from workers.telling.pace import Pace
 from workers.telling.wording import clock, duration, training_state
 
 SECONDS_BETWEEN_LINES = 5.0
@@ -45,13 +46,17 @@ class StageState:
         self.step = self.total = 0
         self.held_out: HeldOutMeasured | None = None
         self.training: TrainingProgress | None = None
+        self.seconds_left: float | None = None
+        self._pace = Pace()
 
     def update(self, event: Event) -> None:
         """Remember what ``event`` tells."""
         if isinstance(event, StageStarted):
             self.step, self.total = 0, event.total_steps
+            self.seconds_left, self._pace = None, Pace()
         elif isinstance(event, StageProgress):
             self.step, self.total = event.step, event.total_steps
+            self.seconds_left = self._pace.left(event.step + event.part, event.total_steps)
         elif isinstance(event, TrainingProgress):
             self.step, self.training = event.iteration, event
         elif isinstance(event, HeldOutMeasured):
@@ -109,6 +114,7 @@ class PlainLines:
 
     def _line(self, event: StageProgress | TrainingProgress) -> str:
         if isinstance(event, StageProgress):
-            return f"  {event.step}/{event.total_steps}"
+            left = self._state.seconds_left
+            return f"  {event.step}/{event.total_steps}" + ("" if left is None else f", {clock(left)} left")
         state = training_state(event, self._state.held_out)
         return f"  {event.iteration}/{event.total_iterations}: {state}, {clock(event.seconds_left)} left"

@@ -66,7 +66,7 @@ async def set_expiries(connection: Connection, retention: Retention) -> None:
             """
             UPDATE datasets SET expires_at = NULL
             WHERE expires_at IS NOT NULL
-              AND (pinned OR EXISTS (SELECT 1 FROM jobs WHERE jobs.dataset_id = datasets.id)
+              AND (pinned OR EXISTS (SELECT 1 FROM jobs WHERE datasets.id IN (jobs.dataset_id, jobs.files_id))
                    OR (SELECT max(uploaded_at) FROM dataset_files WHERE dataset_id = datasets.id)
                       + make_interval(secs => 3600 * %(open)s::float8) > expires_at AND state = 'open')
             """,
@@ -83,7 +83,7 @@ async def set_expiries(connection: Connection, retention: Retention) -> None:
                     AS used_at
                 FROM datasets d
                 WHERE d.expires_at IS NULL AND NOT d.pinned
-                  AND NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.dataset_id = d.id)
+                  AND NOT EXISTS (SELECT 1 FROM jobs WHERE d.id IN (jobs.dataset_id, jobs.files_id))
             ) AS kept
             WHERE kept.id = datasets.id AND kept.hours > 0
             """,
@@ -140,7 +140,7 @@ async def _forget_dataset(connection: Connection, dataset_id: uuid.UUID) -> bool
         cursor = await connection.execute(
             """
             DELETE FROM datasets WHERE id = %s AND expires_at < now()
-              AND NOT EXISTS (SELECT 1 FROM jobs WHERE dataset_id = datasets.id)
+              AND NOT EXISTS (SELECT 1 FROM jobs WHERE datasets.id IN (dataset_id, files_id))
             """,
             [dataset_id],
         )

@@ -2,26 +2,33 @@
 
 import json
 import os
+import time
 from pathlib import Path
 from typing import Any
 
 from engine.config import read_config
-from engine.errors import ExportFailed
-from engine.events import Event, StageFinished, StageProgress, Warned, broadcast
+from engine.errors import Cancelled, ExportFailed
+from engine.events import CheckpointWritten, Event, Listener, StageFinished, StageProgress, Warned, broadcast
 from engine.files import ExportOptions
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.files.several import export_files
+from engine.light.stage_file import named_files
 from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
+from engine.plain_colours import PlainScene
 from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.stages import counted_stage, stopping
 from engine.writing import write_json
+from workers.store.names import check_name
 from workers.work.kinds.options import ExportJobOptions, ReconstructOptions, RenderJobOptions
 from workers.work.places import Places
 from workers.work.preview import Previews
-from workers.work.task import Task
+from workers.work.task import FRAMES, Task
 
 REPORT = "report.html"
+KEEP_SECONDS = 5.0
+KEEP_SECONDS_OF_FRAME = 0.03
+"""Finished frames are stored so long after one another, or so long for each of them if that is longer."""
 
 
 def reconstruct(task: Task) -> None:
@@ -82,12 +89,19 @@ def export(task: Task) -> None:
     settings = ExportOptions(q=q, min_opacity=options.min_opacity, sh_pad_degree=options.sh_pad_degree)
     tell = stopping(task.listener, task.should_stop)
     count = len(options.files)
+    plain = PlainScene(
+        gaussians,
+        task.run,
+        threads=task.threads,
+        on_pass=lambda _done, _total: tell(StageProgress("export", 0, count)),
+    )
     with counted_stage("export", tell, count):
         failed = export_files(
             gaussians,
             task.results,
             options.files,
             settings,
+            plain=lambda: plain.gaussians,
             on_done=lambda done: tell(StageProgress("export", done, count)),
             on_loss=lambda text: tell(Warned(text)),
         )
@@ -97,15 +111,17 @@ def export(task: Task) -> None:
 
 def render(task: Task) -> None:
     """New views of the scene of a reconstruction."""
-    from workers.rendering.views import render_files
+    from workers.rendering.views import Keeping, SetStage, render_files
 
     options = RenderJobOptions.model_validate(task.options)
-    target = task.results / "turntable.mp4" if options.format == "mp4" else task.results / "views"
+    frames, is_film = task.run / FRAMES, options.format == "mp4"
+    target = task.results / "turntable.mp4" if is_film else frames
     arguments: dict[str, Any] = {
         "source": task.run,
-        "scene": task.scene,
+        "scene": None,
         "output": target,
         "views": options.views if options.mode == "views" else None,
+        "photographs": options.photographs,
         "frames": options.frames,
         "seconds": None,
         "fps": options.fps,
@@ -119,7 +135,44 @@ def render(task: Task) -> None:
         "threads": task.threads,
     }
     tell = stopping(task.listener, task.should_stop)
-    render_files(options.mode, arguments, tell, lambda line: tell(Warned(line)))
+    stage = None
+    if options.stage is not None:
+        for _, name in named_files(options.stage):
+            check_name(name)  # as the service did
+        stage = SetStage(options.stage, task.files)
+    kept = _KeptFrames(task.listener)
+    keeping = Keeping(resume=True, or_anew=True, frames=frames, on_kept=kept)
+    try:
+        paths = render_files(options.mode, arguments, tell, lambda line: tell(Warned(line)), stage, keeping)
+    except Cancelled:
+        kept.tell()
+        raise
+    if not is_film:
+        for path in paths:
+            _publish(task, path, f"views/{path.relative_to(frames).as_posix()}")
+
+
+class _KeptFrames:
+    """Asks for finished frames to be stored, not too often."""
+
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+        self._count = self._told = 0
+        self._due = 0.0
+
+    def __call__(self, count: int) -> None:
+        """Hear that so many are done."""
+        self._count = count
+        if time.monotonic() >= self._due:
+            self.tell()
+
+    def tell(self) -> None:
+        """Ask now, if there are new ones."""
+        if self._count > self._told:
+            self._listener(CheckpointWritten(self._count, FRAMES))
+            self._told = self._count
+        # All their names are written each time.
+        self._due = time.monotonic() + max(KEEP_SECONDS, KEEP_SECONDS_OF_FRAME * self._count)
 
 
 def _places(task: Task) -> Places:

@@ -7,7 +7,6 @@ end does not depend on any of it.
 import asyncio
 import contextlib
 import logging
-import time
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -21,6 +20,7 @@ from workers.queue.storing import storing
 from workers.store.errors import StorageError
 from workers.telling.events import journal_progress, told_event
 from workers.telling.lines import PlainLines
+from workers.telling.pace import Pace
 from workers.work.task import RUN
 from workers.work.workspace import Checkpoint, Workspace
 
@@ -58,9 +58,8 @@ class Reporter:
         self._progress: dict[str, Any] | None = None
         self._stage = ""
         self._stages: tuple[str, ...] = ()
-        self._stage_began = 0.0
+        self._left = Pace()
         self._steps = 0
-        self._first_step: int | None = None
         self._wanted: tuple[str, int] | None = None
         self._preview: dict[str, Any] | None = None
         self._kept: Checkpoint | None = None
@@ -105,7 +104,7 @@ class Reporter:
             for line in event.get("cause", ()):
                 self.note(str(line))
         if kind == "stage_started":
-            self._stage, self._stage_began, self._first_step = event["stage"], time.monotonic(), None
+            self._stage, self._left = event["stage"], Pace()
             self._steps = int(event["total_steps"])
             self._progress = {"stage": self._stage, "step": 0, "total_steps": self._steps or None}
         elif kind == "stage_progress":
@@ -151,17 +150,11 @@ class Reporter:
 
     def _count(self, event: dict[str, Any]) -> None:
         step, total = int(event["step"]), int(event["total_steps"])
-        left = None
-        if self._first_step is None:
-            self._first_step, self._stage_began = step, time.monotonic()
-        elif step > self._first_step:
-            pace = (time.monotonic() - self._stage_began) / (step - self._first_step)
-            left = pace * (total - step)
         self._progress = {
             "stage": event["stage"],
             "step": step,
             "total_steps": total,
-            "seconds_left": left,
+            "seconds_left": self._left.left(step + float(event.get("part", 0.0)), total),
             "event": {key: value for key, value in event.items() if key != "kind"},
         }
 

@@ -172,6 +172,7 @@ class Supervisor:
             dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
             files = await files_of(connection, job.dataset_id) if job.dataset_id else []
             artifacts = await artifacts_of(connection, job.source_id) if job.source_id else []
+            named = await files_of(connection, job.files_id) if job.files_id else []
             left = 3600 * settings.max_job_hours - await seconds_spent(connection, job)
         self._time_up = time.monotonic() + left
         if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
@@ -179,6 +180,8 @@ class Supervisor:
             scene = await asyncio.to_thread(self._workspace.fetch_dataset, dataset.id, files, dataset.name)
         if kind.needs == "result":
             await asyncio.to_thread(self._workspace.fetch_source, artifacts, kind.source_files)
+        if named:
+            await asyncio.to_thread(self._workspace.fetch_files, named)
         if job.checkpoint is not None:
             await self._restore(Checkpoint.from_row(job.checkpoint))
         self._reporter.expect(kind.stages(options))

@@ -7,8 +7,11 @@ from typing import Any
 
 from engine.events import Listener, ignore
 
-RUN, RESULTS, SCENE = "run", "results", "scene"
-"""Folders of an attempt: the engine's output, what is to be published, the photographs."""
+RUN, RESULTS, SCENE, FILES = "run", "results", "scene", "files"
+"""Folders of an attempt: the engine's output, what is to be published, photographs, files that are named."""
+
+FRAMES = "frames"
+"""In the engine's output, images of a render that are done; they are kept for later attempts."""
 
 NO_SPACE = "no_space"
 """Type of the error of a job that met a full disk, which is no fault of its own."""
@@ -47,6 +50,11 @@ class Task:
     def run(self) -> Path:
         """The engine's output folder."""
         return self.folder / RUN
+
+    @property
+    def files(self) -> Path:
+        """Folder of the files that the options name, if they name some; they must not be changed."""
+        return self.folder / FILES
 
     @property
     def results(self) -> Path:

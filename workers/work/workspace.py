@@ -14,13 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from engine.render.kept import RECORD
 from workers.queue.attempts import Result
 from workers.records.rows import Artifact, DatasetFile, Job
 from workers.store.errors import StorageError
 from workers.store.protocol import Storage
 from workers.store.trees import Manifest, TreeFile, fetch_tree, publish_manifest, read_manifest, store_tree
 from workers.work.media_types import media_type
-from workers.work.task import RESULTS, RUN
+from workers.work.task import FILES, FRAMES, RESULTS, RUN
 
 POSES = "poses"
 """Poses that the engine found, in its output folder and among the results."""
@@ -84,6 +85,7 @@ class Workspace:
         self.folder = root / "attempts" / f"{job.id}.{job.attempt}"
         self._lock: IO[bytes] | None = None
         self._dataset_lock: IO[bytes] | None = None
+        self._frames: dict[str, TreeFile] = {}
 
     def open(self) -> None:
         """Make the folder, anew if there is one of that name."""
@@ -108,15 +110,18 @@ class Workspace:
         place = folder / (re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "scene")
         if not place.exists():
             partial = folder / f".{uuid.uuid4().hex}.partial"
-            tree = [TreeFile(path=f.path, sha256=f.sha256, size_bytes=f.size_bytes) for f in files]
             try:
-                fetch_tree(self._storage, tree, partial)
+                fetch_tree(self._storage, _tree(files), partial)
                 with contextlib.suppress(OSError):  # another attempt was faster
                     partial.rename(place)
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
         os.utime(folder)
         return place
+
+    def fetch_files(self, files: Sequence[DatasetFile]) -> None:
+        """Files that the options name; they must not be changed."""
+        fetch_tree(self._storage, _tree(files), self.folder / FILES)
 
     def fetch_source(self, artifacts: Sequence[Artifact], wanted: Sequence[str]) -> None:
         """Results of the source job into the run folder."""
@@ -147,11 +152,11 @@ class Workspace:
     def keep(self, stage: str, step: int) -> Checkpoint | None:
         """Store what is needed to go on from here; None if there is nothing yet."""
         for _ in range(_TRIES):
-            names = self._names_to_keep()
+            names = self._names_to_keep(stage)
             if not names:
                 return None
             try:
-                files = store_tree(self._storage, self.folder, names).files
+                files = self._stored(names)
             except StorageError:
                 # The program replaces files while they are read; whatever else is wrong stays wrong.
                 if all((self.folder / name).exists() for name in names):
@@ -203,7 +208,28 @@ class Workspace:
         """Store one file of the folder and return its digest."""
         return store_tree(self._storage, self.folder, [name]).files[0].sha256
 
-    def _names_to_keep(self) -> list[str]:
+    def _stored(self, names: Sequence[str]) -> tuple[TreeFile, ...]:
+        """Store files; finished frames never change, so that each of them is read once."""
+        new = [name for name in names if name not in self._frames]
+        files = {file.path: file for file in store_tree(self._storage, self.folder, new).files}
+        found = tuple(self._frames.get(name) or files[name] for name in names)
+        record = f"{RUN}/{FRAMES}/{RECORD}"
+        self._frames |= {n: f for n, f in files.items() if n.startswith(f"{RUN}/{FRAMES}/") and n != record}
+        return found
+
+    def _frames_to_keep(self) -> list[str]:
+        """The record of finished frames, and those that it names."""
+        folder = self.folder / RUN / FRAMES
+        try:
+            rows = [json.loads(line) for line in (folder / RECORD).read_text(encoding="utf-8").splitlines()]
+        except (OSError, ValueError):  # none yet, or it is being written
+            return []
+        names = [RECORD, *(row["file"] for row in rows[1:])]
+        return [f"{RUN}/{FRAMES}/{name}" for name in names if (folder / name).is_file()]
+
+    def _names_to_keep(self, stage: str) -> list[str]:
+        if stage == "render":
+            return self._frames_to_keep()
         names = [name for name in _ALWAYS_KEPT if (self.folder / name).is_file()]
         poses = [
             path.relative_to(self.folder).as_posix() for path in sorted((self.folder / RUN / POSES).glob("*"))
@@ -254,6 +280,10 @@ def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
                 shutil.rmtree(folder, ignore_errors=True)
             removed += 1
     return removed
+
+
+def _tree(files: Sequence[DatasetFile]) -> list[TreeFile]:
+    return [TreeFile(path=f.path, sha256=f.sha256, size_bytes=f.size_bytes) for f in files]
 
 
 def _results(manifest: Manifest) -> list[Result]:

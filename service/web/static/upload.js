@@ -11,9 +11,10 @@ export class Upload {
      * @param scene as of scene_files.js
      * @param title what to call it
      * @param tell hears {done, total, files, allFiles, stage}
+     * @param holds what the dataset holds
      */
-    constructor(scene, title, tell) {
-        Object.assign(this, { scene, title, tell });
+    constructor(scene, title, tell, holds = "photographs") {
+        Object.assign(this, { scene, title, tell, holds });
         this.sent = new Map(); // bytes by name
         this.running = new Set();
         this.paused = null;
@@ -60,12 +61,12 @@ export class Upload {
 
     /** The dataset that was made for just these files, or a new one. */
     async dataset(items) {
-        const text = [this.title, ...items.map(({ name, file }) => `${name}\0${file.size}\0${file.lastModified}`)].join("\n");
+        const text = [this.title, this.holds, ...items.map(({ name, file }) => `${name}\0${file.size}\0${file.lastModified}`)].join("\n");
         const key = `page-${await this.digest(new Blob([text])).then(hex)}`;
         const make = (key) => fetch("/v1/datasets", {
             method: "POST",
             headers: { "Content-Type": "application/json", "Idempotency-Key": key },
-            body: JSON.stringify({ name: this.title }),
+            body: JSON.stringify({ name: this.title, holds: this.holds }),
         }).then(answer);
         try {
             return await this.again(() => make(key));

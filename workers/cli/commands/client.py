@@ -91,6 +91,48 @@ def submit(
         click.echo(submit(api, what, quiet=quiet)["id"])
 
 
+@click.command(short_help="Queue a job on the results of a finished one, such as a render.")
+@click.argument("kind")
+@click.argument("job_id", metavar="JOB")
+@click.option(
+    "--stage",
+    type=click.Path(path_type=Path),
+    metavar="STAGE.toml",
+    help="Render: the stage; it and the files that it names are sent.",
+)
+@set_option
+@click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
+@click.option("--label", help="What to call the job.")
+@click.option("--queue", default="cpu", show_default=True, help="Which workers.")
+@click.option("--priority", type=click.IntRange(-100, 100), default=0, help="Higher goes first.")
+@server_option
+@quiet_option
+def derive(
+    kind: str, job_id: str, stage: Path | None, wait: bool, output: Path | None, server: str | None,
+    quiet: bool, **given: Any,
+) -> None:  # fmt: skip
+    """Queue a job of the KIND evaluate, export or render on the results of JOB; 'last' is the newest one.
+
+    For example: octasplat derive render last --stage stage.toml --set frames=60 --wait
+    """
+    from workers.cli.submitting import derive, submit_and_wait
+    from workers.client.submission import Derivation, with_stage
+
+    with connected(server) as api:
+        source = _job(api, job_id)["id"]
+        what = Derivation(
+            source, kind, _assigned({}, given["assignments"]),
+            label=given["label"], queue=given["queue"], priority=given["priority"],
+        )  # fmt: skip
+        if stage is not None:
+            what = with_stage(what, stage)
+        if wait:
+            submit_and_wait(api, what, output or Path(f"{kind}-result"), quiet=quiet)
+            return
+        click.echo(derive(api, what, quiet=quiet)["id"])
+
+
 @click.command(short_help="List jobs.")
 @click.option("--state", multiple=True, type=click.Choice(STATES), help="Only these; may be repeated.")
 @click.option("--limit", type=click.IntRange(1, 200), default=20, show_default=True)
@@ -219,7 +261,12 @@ def _options(given: dict[str, Any]) -> dict[str, Any]:
         options["exports"] = list(exports)
     if given.get("iterations") is not None:
         options["train"] = {"iterations": given["iterations"]}
-    for assignment in given["assignments"]:
+    return _assigned(options, given["assignments"])
+
+
+def _assigned(options: dict[str, Any], assignments: tuple[str, ...]) -> dict[str, Any]:
+    """The options with ``--set`` on top."""
+    for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals:
             raise ConfigError(f"--set {assignment}: write it as name=value, e.g. train.rates.quat=0.02.")
@@ -269,4 +316,4 @@ def _where(job: dict[str, Any]) -> str:
     return f"{job['stage']}{count}"
 
 
-COMMANDS = (submit, jobs, status, logs, cancel, retry, download)
+COMMANDS = (submit, derive, jobs, status, logs, cancel, retry, download)

@@ -1,8 +1,13 @@
 """``octasplat export``: Gaussians to other formats."""
 
+import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from engine.gaussians.model import FlatGaussians
 
 
 class _ExportCommand(click.Command):
@@ -26,6 +31,13 @@ class _ExportCommand(click.Command):
 @click.option("--format", "format_name", metavar="NAME", help="The format, if OUT's name does not say it.")
 @click.option(
     "--min-opacity", type=click.FloatRange(0, 1, max_open=True), default=0.0, help="Leave fainter ones out."
+)
+@click.option(
+    "--colour",
+    metavar="cameras|constant|X,Y,Z",
+    help="Formats with one colour for each Gaussian: the one that loses least seen from the photographs' "
+    "places of a run, or from all around a file; the harmonics' constant part; or the one seen along a "
+    "direction.  [default: cameras for a run, constant for a file]",
 )
 @click.option(
     "--sh-pad",
@@ -71,6 +83,7 @@ def export(
     target: Path,
     format_name: str | None,
     min_opacity: float,
+    colour: str | None,
     sh_pad: int | None,
     spz_version: str,
     opaque: bool,
@@ -86,12 +99,13 @@ def export(
     """
     from engine.files import ExportOptions, export_scene, exporter_for
     from engine.gaussians.octagon import CHI2_2_99
-    from workers.cli.scene_files import open_scene, warn_of_lost_channels
+    from workers.cli.scene_files import open_scene, warn_of_losses
     from workers.cli.signals import orderly_termination
 
     exporter = exporter_for(target, format_name)  # complain before the long work
     if opaque and exporter.name != "glb":
         raise click.UsageError(f"--opaque is for GLB; {target} is written as {exporter.name}.")
+    chosen = _colour(colour, source)
     gaussians = open_scene(source)
     options = ExportOptions(
         q=CHI2_2_99 if q is None else q,
@@ -103,8 +117,43 @@ def export(
         ids=not no_ids,
         spz_version=4 if spz_version == "4" else 3,
     )
-    warn_of_lost_channels(gaussians, target, exporter.name)
+    warn_of_losses(gaussians, target, exporter.name)
     with orderly_termination():
+        if not exporter.holds_harmonics:
+            gaussians = _one_colour(gaussians, source, chosen)
         files = export_scene(gaussians, target, options, exporter.name)
     for path in files:
         click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")
+
+
+def _colour(text: str | None, source: Path) -> "str | tuple[float, float, float]":
+    """What ``--colour`` says: ``cameras``, ``constant``, or a direction."""
+    from engine.run_folder import is_run
+
+    if text is None:
+        return "cameras" if is_run(source) else "constant"
+    if text in ("cameras", "constant"):
+        return text
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise click.UsageError(f"--colour {text}: write cameras, constant, or three numbers X,Y,Z.") from None
+    if not 0 < math.hypot(x, y, z) < math.inf:
+        raise click.UsageError(f"--colour {text}: is no direction.")
+    return x, y, z
+
+
+def _one_colour(
+    gaussians: "FlatGaussians", source: Path, colour: "str | tuple[float, float, float]"
+) -> "FlatGaussians":
+    import numpy as np
+
+    from engine.plain_colours import PlainScene
+    from engine.render.one_colour import colours_toward, with_colours
+    from engine.run_folder import is_run
+
+    if colour == "constant" or gaussians.sh_degree == 0:
+        return gaussians
+    if colour == "cameras":
+        return PlainScene(gaussians, source if is_run(source) else None).gaussians
+    return with_colours(gaussians, colours_toward(gaussians, np.array(colour)))

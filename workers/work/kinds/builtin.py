@@ -1,10 +1,11 @@
 """The kinds that octasplat brings."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import cast
 
 from pydantic import BaseModel
 
+from engine.light.stage_file import named_files
 from engine.train.config import iteration_count, most_gaussians
 from workers.records.sizes import Sizes
 from workers.work.kinds.demands import Demand
@@ -93,8 +94,8 @@ def register_all() -> None:
             estimate=lambda options, sizes, cores: estimate_render(
                 cast(RenderJobOptions, options), sizes, cores
             ),
-            source_files=("scene.ply", "config.json"),
-            needs_photographs=lambda _options: True,
+            names_files=_files_of_stage,
+            source_files=_RUN_FILES[:4],
         )
     )
 
@@ -132,7 +133,20 @@ def _reconstruction_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple
 def _render_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
     asked = cast(RenderJobOptions, options)
     path = "frames" if asked.mode == "turntable" else "max_side"
-    return (Demand(path, "render_pixels", rendered_pixels(asked, sizes)),)
+    pixels = rendered_pixels(asked, sizes)
+    if asked.stage is None:
+        return (Demand(path, "render_pixels", pixels),)
+    paths = pixels * asked.stage.integrator.samples
+    return (
+        Demand(path, "render_pixels", pixels),
+        Demand("stage.integrator.samples", "render_paths", paths),
+    )
+
+
+def _files_of_stage(options: BaseModel) -> Iterator[tuple[str, str]]:
+    stage = cast(RenderJobOptions, options).stage
+    for key, name in named_files(stage) if stage is not None else ():
+        yield f"stage.{key.replace('[', '.').replace(']', '')}", name
 
 
 def _same_training(before: BaseModel, after: BaseModel) -> bool:

@@ -10,6 +10,7 @@ CEILINGS: Mapping[str, str] = {
     "side_px": "pixels of a side",
     "exports": "files",
     "render_pixels": "pixels of all images together",
+    "render_paths": "paths of light of all images together",
 }
 """Names of the ceilings, as the settings have them with ``max_`` before, and what they count."""
 

@@ -19,6 +19,8 @@ _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
 _LIFT_CPU_SECONDS_PER_POINT = 7.0e-5
 _EVALUATE_CPU_SECONDS_PER_PIXEL = 2.7e-6
 _RENDER_CPU_SECONDS_PER_PIXEL = 1.5e-6
+_PATH_CPU_SECONDS = 1.0e-5
+"""For a path of a stage among 100,000 Gaussians (``benchmarks/light.py``)."""
 _RAY_CPU_SECONDS = 5.9e-6
 """For a ray, forward and backward, of a training that ends with 100,000 Gaussians."""
 _LEAST_RAY_CPU_SECONDS = 1.0e-6
@@ -105,7 +107,10 @@ def training_pixels(options: ReconstructOptions, photographs: Sequence[Sizes]) -
 def estimate_render(options: RenderJobOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
     """The estimate of new views; of views, all photographs are reckoned with."""
     pixels = rendered_pixels(options, photographs)
-    cpu_seconds = _START_CPU_SECONDS + _RENDER_CPU_SECONDS_PER_PIXEL * pixels
+    each = _RENDER_CPU_SECONDS_PER_PIXEL
+    if options.stage is not None:
+        each += _PATH_CPU_SECONDS * options.stage.integrator.samples
+    cpu_seconds = _START_CPU_SECONDS + each * pixels
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
     return _estimate(cpu_seconds, memory, cores)
 
@@ -115,6 +120,9 @@ def rendered_pixels(options: RenderJobOptions, photographs: Sequence[Sizes]) -> 
     if options.mode == "turntable":
         return options.frames * options.width_px * options.height_px
     shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
+    if options.photographs is not None:
+        largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
+        return largest * len(options.photographs)
     return sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
 
 

@@ -1,15 +1,17 @@
 """Options of the job kinds, as users give them and as they are kept. Imports neither torch nor numba."""
 
 import re
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from engine.config import ReconstructionConfig
 from engine.errors import SceneFileError
 from engine.files import exporter_for
+from engine.light.stage import Stage
 from engine.train.config import preset
 
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -33,6 +35,19 @@ def check_export_name(name: str) -> str:
 
 
 ExportName = Annotated[str, AfterValidator(check_export_name)]
+
+
+def read_toml(value: object) -> object:
+    """What a TOML text says; anything else as it is. Raises ValueError where it is no TOML."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return tomllib.loads(value)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ValueError(f"the stage is no TOML: {error}") from None
+
+
+PhotographName = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class ReconstructOptions(ReconstructionConfig):
@@ -83,6 +98,10 @@ class RenderJobOptions(BaseModel):
         fov_y_degrees: angle of a turntable's images from top to bottom; None takes that of the photographs.
         background: behind the scene; None takes that of the reconstruction's evaluation.
         max_side: longer side of the images of views, px.
+        photographs: with ``mode`` views: those of the photographs with these names, not ``views``.
+        stage: things, lights and mirrors that the scene is rendered with, as ``docs/light.md`` describes:
+            an object, or the text of a stage file. The files that it names are those of the job's
+            ``files_id``.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -97,11 +116,17 @@ class RenderJobOptions(BaseModel):
     fov_y_degrees: float | None = Field(None, ge=1, le=170)
     background: Literal["black", "white"] | None = None
     max_side: int | None = Field(None, ge=16)
+    photographs: tuple[PhotographName, ...] | None = Field(None, min_length=1, max_length=1000)
+    stage: Annotated[Stage | None, BeforeValidator(read_toml, json_schema_input_type=Stage | str | None)] = (
+        None
+    )
 
     @model_validator(mode="after")
     def _fits(self) -> "RenderJobOptions":
         if self.mode == "views" and self.format == "mp4":
             raise ValueError("views are images; choose the format png or exr")
+        if self.mode == "turntable" and self.photographs is not None:
+            raise ValueError("photographs are views; choose the mode views")
         return self
 
 

@@ -35,6 +35,9 @@ class JobKind:
         writes: names of the files that it writes in formats of their own, given the options.
         writes_at: where the options name those files.
         demands: what the options ask for that a service may set a ceiling to, given the photographs' sizes.
+        names_files: files that the options name, each after the place where they do, with dots; they are
+            uploaded as a dataset that holds files, and are in :attr:`workers.work.task.Task.files`. None for
+            a kind that takes no files.
         estimate: time and memory that it takes, given the options, the photographs' sizes and the number of
             cores; None where nobody knows.
     """
@@ -55,6 +58,7 @@ class JobKind:
     writes: Callable[[BaseModel], tuple[str, ...]] = lambda _options: ()
     writes_at: str = ""
     demands: Callable[[BaseModel, Sequence[Sizes]], Iterable[Demand]] = lambda _options, _sizes: ()
+    names_files: Callable[[BaseModel], Iterable[tuple[str, str]]] | None = None
     estimate: Callable[[BaseModel, Sequence[Sizes], int], Estimate | None] = lambda _options, _sizes, _n: None
 
     def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> BaseModel:

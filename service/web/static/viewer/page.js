@@ -1,6 +1,7 @@
 // The viewer on a job's page: loads the scene, starts from the photographs' cameras, listens to all controls.
 
 import { OrbitControls, PerspectiveCamera, Vector3 } from "../vendor/three.js";
+import { CameraPath } from "./camera_path.js";
 import { Walking } from "./walking.js";
 import { CHI2_2_99, Sorting, SplatRenderer } from "./splats.js";
 import { thousands } from "../numbers.js";
@@ -22,6 +23,7 @@ class Viewer {
         this.slow = 0;
         this.lastFrame = 0;
         this.view = -1;
+        this.path = new CameraPath();
         const button = this.veil.querySelector("button");
         if (Number(box.dataset.size) <= AUTOMATIC_BYTES && !navigator.connection?.saveData) this.start();
         else {
@@ -125,6 +127,11 @@ class Viewer {
         else if (action === "background") {
             this.background = this.background === "black" ? "white" : "black";
             this.splats.setBackground(...BACKGROUNDS[this.background]);
+        } else if (action === "key") this.tellPath(this.path.add(this.camera));
+        else if (action === "save-path") this.path.save("camera_path.json");
+        else if (action === "clear-path") {
+            this.path.clear();
+            this.tellPath(0);
         } else if (action === "full") {
             if (document.fullscreenElement) document.exitFullscreen();
             else this.box.requestFullscreen();
@@ -136,6 +143,13 @@ class Viewer {
             this.place.textContent = "";
         }
         this.wake();
+    }
+
+    /** Shows how many cameras the path has. */
+    tellPath(count) {
+        this.box.querySelector("[data-do=save-path]").textContent = `Save path (${count})`;
+        this.box.querySelectorAll("[data-do=save-path], [data-do=clear-path]").forEach((button) => { button.hidden = count === 0; });
+        if (count) this.place.textContent = `Camera ${count} of the path`;
     }
 
     stepView(step) {

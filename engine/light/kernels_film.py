@@ -1,0 +1,17 @@
+"""Sums over the paths of each pixel."""
+
+from engine.trace.kernels_native import lean
+
+
+@lean(cache=True, nogil=True)
+def add_up(values, factors, each, pixels, sums):
+    """Add to the rows ``pixels`` of ``sums`` those of ``values``, ``each`` a pixel, times ``factors``.
+
+    All is summed in float64, one after the other. Without factors (no rows at all) values count as they are.
+    """
+    for i in range(len(pixels)):
+        for channel in range(values.shape[1]):
+            total = 0.0
+            for k in range(i * each, (i + 1) * each):
+                total += float(values[k, channel]) * (factors[k] if len(factors) else 1.0)
+            sums[pixels[i], channel] += total

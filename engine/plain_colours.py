@@ -1,0 +1,80 @@
+"""Scenes with one colour for each Gaussian, as formats without harmonics need them: which colour that is."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64
+
+from engine.config import read_config
+from engine.errors import OctasplatError
+from engine.gaussians.model import FlatGaussians
+from engine.rays import ImageRays
+from engine.render.jobs import view_shots
+from engine.render.one_colour import colours_for_cameras, with_colours
+from engine.run_folder import CONFIG, run_viewpoints
+from engine.surface.cameras import cameras_around
+from engine.trace.make import make_tracer
+from engine.trace.protocol import TraceSettings
+
+SIDE_PX = 160
+MAX_VIEWS = 48
+
+
+class PlainScene:
+    """A scene of which the one colour of each Gaussian is found when somebody asks, and once.
+
+    Args:
+        gaussians: the scene.
+        run: the folder of the run that it is of; its training views are those for which the colours lose
+            least. None takes cameras all around.
+        threads: to use; 0 takes all.
+        on_pass: told (passes done, in all); it may raise to stop.
+    """
+
+    def __init__(
+        self,
+        gaussians: FlatGaussians,
+        run: Path | None,
+        *,
+        threads: int = 0,
+        on_pass: Callable[[int, int], None] = lambda _done, _total: None,
+    ) -> None:
+        self._gaussians, self._run, self._threads, self._on_pass = gaussians, run, threads, on_pass
+
+    @cached_property
+    def gaussians(self) -> FlatGaussians:
+        """The scene without harmonics beyond the constant one.
+
+        The colours of its constant harmonics stay where the cameras of a run are not known any more.
+        """
+        if self._gaussians.sh_degree == 0:
+            return self._gaussians
+        settings, images = TraceSettings(), _around(self._gaussians)
+        if self._run is not None:
+            try:
+                settings, images = _of_run(self._run)
+            except OctasplatError:
+                return with_colours(self._gaussians, self._gaussians.base_rgb_srgb)
+        tracer = make_tracer(settings, threads=self._threads)
+        colours = colours_for_cameras(self._gaussians, tracer, images, on_pass=self._on_pass)
+        return with_colours(self._gaussians, colours)
+
+
+def _of_run(run: Path) -> tuple[TraceSettings, Sequence[Callable[[], ImageRays]]]:
+    config = read_config(run / CONFIG)
+    viewpoints = run_viewpoints(run, max_side=SIDE_PX)
+    near = config.train.near * viewpoints.extent
+    shots = view_shots(viewpoints, _some(viewpoints.train_indices), near)
+    return config.train.trace, [shot.rays for shot in shots]
+
+
+def _around(gaussians: FlatGaussians) -> Sequence[Callable[[], ImageRays]]:
+    return [camera.rays for camera in cameras_around(gaussians, SIDE_PX, MAX_VIEWS)]
+
+
+def _some(indices: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
+    """Not more than ``MAX_VIEWS`` of them, spread evenly."""
+    count = min(len(indices), MAX_VIEWS)
+    return indices[np.linspace(0, len(indices) - 1, count).round().astype(np.int64)]

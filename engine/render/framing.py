@@ -1,0 +1,115 @@
+"""How much of a scene of bare Gaussians is seen, and from how far away all of it fits into an image."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from engine.gaussians.model import FlatGaussians
+
+MARGIN = 1.08
+"""Images are this much wider than what they frame."""
+_SOLID = 0.1
+"""Fainter Gaussians are haze."""
+_REACH = 3.5
+"""What lies further from the middle than this many times three quarters of the scene is its surroundings."""
+_TAIL = 0.002
+"""Share of the opacity at either end of an extent that may be strays."""
+_RING = 64
+
+
+@dataclass(frozen=True)
+class SeenBounds:
+    """An upright cylinder around what is seen.
+
+    Attributes:
+        centre_world: its middle.
+        up_world: its axis, of unit length.
+        radius: world units.
+        half_height: world units.
+    """
+
+    centre_world: Float64[np.ndarray, "3"]
+    up_world: Float64[np.ndarray, "3"]
+    radius: float
+    half_height: float
+
+
+def seen_bounds(gaussians: FlatGaussians, up_world: Float64[np.ndarray, "3"]) -> SeenBounds:
+    """A robust cylinder around the solid Gaussians: surroundings far away and strays do not count.
+
+    Args:
+        gaussians: at least one.
+        up_world: direction of the axis, of any length.
+    """
+    up = up_world / np.linalg.norm(up_world)
+    solid = solid_middle(gaussians)
+    points = gaussians.means_world[solid].astype(np.float64)
+    reach = np.exp(gaussians.log_scales[solid].astype(np.float64)).max(axis=1)
+    weights = gaussians.opacities[solid].astype(np.float64)
+    heights = points @ up
+    low, high = _ends(heights, reach, weights)
+    across = points - heights[:, None] * up
+    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    middle = np.zeros(3)
+    for axis in (first, second):
+        left, right = _ends(across @ axis, reach, weights)
+        middle += 0.5 * (left + right) * axis
+    outwards = np.linalg.norm(across - middle, axis=1)
+    radius = max(_ends(outwards, reach, weights)[1], 0.0)
+    half_height = 0.5 * (high - low)
+    smallest = 1e-6 * max(radius, half_height, float(reach.max()))
+    return SeenBounds(middle + 0.5 * (low + high) * up, up, max(radius, smallest), max(half_height, smallest))
+
+
+def solid_middle(gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
+    """The Gaussians that are not faint and that do not lie far outside of where most are; at least one."""
+    opacities = gaussians.opacities
+    solid = opacities >= min(_SOLID, 0.5 * float(opacities.max()))
+    points = gaussians.means_world.astype(np.float64)
+    centre = np.median(points[solid], axis=0)
+    distances = np.linalg.norm(points - centre, axis=1)
+    most = float(np.quantile(distances[solid], 0.75))
+    return np.asarray(solid & (distances <= _REACH * most)) if most > 0 else np.asarray(solid)
+
+
+def fitting_distance(
+    bounds: SeenBounds, elevation_degrees: float, fov_y_degrees: float, aspect: float
+) -> float:
+    """How far from the middle a camera has to stand so that the cylinder fits into its image, with a margin.
+
+    Args:
+        bounds: the cylinder.
+        elevation_degrees: of the camera above the middle.
+        fov_y_degrees: angle from the top of the image to its bottom.
+        aspect: width over height of the image.
+    """
+    elevation, angles = np.radians(elevation_degrees), np.linspace(0, 2 * np.pi, _RING, endpoint=False)
+    slope_y = np.tan(np.radians(fov_y_degrees) / 2) / MARGIN
+    slope_x = slope_y * aspect
+    along, across = bounds.radius * np.cos(angles), bounds.radius * np.sin(angles)
+    needed = 0.0
+    for height in (-bounds.half_height, bounds.half_height):
+        nearer = along * np.cos(elevation) + height * np.sin(elevation)
+        upwards = height * np.cos(elevation) - along * np.sin(elevation)
+        reach = np.maximum(np.abs(across) / slope_x, np.abs(upwards) / slope_y)
+        needed = max(needed, float((nearer + reach).max()))
+    return needed
+
+
+def _ends(
+    values: Float64[np.ndarray, " n"], reach: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"]
+) -> tuple[float, float]:
+    """Between which values all but the tails lie, each value reaching out by a standard deviation."""
+    low, high = values - reach, values + reach
+    return _quantile(low, weights, _TAIL), _quantile(high, weights, 1 - _TAIL)
+
+
+def _quantile(
+    values: Float64[np.ndarray, " n"], weights: Float64[np.ndarray, " n"], quantile: float
+) -> float:
+    order = np.argsort(values)
+    sums = np.cumsum(weights[order])
+    return float(values[order[min(int(np.searchsorted(sums, quantile * sums[-1])), len(order) - 1)]])

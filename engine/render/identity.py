@@ -1,0 +1,54 @@
+"""What decides how a render looks, as one digest."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+import engine
+
+
+def identity_of(*parts: Any) -> str:
+    """A digest of values: numbers, texts, arrays, models, dataclasses, and lists or mappings of them.
+
+    Paths count by the content of their files and not by their names, so that the same things elsewhere are
+    the same; those within a dataclass say where it came from and do not count. The version of octasplat does.
+    """
+    digest = hashlib.sha256(engine.__version__.encode())
+    for part in parts:
+        _add(digest, part)
+    return digest.hexdigest()
+
+
+def _add(digest: "hashlib._Hash", value: Any) -> None:
+    """Every value begins with its type and ends with a length, so that no two run into each other."""
+    digest.update(type(value).__name__.encode() + b"\0")
+    if isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype.str}{value.shape}".encode())
+        digest.update(value.tobytes())
+    elif isinstance(value, BaseModel):
+        _add(digest, value.model_dump_json())
+    elif isinstance(value, Path):
+        if value.is_file():
+            with value.open("rb") as handle:
+                digest.update(hashlib.file_digest(handle, "sha256").digest())
+    elif is_dataclass(value):
+        for field in fields(value):
+            if not isinstance(part := getattr(value, field.name), Path):
+                _add(digest, field.name)
+                _add(digest, part)
+    elif isinstance(value, Mapping):
+        for key in sorted(value):
+            _add(digest, key)
+            _add(digest, value[key])
+    elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        for item in value:
+            _add(digest, item)
+        digest.update(f"{len(value)}".encode())
+    else:
+        text = repr(value).encode()
+        digest.update(f"{len(text)}:".encode() + text)

@@ -1,0 +1,55 @@
+"""Files that the options of a job name, looked for among those that were sent."""
+
+import uuid
+
+from pydantic import BaseModel
+
+from service.actions.asked import input_problem
+from service.auth import Principal
+from service.problems import Problem
+from workers.records.database import Connection
+from workers.records.datasets import files_of, get_dataset
+from workers.store.names import shown_name
+from workers.work.kinds import JobKind
+
+
+async def check_named_files(
+    connection: Connection, who: Principal, kind: JobKind, options: BaseModel, files_id: uuid.UUID | None
+) -> None:
+    """Refuse options that name a file which is not there under just this name.
+
+    Args:
+        connection: to the database.
+        who: asks.
+        kind: of the job.
+        options: complete ones.
+        files_id: the dataset that is to hold the files.
+
+    Raises:
+        Problem: 422, with the place of each such name; 409 if the dataset is not committed.
+    """
+    names = [] if kind.names_files is None else list(kind.names_files(options))
+    sent: set[str] = set()
+    if files_id is not None:
+        if kind.names_files is None:
+            raise input_problem("files_id", f"Jobs of the kind {kind.name} take no files.")
+        dataset = await get_dataset(connection, files_id, lock=True)
+        if dataset is None or not who.owns(dataset.owner):
+            raise input_problem("files_id", "There is no such dataset.")
+        if dataset.holds != "files":
+            detail = "The dataset holds photographs; make one that holds files."
+            raise input_problem("files_id", detail)
+        if dataset.state != "committed":
+            raise Problem(409, "dataset-open", "The dataset is not committed yet; POST to its /commit first.")
+        sent = {file.path for file in await files_of(connection, files_id)}
+    faults = [
+        {
+            "pointer": f"#/options/{path.replace('.', '/')}",
+            "detail": f"{path}: there is no file {shown_name(name)} among those of files_id; send it.",
+            "file": name,
+        }
+        for path, name in names
+        if name not in sent
+    ]
+    if faults:
+        raise Problem(422, "file-missing", faults[0]["detail"], errors=faults)

@@ -1,0 +1,67 @@
+"""What the form of a stage needs of a finished job: pictures to place things in, and limits."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from service.settings import ServiceSettings
+from service.web.results import Measured
+from workers.records.rows import Artifact, DatasetFile
+from workers.work.kinds import kind_named
+
+MAX_VIEWS = 60
+PREVIEW_PRIORITY = 10
+
+
+@dataclass(frozen=True)
+class PlacingView:
+    """A held-out view in which a place can be shown.
+
+    Attributes:
+        name: of the photograph.
+        render: name of the result that shows it.
+        width: of the photograph at its full size, px.
+        height: of the photograph at its full size, px.
+    """
+
+    name: str
+    render: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class LightForm:
+    """The form of a stage.
+
+    Attributes:
+        views: where things can be placed.
+        priority: of a preview.
+        max_file_bytes: length of one file that is sent.
+    """
+
+    views: list[PlacingView]
+    priority: int
+    max_file_bytes: int
+
+
+def light_form(
+    measured: Measured | None,
+    artifacts: Sequence[Artifact],
+    photographs: Sequence[DatasetFile],
+    settings: ServiceSettings,
+) -> LightForm | None:
+    """The form for a job's result; None where it has no scene or no picture to place things in."""
+    names = {row.name for row in artifacts}
+    needed = kind_named("render").source_files
+    if measured is None or not names.issuperset(needed):
+        return None
+    facts = {file.path.removeprefix("images/"): file.facts for file in photographs}
+    views = [
+        PlacingView(view.name, view.render, int(found["width_px"]), int(found["height_px"]))
+        for view in sorted(measured.views, key=lambda view: view.name)
+        if view.render is not None and (found := facts.get(view.name)) and found.get("height_px")
+    ]
+    if not views:
+        return None
+    priority = min(PREVIEW_PRIORITY, settings.max_priority)
+    return LightForm(views[:MAX_VIEWS], priority, settings.max_upload_bytes)

@@ -1,0 +1,43 @@
+"""``octasplat info``: facts on a file or a run."""
+
+import json
+
+import numpy as np
+import pytest
+
+from engine.evaluate.scene_facts import OPACITY_EDGES
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.render.images import read_image
+
+
+def test_facts_on_a_file_are_those_of_its_gaussians(run, octasplat, tmp_path):
+    gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
+    count = len(gaussians)
+    gaussians = gaussians.with_channels({"roughness": np.ones((count, 1), np.float32)})
+    gaussians.means_world[0] = (1000, 0, 0)  # a stray
+    write_gaussian_ply(gaussians, tmp_path / "scene.ply")
+    result = octasplat("info", tmp_path / "scene.ply", "--up", "z", "--json")
+    assert result.exit_code == 0, result.output
+    facts = json.loads(result.stdout)
+    assert facts["count"] == count and facts["sh_degree"] == gaussians.sh_degree
+    assert facts["channels"] == {"roughness": 1}
+    assert facts["box"]["high_world"][0] == 1000 and facts["box_solid"]["high_world"][0] < 100
+    expected = np.histogram(gaussians.opacities, np.array(OPACITY_EDGES))[0]
+    assert facts["opacity_counts"] == expected.tolist() and sum(expected) == count
+    assert facts["scale_quantiles"][2] == pytest.approx(np.median(gaussians.scales.max(axis=1)), rel=1e-6)
+    assert facts["up_world"] == [0, 0, 1] and facts["photographs"] is None
+    assert 0 < facts["hits"]["mean"] <= facts["hits"]["p95"] and 0 < facts["hits"]["share"] <= 1
+    words = octasplat("info", tmp_path / "scene.ply").stdout
+    assert f"{count:,} Gaussians" in words and "roughness (1)" in words and "\x1b" not in words
+
+
+def test_a_run_knows_its_photographs_and_has_a_picture(run, octasplat, tmp_path):
+    result = octasplat("info", run.output, "--picture", tmp_path / "look.png")
+    assert result.exit_code == 0, result.output
+    assert "a run of 8 photographs" in result.stdout and "of the photographs" in result.stdout
+    assert read_image(tmp_path / "look.png").std() > 0.02
+
+
+def test_what_is_no_scene_is_one_sentence(octasplat, tmp_path):
+    result = octasplat("info", tmp_path / "none.ply")
+    assert result.exit_code == 1 and result.stderr.count("\n") == 1 and "none.ply" in result.stderr

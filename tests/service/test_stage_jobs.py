@@ -1,0 +1,275 @@
+"""Stages as jobs: what is wrong with one is a problem document, and a sound one gives the command's bytes."""
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from click.testing import CliRunner
+from service_bench import claimed, committed_dataset, running, stored
+from test_reconstruction import ROOT
+
+from engine.files.gaussian_ply import read_gaussian_ply
+from engine.pipeline import reconstruct
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from service.state import Service
+from workers.cli.main import cli
+from workers.queue.attempts import Result
+from workers.work.kinds.options import resolve_reconstruction
+
+TRIANGLE = b"v 0 0 0\nv .3 0 0\nv 0 -.3 0\nf 1 2 3\n"
+HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n" + bytes([128, 128, 128, 128] * 4)
+Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
+
+
+@pytest.fixture
+def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
+    def run(conversation: Conversation, **settings: Any) -> None:
+        async def whole() -> None:
+            async with running(conninfo, tmp_path, **settings) as (http, service):
+                await conversation(http, service)
+
+        asyncio.run(whole())
+
+    return run
+
+
+async def finished(http: httpx.AsyncClient, service: Service, files: dict[str, bytes]) -> str:
+    """A reconstruction that ended with these results."""
+    dataset = await committed_dataset(service)
+    facts = json.dumps({"width_px": 48, "height_px": 36})
+    async with service.pool.connection() as connection:
+        for number in range(8):
+            await connection.execute(
+                "INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts) "
+                "VALUES (%s, %s, %s, 1, %s)",
+                [dataset, f"images/{number}.png", stored(service, b"x"), facts],
+            )
+    job = (await http.post("/v1/jobs", json={"dataset_id": dataset})).json()
+    attempt = await claimed(service, job)
+    await attempt.succeed(
+        [Result(name, stored(service, content), len(content), "x/y") for name, content in files.items()], 20.0
+    )
+    return str(job["id"])
+
+
+async def sent(http: httpx.AsyncClient, files: dict[str, bytes]) -> str:
+    """A committed dataset of files that options name."""
+    dataset = (await http.post("/v1/datasets", json={"name": "things", "holds": "files"})).json()["id"]
+    for name, content in files.items():
+        answer = await http.put(f"/v1/datasets/{dataset}/files/{name}", content=content)
+        assert answer.status_code == 201, answer.text
+    committed = (await http.post(f"/v1/datasets/{dataset}/commit")).json()
+    assert committed["state"] == "committed" and committed["facts"]["files"] == len(files)
+    return str(dataset)
+
+
+BAD = [
+    ("colour = 1", "options", "#/options/stage/colour", "no key stage.colour"),
+    ("[[meshes]", "options", "#/options/stage", "no TOML"),
+    (
+        "[[meshes]]\nshape = 'cube'\nposition = [nan, 0, 0]",
+        "options", "#/options/stage/meshes/0/position/0", "finite",
+    ),
+    ("[[meshes]]\nfile = 'chair.glb'", "options", "#/options/stage/meshes/0", "materials of a GLB"),
+    (
+        "[[meshes]]\nshape = 'cube'\nmaterial = { kind = 'glass', ior = 9 }",
+        "options", "#/options/stage/meshes/0/material/ior", "stage.meshes[0].material.ior",
+    ),
+    ("[environment]\nfile = 'sky.hdr'", "file-missing", "#/options/stage/environment/file", "'sky.hdr'"),
+    ("[[meshes]]\nfile = '../thing.obj'", "file-missing", "#/options/stage/meshes/0/file", "'../thing.obj'"),
+    ("[[meshes]]\nfile = '/etc/a.obj'", "file-missing", "#/options/stage/meshes/0/file", "'/etc/a.obj'"),
+    (
+        "[[meshes]]\nfile = 'thing.obj'\nmaterial = { kind = 'diffuse', texture = 'wood.png' }",
+        "file-missing", "#/options/stage/meshes/0/material/texture", "'wood.png'",
+    ),
+    ("[integrator]\nsamples = 65536", "ceiling", "#/options/stage/integrator/samples", "paths of light"),
+    (
+        "[[lights]]\nkind='point'\nposition=[0,0,0]\nintensity=1\n" * 1001,
+        "options", "#/options/stage/lights", "1000 items",
+    ),
+]  # fmt: skip
+
+
+def test_a_bad_stage_is_a_problem_that_names_the_key(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        source = await finished(http, service, {"scene.ply": b"ply"})
+        files = await sent(http, {"thing.obj": TRIANGLE})
+        body: dict[str, Any] = {"kind": "render", "source_id": source, "files_id": files}
+        for stage, kind, pointer, words in BAD:
+            refused = await http.post("/v1/jobs", json={**body, "options": {"stage": stage}})
+            problem = refused.json()
+            assert (refused.status_code, problem["type"]) == (422, f"urn:octasplat:problem:{kind}"), problem
+            assert refused.headers["content-type"] == "application/problem+json"
+            [fault] = problem["errors"]
+            assert fault["pointer"] == pointer and words in fault["detail"], fault
+        # As JSON, where there is no NaN, but Python's reader takes it.
+        text = json.dumps(
+            {**body, "options": {"stage": {"meshes": [{"shape": "cube", "scale": float("nan")}]}}}
+        )
+        refused = await http.post("/v1/jobs", content=text, headers={"Content-Type": "application/json"})
+        assert refused.status_code == 422 and refused.json()["type"].endswith(("options", "request"))
+        million = "[[lights]]\nkind='point'\nposition=[0,0,0]\nintensity=1\n" * 1_000_000
+        too_long = await http.post("/v1/jobs", json={**body, "options": {"stage": million}})
+        assert (too_long.status_code, too_long.json()["type"]) == (413, "urn:octasplat:problem:too-large")
+        assert (await http.get("/v1/jobs", params={"kind": "render"})).json()["jobs"] == []
+
+    talk(conversation, max_render_paths=10**9)
+
+
+def test_files_are_looked_at_as_they_come(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = (await http.post("/v1/datasets", json={"holds": "files"})).json()["id"]
+        address = f"/v1/datasets/{dataset}/files/"
+        for name, content, kind in [
+            ("sky.hdr", b"no picture", "image-kind"),
+            ("thing.glb", TRIANGLE, "file-kind"),
+            ("thing.obj", b"\0\1\2", "file-kind"),
+            ("..%2Fthing.obj", TRIANGLE, "name-traversal"),
+            ("thing.exe", b"MZ", "name-unexpected"),
+        ]:
+            refused = await http.put(address + name, content=content)
+            assert (refused.status_code, refused.json()["type"]) == (422, f"urn:octasplat:problem:{kind}"), (
+                name
+            )
+        archive = await http.put(f"/v1/datasets/{dataset}/archive", content=b"PK")
+        assert archive.status_code == 409
+        empty = await http.post(f"/v1/datasets/{dataset}/commit")
+        assert (empty.status_code, empty.json()["type"]) == (422, "urn:octasplat:problem:dataset-files")
+        for name, content in (("thing.obj", TRIANGLE), ("sky.hdr", HDR)):
+            assert (await http.put(address + name, content=content)).status_code == 201
+        source = await finished(http, service, {"scene.ply": b"ply"})
+        body = {"kind": "render", "source_id": source, "options": {"stage": "[[meshes]]\nfile = 'thing.obj'"}}
+        early = await http.post("/v1/jobs", json={**body, "files_id": dataset})
+        assert (early.status_code, early.json()["type"]) == (409, "urn:octasplat:problem:dataset-open")
+        assert (await http.post(f"/v1/datasets/{dataset}/commit")).json()["state"] == "committed"
+        photographs = (await http.get(f"/v1/jobs/{source}")).json()["dataset_id"]
+        for files_id in (photographs, str(uuid.uuid4())):
+            refused = await http.post("/v1/jobs", json={**body, "files_id": files_id})
+            assert refused.status_code == 422 and refused.json()["errors"][0]["pointer"] == "#/files_id"
+        refused = await http.post("/v1/jobs", json={"dataset_id": dataset})
+        assert refused.status_code == 422 and refused.json()["errors"][0]["pointer"] == "#/dataset_id"
+        made = await http.post("/v1/jobs", json={**body, "files_id": dataset})
+        assert made.status_code == 202 and made.json()["files_id"] == dataset
+        # More paths take more time, and as long as the job is there its files stay.
+        plain = await http.post("/v1/jobs", json={"kind": "render", "source_id": source})
+        assert made.json()["estimate"]["cpu_seconds"] > 2 * plain.json()["estimate"]["cpu_seconds"]
+        assert (await http.delete(f"/v1/datasets/{dataset}")).status_code == 409
+
+    talk(conversation)
+
+
+STAGE = """
+[[meshes]]
+file = "../things/thing.obj"
+on = { view = "%s", pixel = [24, 20] }
+scale = 2
+material = { kind = "metal", roughness = 0.3 }
+[environment]
+file = "sky.hdr"
+visible = false
+[integrator]
+samples = 120
+"""
+FRAMES = {"frames": 6, "width_px": 32, "height_px": 24}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of a moment, and a stage beside it."""
+    root = tmp_path_factory.mktemp("staged")
+    config = GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
+    write_generated_scene(root / "scene", config)
+    train = {"iterations": 20, "rays": 512, "max_gaussians": 500, "initial_points": 400, "fit_iterations": 0}
+    asked = resolve_reconstruction({"preset": "fast", "train": train, "exports": ["mesh.ply"]})
+    reconstruct(root / "scene", root / "run", asked.config(), threads=1)
+    (root / "things").mkdir()
+    (root / "things" / "thing.obj").write_bytes(TRIANGLE)
+    (root / "stages").mkdir()
+    (root / "stages" / "sky.hdr").write_bytes(HDR)
+    view = json.loads((root / "run" / "held_out.json").read_text())[0]
+    (root / "stages" / "stage.toml").write_text(STAGE % view)
+    assert len(read_gaussian_ply(root / "run" / "scene.ply")[0]) > 100
+    return root
+
+
+@pytest.mark.heavy
+def test_a_killed_film_goes_on_at_another_worker_with_the_bytes_of_the_command(
+    conninfo: str, tmp_path: Path, run: Path
+) -> None:
+    from workers.client.submission import Derivation, with_stage
+
+    stage = run / "stages" / "stage.toml"
+    size = ("--frames", "6", "--width", "32", "--height", "24", "--threads", "1")
+    command = ["render", run / "run", "-o", tmp_path / "film.mp4", "--turntable", "--stage", stage, *size]
+    done = CliRunner().invoke(cli, [str(part) for part in command])
+    assert done.exit_code == 0, done.output
+    what = with_stage(Derivation("", "render", FRAMES), stage)
+    assert set(what.files) == {
+        "elsewhere/1/thing.obj",
+        "sky.hdr",
+    }  # a name without ..
+    workers: list[subprocess.Popen[bytes]] = []
+
+    def worker(name: str) -> None:
+        given = {
+            "STORAGE": tmp_path / "store", "WORK": tmp_path / name, "FLOOR_BYTES": 0, "THREADS": 1,
+            "HEARTBEAT_SECONDS": 0.4, "STALE_SECONDS": 2.4, "RESCUE_SECONDS": 0.3, "POLL_SECONDS": 0.15,
+        }  # fmt: skip
+        environment = {f"OCTASPLAT_{key}": str(value) for key, value in given.items()}
+        workers.append(
+            subprocess.Popen(
+                [sys.executable, "-m", "workers", "worker", "--queues", "cpu", "--name", name],
+                cwd=ROOT, env={**os.environ, **environment, "DATABASE_URL": conninfo, "OMP_NUM_THREADS": "1"},
+            )
+        )  # fmt: skip
+
+    async def conversation() -> None:
+        async with running(conninfo, tmp_path, kind_modules=()) as (http, service):
+            names = ("scene.ply", "config.json", "held_out.json", "views.json")
+            source = await finished(
+                http, service, {name: (run / "run" / name).read_bytes() for name in names}
+            )
+            files = await sent(http, {name: path.read_bytes() for name, path in what.files.items()})
+            body = {"kind": "render", "source_id": source, "files_id": files, "options": dict(what.options)}
+            made = await http.post("/v1/jobs", json=body)
+            assert made.status_code == 202, made.text
+            address = made.headers["Location"]
+
+            async def until(wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+                deadline = time.monotonic() + 200
+                while time.monotonic() < deadline:
+                    job: dict[str, Any] = (await http.get(address)).json()
+                    if wanted(job):
+                        return job
+                    assert job["state"] != "failed", job
+                    await asyncio.sleep(0.05)
+                raise AssertionError(job)
+
+            worker("first")
+            job = await until(lambda job: job["checkpoint"] is not None or job["state"] == "succeeded")
+            assert job["state"] == "running" and job["checkpoint"]["stage"] == "render"
+            workers[0].send_signal(signal.SIGKILL)
+            worker("second")
+            job = await until(lambda job: job["state"] == "succeeded")
+            assert job["worker"] == "second" and job["attempt"] == 2
+            log = [line["text"] for line in (await http.get(f"{address}/logs")).json()["lines"]]
+            assert any(line.startswith("Goes on from step ") and "of render" in line for line in log), log
+            film = (await http.get(f"{address}/artifacts/turntable.mp4")).content
+            assert film == (tmp_path / "film.mp4").read_bytes()
+
+    try:
+        asyncio.run(conversation())
+    finally:
+        for process in workers:
+            process.kill()
+            process.wait(20)

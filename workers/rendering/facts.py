@@ -1,0 +1,58 @@
+"""Facts on a scene in a file or a run, and a small picture of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from engine.evaluate.scene_facts import HitFacts, SceneFacts, hit_facts, scene_facts
+from engine.render.jobs import turntable_cameras
+from engine.render.renderer import render_rays
+from engine.surface.cameras import photograph_cameras
+from engine.trace.make import make_tracer
+from workers.rendering.stages import StagePlace
+
+SIDE_PX = 160
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is known of a scene.
+
+    Attributes:
+        scene: on its Gaussians.
+        hits: on the rays of the picture.
+        up_world: the direction that points up; known of a run, a guess of a file.
+        picture_srgb: display values, from the first photograph's place of a run.
+        photographs: how many; None of a file.
+    """
+
+    scene: SceneFacts
+    hits: HitFacts
+    up_world: Float64[np.ndarray, "3"]
+    picture_srgb: Float32[np.ndarray, "h w 3"]
+    photographs: int | None
+
+
+def find_facts(place: StagePlace, up_world: Float64[np.ndarray, "3"] | None) -> Found:
+    """Look at a scene; ``up_world`` is what the user says of a file.
+
+    Raises:
+        ConfigError: the cameras of the photographs share no centre or no up direction.
+    """
+    table = place.turntable(up_world)
+    if place.photographs is None:
+        (camera,) = turntable_cameras(table, 1, SIDE_PX, SIDE_PX)
+        image = camera.rays()
+    else:
+        image = photograph_cameras(place.photographs, np.array([0]), SIDE_PX)[0].rays()
+    tracer = make_tracer(place.settings, threads=place.threads)
+    tracer.build(place.gaussians)
+    picture = render_rays(tracer, image, place.background_srgb)
+    return Found(
+        scene_facts(place.gaussians, table.up_world),
+        hit_facts(tracer, image),
+        table.up_world,
+        picture.rgb_srgb,
+        None if place.photographs is None else len(place.photographs.views),
+    )
