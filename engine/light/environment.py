@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from engine.errors import ConfigError, DatasetError
-from engine.render.images import read_image
+from engine.render.images import read_image, write_exr, write_rgbe
 
 MAX_PIXELS = 1 << 27
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -59,6 +59,22 @@ def read_environment(path: Path) -> Float32[np.ndarray, "h w 3"]:
     if not np.isfinite(rgb).all() or (rgb < 0).any():
         raise ConfigError(f"{path}: holds values that are negative or not finite; mend the image.")
     return np.ascontiguousarray(rgb)
+
+
+def write_environment(path: Path, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write a map as RGBE (``.hdr``, values to within 1 %) or as EXR (``.exr``, exactly), atomically.
+
+    Raises:
+        ConfigError: the name ends otherwise.
+        OutputError: the file cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".hdr":
+        write_rgbe(path, radiance_linear)
+    elif suffix == ".exr":
+        write_exr(path, {name: radiance_linear[..., k] for k, name in enumerate("RGB")})
+    else:
+        raise ConfigError(f"{path}: an environment is written as .hdr or .exr.")
 
 
 def environment_frame(
