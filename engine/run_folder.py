@@ -16,6 +16,7 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 ON = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
+ENVIRONMENT = "environment.hdr"
 
 
 def is_run(source: Path) -> bool:

@@ -9,10 +9,12 @@ from engine.evaluate.held_out import evaluate_held_out
 from engine.evaluate.truth import find_truth
 from engine.events import Listener, StageProgress, Warned
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
+from engine.light.environment import read_environment
 from engine.poses.find import read_record
 from engine.run_folder import (
     CACHE,
     CONFIG,
+    ENVIRONMENT,
     ON,
     POSES,
     SCENE,
@@ -24,9 +26,11 @@ from engine.run_folder import (
 )
 from engine.scene import Dataset
 from engine.scene.views_file import read_views, write_views
+from engine.shading.protocol import ShadingModel
 from engine.stages import stage
 from engine.threads import use_threads
-from engine.train.shading import make_shading
+from engine.train.config import TrainConfig
+from engine.train.shading import deferred_of, make_shading
 from engine.versions import versions
 
 
@@ -99,7 +103,7 @@ def measure_run(
         gaussians,
         into or output,
         settings=config.train.trace,
-        shading=make_shading(config.train, len(dataset.views)),
+        shading=finished_shading(output, config.train, dataset),
         background=config.evaluate_background,
         run={
             "gaussians": len(gaussians),
@@ -116,6 +120,19 @@ def measure_run(
         tell=tell,
         truth=truth,
     )
+
+
+def finished_shading(output: Path, config: TrainConfig, dataset: Dataset) -> ShadingModel:
+    """The shading model of a finished run, with the environment that it left.
+
+    Raises:
+        ConfigError: the run learnt materials and its environment is missing or damaged.
+    """
+    extent = read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
+    shading = make_shading(config, len(dataset.views), extent)
+    if (deferred := deferred_of(shading)) is not None:
+        deferred.light.put(read_environment(output / ENVIRONMENT))
+    return shading
 
 
 def _evaluate_on(
