@@ -1,6 +1,6 @@
 """From a stage to the arrays that paths are traced through."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +69,10 @@ class LitMeshes:
             self.triangles.closest_query, self.triangles.any_query, self.obstacles.any_query,
             self.glass.closest_query, self.glass_faces,
         )  # fmt: skip
+
+    def lit_by(self, lights: LightArrays) -> "LitMeshes":
+        """The same meshes in other light, their environment unseen by the camera."""
+        return replace(self, lights=lights, environment_visible=False)
 
 
 def stage_meshes(stage: Stage, folder: Path, *, threads: int = 0) -> LitMeshes:
