@@ -246,7 +246,7 @@ def gaussian_layers(lit: Stage, gaussians: FlatGaussians, settings: TraceSetting
 
 
 def report(works: dict[str, Callable[[], object]], count: int, what: str, repeats: int) -> None:
-    """Medians of some repeats in turn, after one to warm up where it is not just one; and ratios of CPU times."""
+    """Medians of repeats in turn, after one to warm up where it is not just one; and ratios of CPU times."""
     clock: dict[str, list[float]] = {name: [] for name in works}
     cpu: dict[str, list[float]] = {name: [] for name in works}
     for repeat in range(1 if repeats == 1 else 0, repeats + 1):
