@@ -35,12 +35,14 @@ from engine.files import ExportOptions, check_writable
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
 from engine.gaussians.model import FlatGaussians
+from engine.light.environment import write_environment
 from engine.plain_colours import PlainScene
 from engine.poses import find_poses
 from engine.run_folder import (
     CACHE,
     CHECKPOINTS,
     CONFIG,
+    ENVIRONMENT,
     EVENTS,
     HELD_OUT,
     POSES,
@@ -62,7 +64,8 @@ from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count
 from engine.train.fingerprint import run_fingerprint
-from engine.train.initialise import initial_gaussians
+from engine.train.initialise import initial_gaussians, with_first_materials
+from engine.train.shading import deferred_of
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 from engine.versions import versions
@@ -263,6 +266,8 @@ def _train(
     state = _resume(folder, fingerprint, tell)
     if state is None:
         first = initial_gaussians(dataset, config, threads=use_threads(threads))
+        if config.materials.learn:
+            first = with_first_materials(first, config.materials)
         state = fresh_state(first, config.seed)
         state.seconds = clock.seconds()
     else:
@@ -279,6 +284,8 @@ def _train(
         onlooker=None if watch is None else lambda iteration, tracer: watch(iteration, dataset, tracer),
     )
     gaussians = trainer.run()
+    if (deferred := deferred_of(trainer.shading)) is not None:
+        write_environment(output / ENVIRONMENT, deferred.light.radiance_linear)
     write_json(output / TRAINING, {"seconds": clock.stop(), "iterations": trainer.state.iteration})
     return gaussians
 

@@ -23,6 +23,8 @@ MATERIAL_WIDTHS: Mapping[str, int] = {ALBEDO: 3, METALLIC: 1, ROUGHNESS: 1}
 ``albedo`` is the linear base colour: of the matt ground, and of what a metal reflects head-on. ``roughness``
 is perceptual: GGX's alpha is its square.
 """
+AMBIENT = "ambient"
+"""A channel beside them, which follows from the geometry: share of the light from all around that arrives."""
 DIELECTRIC_F0 = 0.04
 """What a surface that is no metal reflects head-on, that of an index of refraction of 1.5."""
 

@@ -93,6 +93,14 @@ class ShadingModel(Protocol):
         """
         ...
 
+    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+        """Look around in the scene of which ``tracer`` has just built the hierarchy.
+
+        Channels of the Gaussians, and the features, may be changed: to what follows from their geometry and
+        ``progress`` alone, so that a training that goes on finds the same.
+        """
+        ...
+
     def develop(self, sight: Sight) -> Developed:
         """What photographs show of ``sight``; depends on nothing else but the model's parameters."""
         ...
