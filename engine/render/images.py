@@ -6,6 +6,7 @@ its readers expect, linear light: ``exr_layers`` converts.
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -152,7 +153,8 @@ def resized(image: Float32[np.ndarray, "h w c"], max_side_px: int) -> Float32[np
     return np.asarray(shrunk.get_pixels(oiio.FLOAT), dtype=np.float32).reshape(size[1], size[0], channels)
 
 
-def _write(path: Path, spec: "oiio.ImageSpec", pixels: np.ndarray) -> None:
+def _write(path: Path, spec: Any, pixels: np.ndarray) -> None:
+    # Not called by its type, an ImageSpec: the tests' type checker would keep that beyond OpenImageIO's end.
     spec.attribute(_AS_STORED, 1)
     try:
         with replacing(path) as temporary:

@@ -18,7 +18,7 @@ from engine.light.stage import Stage
 from engine.light.stage_file import named_files
 from engine.render.identity import identity_of
 from engine.render.jobs import Paint, Shot, camera_shots, gaussian_turntable, scene_paint, view_shots
-from engine.render.kept import KeptImages
+from engine.render.kept import RECORD, KeptImages
 from engine.render.names import names_by_number
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
@@ -161,10 +161,12 @@ class Series:
     def kept(self, identity: str) -> KeptImages:
         """What there is already of images that look as ``identity`` says."""
         keeping, output = self.keeping, self.output
-        folder = output.parent if output.suffix.lower() in (".png", ".exr") else output
+        folder, record = output, RECORD
+        if output.suffix.lower() in (".png", ".exr"):
+            folder, record = output.parent, f"{output.name}.{RECORD}"
         if self.is_film:
             folder = keeping.frames or output.with_name(f"{output.name}.frames")
-        return KeptImages(folder, identity, resume=keeping.resume, or_anew=keeping.or_anew)
+        return KeptImages(folder, identity, resume=keeping.resume, or_anew=keeping.or_anew, record=record)
 
     def render(self, paint: Paint, kept: KeptImages, listener: Listener) -> tuple[Path, ...]:
         """Do so; returns the files."""
