@@ -81,7 +81,7 @@ class MaterialSettings(BaseModel):
     blur_until: float = Field(0.3, ge=0, le=1)
     normal_weight: float = Field(0.1, ge=0)
     depth_normal_weight: float = Field(0.1, ge=0)
-    smooth_normal_weight: float = Field(0.05, ge=0)
+    smooth_normal_weight: float = Field(0.1, ge=0)
     smooth_weight: float = Field(0.01, ge=0)
     white_weight: float = Field(0.01, ge=0)
     even_weight: float = Field(0.1, ge=0)
