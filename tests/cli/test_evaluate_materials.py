@@ -7,11 +7,16 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from pydantic import ValidationError
 
 from engine.config import resolve_config
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.light.environment import write_environment
 from engine.render.images import read_image
+from workers.records.sizes import Sizes
+from workers.work.kinds import kind_named
+from workers.work.programs import relight
+from workers.work.task import Task
 
 SIDE = (48, 64)
 
@@ -108,3 +113,25 @@ def test_the_run_is_relit_at_its_own_and_at_other_views(shiny_run, scene_with_tr
     assert (
         picture.max() < 0.5
     )  # 0.25 is 0.54 in display values, and rough metal of albedo 0.25 sends back less
+
+
+def test_a_job_relights_with_files_of_its_own(shiny_run, scene_with_truth, tmp_path):
+    shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
+    shutil.copytree(scene_with_truth / "env", tmp_path / "attempt" / "files" / "maps")
+    kind = kind_named("relight")
+    asked = {"environments": ["maps/day.hdr", "maps/dim.hdr"], "mode": "views", "format": "png", "samples": 1}
+    options = kind.resolve(asked)
+    assert [name for _, name in kind.names_files(options)] == asked["environments"]
+    size = Sizes(64, 48, 8)
+    assert {demand.of: demand.amount for demand in kind.demands(options, [size])} == {
+        "render_pixels": 2 * 8 * 64 * 48, "render_paths": 2 * 8 * 64 * 48,
+    }  # fmt: skip
+    relight(Task(tmp_path / "attempt", options.model_dump(mode="json"), threads=1))
+    views = tmp_path / "attempt" / "results" / "views"
+    names = {path.relative_to(views).as_posix() for path in views.rglob("*.png")}
+    assert names == {f"{light}/view_00{k}.png" for light in ("day", "dim") for k in (0, 4)}
+    bright, dark = (read_image(views / light / "view_000.png").mean() for light in ("day", "dim"))
+    assert bright > 1.5 * dark > 0
+
+    with pytest.raises(ValidationError):
+        kind.resolve({"environments": []})

@@ -85,7 +85,7 @@ def relight_files(
         identity_of(
             mode, source.gaussians, source.settings, list(environments), list(environments.values()), up,
             len(shots), [(e.origin_world, e.directions_world) for e in ends],
-            {name: options[name] for name in _OF_THE_PICTURES},
+            {name: options.get(name) for name in _OF_THE_PICTURES},
         )
     )  # fmt: skip
     return series.render(paint, kept, listener)
