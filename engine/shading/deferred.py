@@ -113,7 +113,7 @@ class Deferred:
         if share == 0:
             return Developed(seen.rgb_srgb, seen.transmittance)
         buffer = gather(sight.rays, seen)
-        surface, reflection = self._dimmed(seen, buffer, self.settings.blurred(sight.progress)), None
+        surface, reflection = self._dimmed(seen, buffer), None
         if sight.progress >= self.settings.secondary_from:
             surface, reflection = self._reflect(sight, buffer, surface)
         linear = shade(surface, self.light.levels, self.frame)
@@ -154,7 +154,9 @@ class Deferred:
             by_linear = by_shown * buffer.alpha[:, None]
             if settings.recipe != "seed":
                 by_linear *= encoding_slope(kept.linear)
-            back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear)
+                by_linear[(kept.linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
+            blur = settings.blurred(sight.progress)
+            back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
             normal = back.normal + back.reflected if settings.reflected_gradient else back.normal
             by_material, rgb = back.material, by_rgb * np.float32(1 - kept.shaded)
             if settings.is_seed_deferred(sight.progress):
@@ -226,13 +228,9 @@ class Deferred:
         self._started_over = own["started_over"].copy()
         self.light.restore(own)
 
-    def _dimmed(self, seen: TraceResult, buffer: Buffer, roughest: float = 0.0) -> Surface:
-        """The surface of a buffer with its ambient visibility, to which no gradient goes, and blurred."""
+    def _dimmed(self, seen: TraceResult, buffer: Buffer) -> Surface:
+        """The surface of a buffer with its ambient visibility, to which no gradient goes."""
         surface = buffer.surface
-        if roughest > 0:
-            material = surface.material.copy()
-            material[:, 4] = np.maximum(material[:, 4], roughest)
-            surface = replace(surface, material=material)
         if self.settings.recipe == "seed":  # the seed's matt part is a colour of its own
             return replace(surface, ambient=np.zeros(len(buffer.which)))
         if not self.settings.ambient or seen.features.shape[1] <= AMBIENT_COLUMN:

@@ -213,10 +213,12 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "materials": config.materials.model_copy(update={"learn": True}),
             "rates": config.rates.model_copy(update=rates),
             "lift_pixels": False,
-            "plane_points": 16,
+            "plane_points": 10,
+            "sh_degree": min(config.sh_degree, 1),
+            "rays": 8192,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
-            "max_gaussians_auto": min(config.max_gaussians_auto, 60_000),
+            "max_gaussians_auto": min(config.max_gaussians_auto, 40_000),
         }
     )
 
