@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from engine.errors import ConfigError
 from engine.gaussians.model import FlatGaussians
-from engine.light.meshes import placed, turn_to
+from engine.light.meshes import placed, upright_turn
 from engine.light.stage import Rest, Stage
 from engine.light.stage_file import BALL_OF_SIZE, StageFacts
 from engine.light.staging import stage_shape, up_axis
@@ -46,7 +46,9 @@ def rested(stage: Stage, tracer: Tracer | None, ray_of_pixel: RayOfPixel, folder
             raise ConfigError(f"{key}: there are no Gaussians on which it could stand.")
         spot = _met(mesh.on, tracer, ray_of_pixel, key)
         shape = stage_shape(mesh, number, folder)
-        points = placed(shape.vertices @ turn_to(up_axis(mesh), up).T, mesh) - np.array(mesh.position)
+        points = placed(shape.vertices, mesh, upright_turn(up_axis(mesh), mesh.turn_degrees, up)) - np.array(
+            mesh.position
+        )
         heights = points @ up
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         foot = middle - (middle @ up - heights.min()) * up

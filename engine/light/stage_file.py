@@ -9,10 +9,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from engine.errors import ConfigError
-from engine.light.stage import Dielectric, Diffuse, MetallicRoughness, Stage
+from engine.light.stage import Stage
 from engine.writing import write_text
 
 MAX_STAGE_BYTES = 16 << 20
+TEXTURES = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
+"""Keys of materials that name images."""
 
 
 def read_stage(path: Path) -> Stage:
@@ -59,12 +61,10 @@ def named_files(stage: Stage) -> Iterator[tuple[str, str]]:
     for number, mesh in enumerate(stage.meshes):
         if mesh.file is not None:
             yield f"meshes[{number}].file", mesh.file
-        material = mesh.material
-        if isinstance(material, Diffuse | Dielectric | MetallicRoughness) and material.texture is not None:
-            yield f"meshes[{number}].material.texture", material.texture
-        if isinstance(material, MetallicRoughness) and material.metallic_roughness_texture is not None:
-            key = f"meshes[{number}].material.metallic_roughness_texture"
-            yield key, material.metallic_roughness_texture
+        for key in TEXTURES:
+            texture = getattr(mesh.material, key, None)
+            if texture is not None:
+                yield f"meshes[{number}].material.{key}", texture
 
 
 def with_files(stage: Stage, names: Mapping[str, str]) -> Stage:
