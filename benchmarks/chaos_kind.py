@@ -8,6 +8,7 @@ import json
 import os
 import time
 from collections.abc import Mapping
+from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -29,6 +30,8 @@ class ChainOptions(BaseModel):
     seed: int = 0
     steps: int = Field(60, ge=1)
     seconds: float = Field(0.05, ge=0)
+    gate: str = ""
+    """The last step is not made before this file is there."""
 
 
 def start_of(photographs: Mapping[str, bytes], seed: int) -> bytes:
@@ -77,6 +80,10 @@ def run(task: Task) -> None:
     task.listener(StageStarted("train", options.steps))
     while step < options.steps:
         time.sleep(options.seconds)
+        shut = options.gate and step == options.steps - 1 and not Path(options.gate).exists()
+        if shut and not task.should_stop():
+            task.listener(StageProgress("train", step, options.steps))
+            continue
         step += 1
         state = link(state, step)
         task.listener(StageProgress("train", step, options.steps))

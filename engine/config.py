@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from engine.errors import ConfigError
-from engine.train.config import PresetName, TrainConfig, preset
+from engine.train.config import PresetName, TrainConfig, preset, with_materials
 
 
 class ReconstructionConfig(BaseModel):
@@ -46,6 +46,7 @@ class ReconstructionConfig(BaseModel):
 def resolve_config(
     preset_name: str = "standard",
     *,
+    materials: bool = False,
     settings: Mapping[str, object] | None = None,
     assignments: Sequence[str] = (),
 ) -> ReconstructionConfig:
@@ -53,13 +54,15 @@ def resolve_config(
 
     Args:
         preset_name: ``fast``, ``standard`` or ``paper``.
+        materials: learn materials and the environment too, see :func:`engine.train.config.with_materials`.
         settings: fields of :class:`ReconstructionConfig`; None values are left at their defaults.
         assignments: into the training configuration, values as JSON, e.g. ``rates.mean=2e-4``.
 
     Raises:
         ConfigError: an unknown name, a value out of range, or no such preset.
     """
-    train: dict[str, Any] = preset(preset_name).model_dump()
+    chosen = preset(preset_name)
+    train: dict[str, Any] = (with_materials(chosen) if materials else chosen).model_dump()
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals:

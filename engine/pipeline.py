@@ -6,7 +6,6 @@ or killed goes on where it was.
     (features -> matches -> poses ->) load -> train (initialise, fit) -> scene.ply -> evaluate -> export
 """
 
-import json
 import shutil
 import time
 from collections.abc import Callable
@@ -23,7 +22,7 @@ from engine.errors import (
     ExportFailed,
     OutputError,
 )
-from engine.evaluate.held_out import evaluate_held_out
+from engine.evaluate.runs import measure_run
 from engine.events import (
     JsonLinesListener,
     Listener,
@@ -36,13 +35,14 @@ from engine.files import ExportOptions, check_writable
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
 from engine.gaussians.model import FlatGaussians
+from engine.light.environment import write_environment
 from engine.plain_colours import PlainScene
 from engine.poses import find_poses
-from engine.poses.find import read_record
 from engine.run_folder import (
     CACHE,
     CHECKPOINTS,
     CONFIG,
+    ENVIRONMENT,
     EVENTS,
     HELD_OUT,
     POSES,
@@ -50,7 +50,7 @@ from engine.run_folder import (
     TRAINING,
     VIEWS,
     found_model,
-    photographs_folder,
+    open_photographs,
     run_scene,
 )
 from engine.scene import Dataset, write_held_out
@@ -64,8 +64,8 @@ from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count
 from engine.train.fingerprint import run_fingerprint
-from engine.train.initialise import initial_gaussians
-from engine.train.shading import make_shading
+from engine.train.initialise import initial_gaussians, with_first_materials
+from engine.train.shading import deferred_of
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 from engine.versions import versions
@@ -136,7 +136,7 @@ def reconstruct(
         try:
             _find_poses(scene, output, config, threads, tell, should_stop)
             with stage("load", tell):
-                dataset = _open_dataset(
+                dataset = open_photographs(
                     scene,
                     output,
                     config,
@@ -169,7 +169,7 @@ def reconstruct(
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
             try:
                 with stage("evaluate", tell, len(dataset.test_indices)):
-                    _evaluate(dataset, output, config, threads, tell)
+                    measure_run(dataset, output, config, threads, tell)
             except Cancelled:
                 raise
             except Exception as error:  # noqa: BLE001 - raised below, after the files are written
@@ -188,47 +188,6 @@ def reconstruct(
     finally:
         events.close()
     return output
-
-
-def evaluate(
-    output: Path, *, scene: Path | None = None, threads: int = 0, listener: Listener = lambda _event: None
-) -> Path:
-    """Measure the scene of a finished run again and write its metrics, renders and report anew.
-
-    Args:
-        output: folder of the run.
-        scene: where the photographs are now; None takes the folder that the run was made from.
-        threads: for everything; 0 means all cores.
-        listener: hears the progress.
-
-    Returns:
-        The path of ``metrics.json``.
-
-    Raises:
-        ConfigError: ``output`` is no run.
-        DatasetError: the photographs cannot be used.
-    """
-    use_threads(threads)
-    config = read_config(output / CONFIG)
-    if not (output / SCENE).exists():
-        raise OutputError(
-            f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."
-        )
-    dataset = _open_dataset(
-        photographs_folder(output, scene),
-        output,
-        config,
-        threads,
-        listener,
-        model_folder=found_model(output),
-    )
-    if (output / VIEWS).exists():
-        difference = read_views(output / VIEWS).difference(dataset.record)
-        if difference is not None:
-            listener(Warned(f"{output} was made from other photographs or another model ({difference})."))
-    with stage("evaluate", listener, len(dataset.test_indices)):
-        _evaluate(dataset, output, config, threads, listener)
-    return output / "metrics.json"
 
 
 def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
@@ -292,34 +251,6 @@ def _find_poses(
     )
 
 
-def _open_dataset(
-    scene: Path,
-    output: Path,
-    config: ReconstructionConfig,
-    threads: int,
-    tell: Listener,
-    *,
-    model_folder: Path | None = None,
-    accept: Callable[[ViewsRecord], None] | None = None,
-) -> Dataset:
-    dataset = Dataset.open(
-        scene,
-        output / CACHE,
-        max_side=config.max_side,
-        test_every=config.test_every,
-        held_out=config.held_out,
-        masks=config.masks,
-        model_folder=model_folder,
-        accept=accept,
-        near=config.train.near,
-        threads=threads,
-        progress=lambda done, total: tell(StageProgress("load", done, total)),
-    )
-    for warning in dataset.warnings:
-        tell(Warned(warning))
-    return dataset
-
-
 def _train(
     dataset: Dataset,
     output: Path,
@@ -335,6 +266,8 @@ def _train(
     state = _resume(folder, fingerprint, tell)
     if state is None:
         first = initial_gaussians(dataset, config, threads=use_threads(threads))
+        if config.materials.learn:
+            first = with_first_materials(first, config.materials)
         state = fresh_state(first, config.seed)
         state.seconds = clock.seconds()
     else:
@@ -351,6 +284,8 @@ def _train(
         onlooker=None if watch is None else lambda iteration, tracer: watch(iteration, dataset, tracer),
     )
     gaussians = trainer.run()
+    if (deferred := deferred_of(trainer.shading)) is not None:
+        write_environment(output / ENVIRONMENT, deferred.light.radiance_linear)
     write_json(output / TRAINING, {"seconds": clock.stop(), "iterations": trainer.state.iteration})
     return gaussians
 
@@ -364,40 +299,6 @@ def _resume(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None
             tell(Warned(str(error)))
             path.unlink()
     return None
-
-
-def _evaluate(
-    dataset: Dataset, output: Path, config: ReconstructionConfig, threads: int, tell: Listener
-) -> None:
-    gaussians, _ = read_gaussian_ply(output / SCENE)
-    training = json.loads((output / TRAINING).read_text(encoding="utf-8"))
-    evaluate_held_out(
-        dataset,
-        gaussians,
-        output,
-        settings=config.train.trace,
-        shading=make_shading(config.train, len(dataset.views)),
-        background=config.evaluate_background,
-        run={
-            "gaussians": len(gaussians),
-            "iterations": training["iterations"],
-            "seconds": training["seconds"],
-            "seed": config.train.seed,
-            "resolution": {"max_side": config.max_side},
-            "background": config.evaluate_background,
-            "versions": versions(),
-            **_placed(output),
-        },
-        config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
-        threads=threads,
-        tell=tell,
-    )
-
-
-def _placed(output: Path) -> dict[str, object]:
-    """How many photographs have poses, where a run found these by itself."""
-    record = read_record(output / POSES)
-    return {"poses": {name: record[name] for name in ("placed", "photographs")}} if record else {}
 
 
 def _export(output: Path, config: ReconstructionConfig, threads: int, tell: Listener) -> str | None:

@@ -1,17 +1,22 @@
 """The folder of a run: the names of its files, and what its photographs are and were taken from."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
-from engine.config import read_config
+from engine.config import ReconstructionConfig, read_config
 from engine.errors import ConfigError, DatasetError
-from engine.scene import load_scene
-from engine.scene.views_file import SplitViewpoints, read_views, scene_viewpoints
+from engine.events import Listener, StageProgress, Warned
+from engine.scene import Dataset, load_scene
+from engine.scene.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
 )  # fmt: skip
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
+ON = "on"
+"""Below it are the measures on photographs of other folders, a folder each."""
+ENVIRONMENT = "environment.hdr"
 
 
 def is_run(source: Path) -> bool:
@@ -79,3 +84,46 @@ def found_model(output: Path) -> Path | None:
         if any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             return folder
     return None
+
+
+def open_photographs(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    *,
+    model_folder: Path | None = None,
+    accept: Callable[[ViewsRecord], None] | None = None,
+) -> Dataset:
+    """The photographs of a run as its settings say, ready to train on or to be measured.
+
+    Args:
+        scene: folder of the photographs.
+        output: folder of the run, which holds the cache.
+        config: of the run.
+        threads: for decoding; 0 takes all cores.
+        tell: hears the progress and what is odd but usable.
+        model_folder: of poses that were found, see :func:`found_model`.
+        accept: told what was found before anything is written; to refuse it, it raises.
+
+    Raises:
+        DatasetError: the photographs cannot be used.
+        OutputError: the cache cannot be written.
+    """
+    dataset = Dataset.open(
+        scene,
+        output / CACHE,
+        max_side=config.max_side,
+        test_every=config.test_every,
+        held_out=config.held_out,
+        masks=config.masks,
+        model_folder=model_folder,
+        accept=accept,
+        near=config.train.near,
+        threads=threads,
+        progress=lambda done, total: tell(StageProgress("load", done, total)),
+    )
+    for warning in dataset.warnings:
+        tell(Warned(warning))
+    return dataset

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import jaxtyping
 import numpy as np
 import pytest
+from longest_first import LONGEST_FIRST
 
 if TYPE_CHECKING:
     from engine.gaussians.model import FlatGaussians
@@ -28,6 +29,17 @@ def checked_modules() -> list[str]:
 
 
 jaxtyping.install_import_hook(checked_modules(), "shape_checks.check")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Files are handed out in the order of the items; xdist would begin with those of the most tests."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What takes long comes first, so that no process is left with it when the others have nothing to do."""
+    items.sort(key=lambda item: LONGEST_FIRST.get(item.path.name, len(LONGEST_FIRST)))
 
 
 @pytest.fixture(scope="session")

@@ -28,6 +28,8 @@ from engine.gaussians.octagon import (
 
 STRAINED = 0.3
 """Residual, in standard deviations, above which one Gaussian is a coarse stand-in for what the edit made."""
+TORN = 0.5
+"""Of an octagon's largest radius: corners of which some stayed and one moved further are not one surface."""
 AXES_SAMPLES = 100_000
 """Octagons that are looked at to find turned axes."""
 
@@ -42,6 +44,8 @@ class EditOptions(BaseModel):
             corners left, turned back, or moved as their neighbours were; ``drop``: left out.
         axes: the turn about x that brings the mesh into the scene's frame, or ``auto``.
         q: chi-square quantile that the mesh was exported with; None asks the mesh.
+        whole_octagons: octagons of which some corners moved and others did not move as those that moved if
+            these are the half of them at least, and else not at all.
         max_residual: octagons further than this from an affine image, in standard deviations, are crumpled.
     """
 
@@ -51,6 +55,7 @@ class EditOptions(BaseModel):
     damaged: Literal["repair", "drop"] = "repair"
     axes: Literal["auto"] | Axes = "auto"
     q: float | None = Field(default=None, gt=0.0, le=100.0)
+    whole_octagons: bool = False
     max_residual: float = Field(default=1.0, gt=0.0)
 
 
@@ -76,6 +81,8 @@ class EditReport:
         flipped: facing the other way than their surroundings.
         mirrored: in parts of the scene that were mirrored as a whole.
         dropped: of the damaged ones, left out.
+        partial: with some corners that stayed and others that moved far.
+        snapped: of these, moved or kept as a whole.
         foreign_vertices: vertices that belong to no octagon.
         ambiguous_corners: corners claimed by several vertices, taken as missing.
         strained: with a residual above 0.3 standard deviations.
@@ -101,6 +108,8 @@ class EditReport:
     flipped: int = 0
     mirrored: int = 0
     dropped: int = 0
+    partial: int = 0
+    snapped: int = 0
     foreign_vertices: int = 0
     ambiguous_corners: int = 0
     strained: int = 0
@@ -200,6 +209,13 @@ def _recover(
         unedited = octagon_corners_world(part, radius)
         moves = np.where(present[:, :, None], corners - unedited, 0.0)
         rounding = coordinate_rounding(unedited).astype(np.float64) + 2 * file_rounding
+        torn, gone = _torn(moves, present, part, radius, rounding)
+        report.partial += int(torn.sum())
+        if options.whole_octagons and torn.any():
+            report.snapped += int(torn.sum())
+            follows = torn & (2 * (gone & present).sum(axis=1) >= present.sum(axis=1))
+            present = np.where(follows[:, None], present & gone, present)
+            moves[(torn & ~follows)] = 0.0
         stayed = present.any(axis=1) & (np.abs(moves).max(axis=(1, 2)) <= rounding)
         fit = fit_octagons(part, moves, present, radius)
         new_means, new_legs = fit.means_world, fit.legs_world
@@ -228,6 +244,24 @@ def _recover(
         report.residual_median, report.residual_p95 = np.quantile(known, [0.5, 0.95]).tolist()
         report.residual_max = float(known.max())
     return _Recovered(means, legs, signs, unmoved, readable, ~complete | crumpled | flipped)
+
+
+def _torn(
+    moves: Float64[np.ndarray, "m 8 3"],
+    present: Bool[np.ndarray, "m 8"],
+    old: FlatGaussians,
+    radii: Float[np.ndarray, " m"],
+    rounding: Float64[np.ndarray, " m"],
+) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, "m 8"]]:
+    """Octagons that a selection of vertices went through, and which of their corners moved.
+
+    Those of a smooth deformation that ends on them are none: their corners move by less than their size.
+    """
+    lengths = np.linalg.norm(moves, axis=2)
+    gone = lengths > rounding[:, None]
+    size = radii * old.scales.max(axis=1)
+    far = np.where(present, lengths, 0.0).max(axis=1) > TORN * size
+    return far & (present & ~gone).any(axis=1), gone
 
 
 def _three_point(

@@ -14,6 +14,8 @@ LEAST_AGREEMENT = 0.8
 """Correlation of the neighbours' moves with a rotation and scale, below which they are no witnesses."""
 MIRROR_GAIN = 0.1
 """A reflection must beat the best rotation by this much correlation to be believed: in a plane it cannot."""
+STRAY = 0.75
+"""Of the spread of its neighbours: a Gaussian further from where they expect it has no witnesses in them."""
 FLIPPED_COSINE = -0.2
 
 
@@ -41,7 +43,8 @@ def neighbour_turns(
 ) -> Float64[np.ndarray, "m 3 3"]:
     """Orthogonal matrices that best take each asked Gaussian's old neighbours to the new ones (Kabsch).
 
-    Zero where there are too few neighbours, or where they moved in no common way. Neighbours that lie in a
+    Zero where there are too few neighbours, where they moved in no common way, or where the Gaussian itself
+    went another way, as at the rim of a part that was moved. Neighbours that lie in a
     plane do not show whether they were mirrored; for them the whole scene decides.
     """
     count = min(NEIGHBOURS, len(old_means))
@@ -54,6 +57,8 @@ def neighbour_turns(
     for block in blocks(len(asked)):
         _, near = tree.query(old_means[asked[block]], k=count, workers=-1)
         turns[block] = _orthogonal_fits(old_means[near], new_means[near], planar_sign)
+        stray = _strays(old_means[near], new_means[near], turns[block])
+        turns[block][stray] = 0.0
     return turns
 
 
@@ -72,6 +77,19 @@ def _orthogonal_fits(
     turns: np.ndarray = u @ vt
     turns[agreement < LEAST_AGREEMENT * whole] = 0.0
     return turns
+
+
+def _strays(
+    old: Float64[np.ndarray, "m k 3"], new: Float64[np.ndarray, "m k 3"], turns: Float64[np.ndarray, "m 3 3"]
+) -> Bool[np.ndarray, " m"]:
+    """Gaussians, first of their neighbours, that went elsewhere than these: at the rim of what was moved."""
+    around_old, around_new = old[:, 1:].mean(axis=1), new[:, 1:].mean(axis=1)
+    reach_old = np.sqrt(np.mean(np.sum((old[:, 1:] - around_old[:, None]) ** 2, axis=2), axis=1))
+    reach_new = np.sqrt(np.mean(np.sum((new[:, 1:] - around_new[:, None]) ** 2, axis=2), axis=1))
+    grown = reach_new / np.maximum(reach_old, 1e-300)
+    expected = around_new + grown[:, None] * np.einsum("nij,nj->ni", turns, old[:, 0] - around_old)
+    result: np.ndarray = np.linalg.norm(new[:, 0] - expected, axis=1) > STRAY * reach_new
+    return result
 
 
 def _mirrors(turns: Float64[np.ndarray, "m 3 3"]) -> Bool[np.ndarray, " m"]:

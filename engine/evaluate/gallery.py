@@ -4,7 +4,7 @@ import base64
 import bisect
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -32,11 +32,12 @@ MAGMA = np.array(
 
 @dataclass(frozen=True)
 class ViewImages:
-    """What the report shows of one view: display values, and the FLIP error per pixel."""
+    """What the report shows of one view: display values, the FLIP error per pixel, and layers by name."""
 
     photograph: Float32[np.ndarray, "h w 3"]
     render: Float32[np.ndarray, "h w 3"]
     flip_map: Float32[np.ndarray, "h w"]
+    layers: Mapping[str, Float32[np.ndarray, "h w 3"]] = field(default_factory=dict)
 
     def shrunk(self, max_side_px: int = MAX_SIDE_PX) -> "ViewImages":
         """The same at most ``max_side_px`` wide and high."""
@@ -44,6 +45,7 @@ class ViewImages:
             resized(self.photograph, max_side_px),
             resized(self.render, max_side_px),
             resized(self.flip_map[..., None], max_side_px)[..., 0],
+            {name: resized(image, max_side_px) for name, image in self.layers.items()},
         )
 
 

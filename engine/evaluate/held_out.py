@@ -6,10 +6,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numba
+import numpy as np
+from jaxtyping import Float32
 
 from engine.colour import composited
+from engine.evaluate.against_truth import TruthMeasures
 from engine.evaluate.gallery import ViewImages, WorstAndBest
+from engine.evaluate.layers import shown_layers
 from engine.evaluate.report import write_report
+from engine.evaluate.truth import Truth
 from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
 from engine.events import Listener, StageProgress
 from engine.gaussians.model import FlatGaussians
@@ -37,6 +42,8 @@ def evaluate_held_out(
     config: Mapping[str, object],
     threads: int,
     tell: Listener,
+    truth: Truth | None = None,
+    environment_linear: Float32[np.ndarray, "h w 3"] | None = None,
 ) -> None:
     """Measure ``gaussians`` on the held-out views of ``dataset``.
 
@@ -51,24 +58,31 @@ def evaluate_held_out(
         config: shown in the report.
         threads: for rendering and measuring; 0 means all cores.
         tell: hears the progress.
+        truth: of the scene, whose measures then join the metrics as ``truth``.
+        environment_linear: the map that the scene was learnt with, for the report.
     """
     tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
+    measures = None if truth is None else TruthMeasures(truth)
     rows: list[ViewMetrics] = []
     images = WorstAndBest()
     total = len(dataset.test_indices)
     photographs = [view.name for view in dataset.views]
     names = dict(zip(photographs, render_names(photographs), strict=True))
     for view, measured in _measured(
-        _rendered(dataset, tracer, shading, background), threads or numba.get_num_threads()
+        _rendered(dataset, tracer, shading, background, measures), threads or numba.get_num_threads()
     ):
         path = output / RENDERS / f"{names[view.name]}.png"
         write_png(path, view.render)
         rows.append(measured.metrics)
         images.offer(
-            view.name, measured.metrics.psnr, ViewImages(view.reference, view.render, measured.flip_map)
+            view.name,
+            measured.metrics.psnr,
+            ViewImages(view.reference, view.render, measured.flip_map, view.layers),
         )
         tell(StageProgress("evaluate", len(rows), total))
+    if measures is not None and measures.rows:
+        run = {**run, "truth": measures.as_dict()}
     metrics = summarise(rows).as_dict(run)
     write_json(output / METRICS, metrics)
     write_report(
@@ -78,19 +92,33 @@ def evaluate_held_out(
         events=_read_events(output / "events.jsonl"),
         config=config,
         images=images,
+        environment_linear=environment_linear,
     )
 
 
 def _rendered(
-    dataset: Dataset, tracer: Tracer, shading: ShadingModel, background: str
+    dataset: Dataset,
+    tracer: Tracer,
+    shading: ShadingModel,
+    background: str,
+    measures: TruthMeasures | None,
 ) -> Iterator[RenderedView]:
     colour = background_colour(background)
     for index in dataset.test_indices:
         rgb, alpha, weight = dataset.view_image(int(index))
-        image = render_rays(tracer, dataset.view_rays(int(index)), colour, shading)
+        rays = dataset.view_rays(int(index))
+        image = render_rays(tracer, rays, colour, shading)
+        if measures is not None:
+            view = dataset.views[index]
+            measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
         reference = composited(rgb, alpha, colour)
         yield RenderedView(
-            dataset.views[index].name, image.rgb_srgb, reference, weight, alpha if dataset.has_alpha else None
+            dataset.views[index].name,
+            image.rgb_srgb,
+            reference,
+            weight,
+            alpha if dataset.has_alpha else None,
+            shown_layers(image),
         )
 
 

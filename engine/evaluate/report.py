@@ -10,11 +10,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float32
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from engine.errors import OutputError
 from engine.evaluate.curves import duration, training_charts
-from engine.evaluate.gallery import BEST, MAGMA, WORST, ViewImages, data_uri, embedded_names, magma
+from engine.evaluate.gallery import (
+    BEST,
+    MAGMA,
+    MAX_SIDE_PX,
+    WORST,
+    ViewImages,
+    data_uri,
+    embedded_names,
+    magma,
+)
+from engine.evaluate.layers import LABELS, shown_environment
+from engine.render.images import resized
 from engine.writing import write_text
 
 
@@ -39,6 +52,16 @@ COLUMNS = (
 )
 
 EXPOSURE_MATTERS_DB = 0.3
+_LABELS = {"photograph": "Photograph", "render": "Render", "flip": "FLIP error map"}
+_TRUTH_TILES = (
+    ("normal_mae", "Normals", 2, "degrees"),
+    ("depth_mae", "Depth", 4, "units"),
+    ("albedo_psnr_scaled", "Albedo", 2, "dB"),
+    ("roughness_mae", "Roughness", 3, "off"),
+    ("metallic_mae", "Metallic", 3, "off"),
+    ("environment_psnr_scaled", "Environment", 2, "dB"),
+    ("relight_psnr_scaled", "Relit", 2, "dB"),
+)
 _NOTES = {
     "psnr_colour_corrected": "exposure left out",
     "ssim": "as in 3DGS, zero padding",
@@ -54,6 +77,7 @@ def write_report(
     events: Sequence[Mapping[str, object]],
     config: Mapping[str, object],
     images: Mapping[str, ViewImages],
+    environment_linear: Float32[np.ndarray, "h w 3"] | None = None,
 ) -> None:
     """Write the report page, atomically.
 
@@ -65,6 +89,7 @@ def write_report(
         config: Settings of the run, nested as in ``config.json``.
         images: Pictures by view name. Views without any are in the table only; of more than 16, the 12
             worst and 4 best are embedded, and no others are asked for, so that the mapping may load lazily.
+        environment_linear: The map that a scene with materials was learnt with.
 
     Raises:
         OutputError: The page cannot be written.
@@ -78,6 +103,7 @@ def write_report(
     )
     page = environment.get_template("report.html").render(
         _content(title, metrics, events, config, images),
+        environment=None if environment_linear is None else _environment(environment_linear),
     )
     try:
         write_text(path, page)
@@ -99,7 +125,10 @@ def _content(
     worst_first = sorted(views, key=lambda name: (_number(views[name].get("psnr"), math.inf), name))
     embedded = embedded_names(worst_first, images)
     interval = metrics.get("mean_psnr_ci95")
+    layers = [name for name in LABELS if any(name in images[view].layers for view in embedded)]
     return {
+        "labels": {**_LABELS, **{name: LABELS[name] for name in layers}},
+        "tabs": layers,
         "title": title,
         "tiles": _tiles(mean, columns, interval, metrics),
         "facts": _facts(metrics, len(views)),
@@ -115,8 +144,22 @@ def _content(
         "magma": [f"rgb({r} {g} {b})" for r, g, b in (MAGMA * 255).round().astype(int).tolist()],
         "settings": _flattened(config),
         "versions": _flattened(_mapping(metrics.get("versions"))),
-        "definitions": list(_mapping(metrics.get("definitions")).items()),
+        "definitions": [
+            *_mapping(metrics.get("definitions")).items(),
+            *_mapping(_mapping(metrics.get("truth")).get("definitions")).items(),
+        ],
         "warnings": list(dict.fromkeys(str(e.get("message")) for e in events if e.get("kind") == "warning")),
+    }
+
+
+def _environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
+    """The map's picture and size."""
+    height, width = radiance_linear.shape[:2]
+    return {
+        "uri": data_uri(resized(shown_environment(radiance_linear), MAX_SIDE_PX)),
+        "width": width,
+        "height": height,
+        "brightest": _shown(float(radiance_linear.max()), 1),
     }
 
 
@@ -143,6 +186,11 @@ def _tiles(
             unit = "dB" if column.key.startswith("psnr") else ""
             value = _shown(mean[column.key], column.decimals)
             tiles.append({"label": column.heading, "value": value, "unit": unit, "note": note})
+    known = _mapping(_mapping(metrics.get("truth")).get("mean"))
+    for key, label, decimals, unit in _TRUTH_TILES:
+        if known.get(key) is not None:
+            note = "against the truth" + (", one factor a channel" if key.endswith("_scaled") else "")
+            tiles.append({"label": label, "value": _shown(known[key], decimals), "unit": unit, "note": note})
     gaussians = metrics.get("gaussians")
     if isinstance(gaussians, int):
         tiles.append({"label": "Gaussians", "value": _thousands(gaussians), "unit": "", "note": ""})
@@ -237,6 +285,7 @@ def _figure(name: str, view: Mapping[str, object], images: ViewImages) -> dict[s
             ("photograph", data_uri(small.photograph)),
             ("render", data_uri(small.render)),
             ("flip", data_uri(magma(small.flip_map))),
+            *((layer, data_uri(picture)) for layer, picture in small.layers.items() if layer in LABELS),
         ],
     }
 

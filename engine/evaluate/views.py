@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ class RenderedView(NamedTuple):
         reference: Display values of the photograph at the render's size, over the same background.
         weight: 1 where the photograph is valid, 0 where a mask rules it out.
         alpha: Coverage of the photograph's foreground, for photographs that have one.
+        layers: What lies behind the render, as display values by name.
     """
 
     name: str
@@ -40,6 +42,7 @@ class RenderedView(NamedTuple):
     reference: Float32[np.ndarray, "h w 3"]
     weight: Float32[np.ndarray, "h w"]
     alpha: Float32[np.ndarray, "h w"] | None = None
+    layers: Mapping[str, Float32[np.ndarray, "h w 3"]] = MappingProxyType({})
 
 
 @dataclass(frozen=True)

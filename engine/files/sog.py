@@ -70,7 +70,11 @@ def read(path: Path) -> GaussianCloud:
         SceneFileError: the file is no SOG, an image is missing or too small, or a number is out of range.
     """
     try:
-        if not zipfile.is_zipfile(path):
+        if path.stat().st_size == 0:
+            raise SceneFileError(f"{path}: is empty.")
+        if path.name != META and not zipfile.is_zipfile(path):
+            raise SceneFileError(f"{path}: is no SOG bundle, which is a ZIP archive, or it is damaged.")
+        if path.name == META:
             return _decode(path, path.read_bytes(), _folder_images(path))
         with zipfile.ZipFile(path) as bundle, tempfile.TemporaryDirectory(prefix="octasplat-") as folder:
             return _decode(path, _member(path, bundle, META), _bundle_images(path, bundle, Path(folder)))

@@ -142,6 +142,22 @@ class ShadowRays(NamedTuple):
     straight: Bool[np.ndarray, " n"]
 
 
+class SurfacePoints(NamedTuple):
+    """``n`` points of surfaces, each seen along a ray.
+
+    Attributes:
+        points_world: from where rays go on, a little off the surface.
+        normals_world: unit normals on the viewer's side.
+        directions_world: unit vectors from the viewer.
+        materials: linear albedo, metallic and perceptual roughness.
+    """
+
+    points_world: Float32[np.ndarray, "n 3"]
+    normals_world: Float32[np.ndarray, "n 3"]
+    directions_world: Float32[np.ndarray, "n 3"]
+    materials: Float32[np.ndarray, "n 5"]
+
+
 class MeshQueries(NamedTuple):
     """What kernels ask Embree about the meshes of a stage.
 

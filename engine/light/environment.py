@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from engine.errors import ConfigError, DatasetError
-from engine.render.images import read_image
+from engine.render.images import read_image, write_exr, write_rgbe
+from engine.shading.environment_frame import environment_frame as environment_frame
 
 MAX_PIXELS = 1 << 27
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -61,22 +62,20 @@ def read_environment(path: Path) -> Float32[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(rgb)
 
 
-def environment_frame(
-    up_world: Float64[np.ndarray, "3"], rotation_degrees: float = 0.0
-) -> Float64[np.ndarray, "3 3"]:
-    """Right, up and forward of a map, as rows.
+def write_environment(path: Path, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write a map as RGBE (``.hdr``, values to within 1 %) or as EXR (``.exr``, exactly), atomically.
 
-    Forward, where the middle column lies, is the world's z made level, or its x where z is about up. The
-    rotation turns it to the left, seen from above anticlockwise.
+    Raises:
+        ConfigError: the name ends otherwise.
+        OutputError: the file cannot be written.
     """
-    up = up_world / np.linalg.norm(up_world)
-    ahead = np.array([1.0, 0.0, 0.0]) if abs(up[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
-    ahead = ahead - (ahead @ up) * up
-    ahead /= np.linalg.norm(ahead)
-    left = np.cross(up, ahead)
-    angle = np.radians(rotation_degrees)
-    forward = np.cos(angle) * ahead + np.sin(angle) * left
-    return np.stack([np.cross(forward, up), up, forward])
+    suffix = path.suffix.lower()
+    if suffix == ".hdr":
+        write_rgbe(path, radiance_linear)
+    elif suffix == ".exr":
+        write_exr(path, {name: radiance_linear[..., k] for k, name in enumerate("RGB")})
+    else:
+        raise ConfigError(f"{path}: an environment is written as .hdr or .exr.")
 
 
 def environment_sampler(radiance_linear: Float32[np.ndarray, "h w 3"]) -> EnvironmentSampler:

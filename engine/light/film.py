@@ -3,6 +3,9 @@
 A pixel has a front layer of Gaussians (premultiplied display colour, transmittance, and the factor that the
 stage's lights give to it) and linear light behind it; see :mod:`engine.light.kernels_layer` for the reason.
 
+Gaussians with materials that the camera sees are a part of the pixel of their own, encoded by itself, so that
+their edges blend in display values as photographs with alpha do.
+
 A compositor's layers are so made that ``background * shadow`` under ``things`` is the picture again. Things
 and scene meet in display values in the picture, but in linear ones in a compositor: where a pixel is covered
 in part, the alpha of the things is the larger one that this takes, so that nothing becomes negative.
@@ -19,6 +22,7 @@ from jaxtyping import Float32, Float64, Int64
 from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.light.arrays import Paths
 from engine.light.kernels_film import add_up
+from engine.light.kernels_scatter import FRONT
 
 Tone = Literal["none", "reinhard", "filmic"]
 Filter = Callable[
@@ -65,7 +69,8 @@ class Film:
         self._shape = (height, width)
         count = height * width
         self._layer, self._light, self._shade, self._albedo, self._normals = np.zeros((5, count, 3))
-        self._through, self._coverage, self._things, self._samples = np.zeros((4, count))
+        self._through, self._coverage, self._things, self._samples, self._front = np.zeros((5, count))
+        self._front_light = np.zeros((count, 3))
         self.plate = Film(height, width) if layered else None
         self._free = Film(height, width) if layered else None
 
@@ -88,12 +93,15 @@ class Film:
         ) -> None:
             add_up(values.reshape(len(values), -1), factors, each, pixels, sums.reshape(len(sums), -1))
 
-        through = paths.transmittance
+        front = (paths.marks & FRONT != 0).astype(np.float32)
+        through = paths.transmittance * (1 - front)
         add(self._layer, paths.layer_srgb)
         add(self._light, paths.radiance_linear, through if counted is None else through * counted)
         add(self._shade, paths.shade)
         add(self._through, through)
         add(self._coverage, paths.coverage)
+        add(self._front, front)
+        add(self._front_light, paths.radiance_linear, front if counted is None else front * counted)
         if counted is not None:
             add(self._samples, counted)
             return
@@ -103,6 +111,14 @@ class Film:
         add(self._things, paths.things)
         if self._free is not None:
             self._free.add(paths, pixels, (paths.things == 0.0).astype(np.float32))
+
+    def surface(self) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+        """Mean linear radiance of the Gaussians with materials that the camera sees, and their coverage."""
+        linear = _divided(self._front_light, self._front[:, None])
+        coverage = self._front / np.maximum(self._samples, 1)
+        return linear.astype(np.float32).reshape(*self._shape, 3), coverage.astype(np.float32).reshape(
+            self._shape
+        )
 
     def image(self, *, exposure: float = 0.0, tone: Tone = "none") -> StageImage:
         """The picture of all paths so far; ``exposure`` is in stops."""
@@ -124,7 +140,7 @@ class Film:
             light = clean(self._picture(self._light / count), *guides)
             smooth = light.reshape(-1, 3).astype(np.float64) * count
             film._light = np.where(self._things[:, None] > 0.0, smooth, self._light)
-        covered = self._samples[:, None] - self._through[:, None]
+        covered = self._covered()
         shade = _divided(self._shade, covered, 1.0)
         if (np.abs(shade - 1.0) > _DARK).any():
             even = clean(self._picture(np.maximum(shade, 0.0)), None, None)
@@ -135,15 +151,21 @@ class Film:
 
     def _linear(self, *, lit: bool = True) -> Float64[np.ndarray, "n 3"]:
         """Linear values; not ``lit`` shows the Gaussians as trained."""
-        through = self._through[:, None] / np.maximum(self._samples, 1)[:, None]
-        covered = 1.0 - through
-        layer = self._layer / np.maximum(self._samples, 1)[:, None]
+        count = np.maximum(self._samples, 1)[:, None]
+        through, front = self._through[:, None] / count, self._front[:, None] / count
+        covered = np.maximum(1.0 - through - front, 0.0)
+        layer = self._layer / count
         light = _divided(self._light, self._through[:, None])
+        surface = _divided(self._front_light, self._front[:, None])
         if lit:
-            shade = _divided(self._shade, self._samples[:, None] - self._through[:, None], 1.0)
+            shade = _divided(self._shade, self._covered(), 1.0)
             colour = srgb_to_linear(_divided(layer, covered)) * np.maximum(shade, 0.0)
             layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(colour))
-        return np.asarray(srgb_to_linear(layer + through * linear_to_srgb(light)))
+        shown = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
+        return np.asarray(srgb_to_linear(shown))
+
+    def _covered(self) -> Float64[np.ndarray, "n 1"]:
+        return (self._samples - self._through - self._front)[:, None]
 
     def _layers(self, picture: Float64[np.ndarray, "n 3"]) -> dict[str, Float32[np.ndarray, "h w"]]:
         if self._free is None or self.plate is None:

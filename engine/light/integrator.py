@@ -17,6 +17,7 @@ from engine.light.arrays import (
     Rules,
     Scratch,
     ShadowRays,
+    SurfacePoints,
     View,
     new_paths,
     new_scratches,
@@ -26,6 +27,7 @@ from engine.light.denoising import denoiser
 from engine.light.film import Film
 from engine.light.kernels_follow import follow_paths
 from engine.light.kernels_layer import add_layer_light, meet_layers
+from engine.light.kernels_material_layer import meet_materials, start_at_points
 from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
 from engine.light.kernels_shadows import let_through
 from engine.light.layers import GaussianLayers
@@ -34,6 +36,7 @@ from engine.light.staging import LitMeshes, stage_meshes
 from engine.rays import ImageRays, RayBatch
 from engine.render.renderer import tile_order
 from engine.threads import use_threads
+from engine.trace.protocol import Tracer
 
 PATHS_AT_ONCE = 1 << 18
 """Paths that are traced together through Gaussians."""
@@ -228,12 +231,46 @@ class PathTracer:
             self._follow(paths, near)
             film.add(paths, batch.pixels)
 
-    def _follow(self, paths: Paths, near: Float32[np.ndarray, "1"]) -> None:
-        """Follow paths to their ends; the camera sees nothing nearer than ``near``."""
+    def radiance(
+        self, at: SurfacePoints, pixels: Int64[np.ndarray, " n"], samples: Int64[np.ndarray, " n"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """What points of surfaces send to who sees them, each by one path: linear, unbiased.
+
+        The surface of a point is not part of the scene unless that holds it too.
+
+        Args:
+            at: the points.
+            pixels: any number for each; with its sample it decides the path.
+            samples: number of each path among those of its pixel, below 65,536.
+        """
+        use_threads(self._threads)
+        meshes, layers = self._scene.meshes, self._scene.layers
+        count = len(at.points_world)
+        paths, shadows = new_paths(count), new_shadow_rays(count)
+        self._share(
+            start_at_points, count, at, pixels, samples, self._rules, meshes.materials, meshes.lights,
+            paths, shadows,
+        )  # fmt: skip
+        every = np.arange(count, dtype=np.int32)
+        self._add_surface_light(paths, every, shadows, None if layers is None else layers.tracer)
+        self._follow(paths, np.zeros(1, np.float32), every[paths.alive], met=1)
+        return paths.radiance_linear
+
+    def _follow(
+        self,
+        paths: Paths,
+        near: Float32[np.ndarray, "1"],
+        active: Int32[np.ndarray, " n"] | None = None,
+        met: int = 0,
+    ) -> None:
+        """Follow paths to their ends; the camera sees nothing nearer than ``near``.
+
+        ``active`` are those that are left after they ``met`` so many surfaces; None stands for all.
+        """
         meshes, layers = self._scene.meshes, self._scene.layers
         environment = meshes.lights.environment_number
-        active = np.arange(len(paths.keys), dtype=np.int32)
-        for depth in range(self._rules.max_depth + 1):
+        active = np.arange(len(paths.keys), dtype=np.int32) if active is None else active
+        for depth in range(met, self._rules.max_depth + 1):
             rays = RayBatch(
                 paths.origins_world if depth == 0 else paths.origins_world[active],
                 paths.directions_world if depth == 0 else paths.directions_world[active],
@@ -243,6 +280,14 @@ class PathTracer:
             shadows = new_shadow_rays(len(active))
             if layers is not None:
                 seen = layers.trace(rays, hits.distances)
+                if layers.with_materials:
+                    self._share(
+                        meet_materials, len(active), paths, active, depth, hits.faces, seen.rgb_srgb,
+                        seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
+                        seen.features, meshes.materials, meshes.lights, self._rules, layers.spent_below,
+                        shadows,
+                    )  # fmt: skip
+                    self._add_surface_light(paths, active, shadows, layers.tracer)
                 self._share(
                     meet_layers, len(active), paths, active, depth, hits.distances, hits.faces,
                     seen.rgb_srgb, seen.transmittance, seen.depth_median, seen.depth_sum, seen.normal_world,
@@ -255,7 +300,7 @@ class PathTracer:
                 paths, active, depth, hits.distances, hits.faces, hits.barycentrics,
                 meshes.surfaces, meshes.materials, meshes.lights, environment, self._rules, shadows,
             )  # fmt: skip
-            self._add_surface_light(paths, active, shadows)
+            self._add_surface_light(paths, active, shadows, None if layers is None else layers.on_meshes)
             active = active[paths.alive[active]]
             if len(active) == 0:
                 return
@@ -269,15 +314,15 @@ class PathTracer:
         )  # fmt: skip
         return share
 
-    def _add_surface_light(self, paths: Paths, active: Int32[np.ndarray, " n"], shadows: ShadowRays) -> None:
-        """Add the light that reaches surfaces."""
+    def _add_surface_light(
+        self, paths: Paths, active: Int32[np.ndarray, " n"], shadows: ShadowRays, casters: Tracer | None
+    ) -> None:
+        """Add the light that reaches surfaces past meshes and the Gaussians of ``casters``."""
         shadows.lost[:] = 0.0
         share = self._let_through(shadows)
-        layers = self._scene.layers
-        if layers is not None and layers.on_meshes is not None:
-            free = np.flatnonzero(share.any(axis=1))
-            if len(free):
-                share[free] *= layers.on_meshes.transmittance(_rays(shadows, free))[:, None]
+        free = np.flatnonzero(share.any(axis=1))
+        if casters is not None and len(free):
+            share[free] *= casters.transmittance(_rays(shadows, free))[:, None]
         self._share(add_lit, len(active), paths, active, shadows.lit, share)
 
     def _add_layer_light(

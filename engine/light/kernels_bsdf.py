@@ -4,15 +4,21 @@ Directions are in the frame of the shading normal (z), ``o`` towards the viewer 
 both of unit length. Values are linear and already hold the cosine to the light. Everything is a pure
 function of its arguments.
 
-GGX with Smith's separable masking: "Microfacet Models for Refraction through Rough Surfaces" (Walter et al.
-2007). Visible normals: "Sampling Visible GGX Normals with Spherical Caps" (Dupuy and Benyoub 2023,
-https://arxiv.org/abs/2306.05044). Light that facets throw at each other: "Practical multiple scattering
-compensation for microfacet models" (Turquin 2019). The ground under a coat takes what the coat leaves, in
-both directions: "A Microfacet Based Coupled Specular-Matte BRDF Model" (Kelemen and Szirmay-Kalos 2001).
+Microfacets are those of :mod:`engine.shading.kernels_microfacets`. Light that facets throw at each other:
+"Practical multiple scattering compensation for microfacet models" (Turquin 2019). The ground under a coat
+takes what the coat leaves, in both directions: "A Microfacet Based Coupled Specular-Matte BRDF Model"
+(Kelemen and Szirmay-Kalos 2001).
 """
 
 import math
 
+from engine.shading.kernels_microfacets import (
+    ggx_density,
+    ggx_masking,
+    sample_visible_normal,
+    schlick_weight,
+    table_value,
+)
 from engine.trace.kernels_native import lean
 
 LEAST_ALPHA = 1e-3
@@ -36,60 +42,10 @@ def fresnel_dielectric(cos_o, eta):
 
 
 @lean(forceinline=True)
-def schlick_weight(cosine):
-    """(1 - cosine) to the power of 5."""
-    x = min(max(1.0 - cosine, 0.0), 1.0)
-    return x * x * x * x * x
-
-
-@lean(forceinline=True)
-def ggx_density(cos_h, alpha):
-    """The microfacet distribution D at a half vector of that cosine."""
-    a2 = alpha * alpha
-    x = cos_h * cos_h * (a2 - 1.0) + 1.0
-    return a2 / (math.pi * x * x)
-
-
-@lean(forceinline=True)
-def ggx_masking(cosine, alpha):
-    """Smith's G1: the share of the facets that face a direction and are seen from it."""
-    c2 = cosine * cosine
-    return 2.0 / (1.0 + math.sqrt(1.0 + alpha * alpha * max(1.0 - c2, 0.0) / max(c2, 1e-12)))
-
-
-@lean(forceinline=True)
-def sample_visible_normal(o_x, o_y, o_z, alpha, u, v):
-    """A normal of GGX as it is seen from ``o`` (o_z > 0)."""
-    x, y, z = alpha * o_x, alpha * o_y, o_z
-    length = math.sqrt(x * x + y * y + z * z)
-    x, y, z = x / length, y / length, z / length
-    height = (1.0 - u) * (1.0 + z) - z
-    radius = math.sqrt(min(max(1.0 - height * height, 0.0), 1.0))
-    angle = 2.0 * math.pi * v
-    h_x, h_y, h_z = radius * math.cos(angle) + x, radius * math.sin(angle) + y, height + z
-    h_x, h_y, h_z = alpha * h_x, alpha * h_y, max(h_z, 1e-9)
-    length = math.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
-    return h_x / length, h_y / length, h_z / length
-
-
-@lean(forceinline=True)
 def sample_cosine(u, v):
     """A direction over the hemisphere, as dense as its cosine; its density is cosine / pi."""
     radius, angle = math.sqrt(u), 2.0 * math.pi * v
     return radius * math.cos(angle), radius * math.sin(angle), math.sqrt(max(1.0 - u, 0.0))
-
-
-@lean(forceinline=True)
-def table_value(table, cosine, roughness):
-    """Bilinear value of a table over (roughness, cosine), both from 0 to 1."""
-    rows, columns = table.shape
-    y = min(max(roughness, 0.0), 1.0) * (rows - 1)
-    x = min(max(cosine, 0.0), 1.0) * (columns - 1)
-    j, i = min(int(y), rows - 2), min(int(x), columns - 2)
-    y, x = y - j, x - i
-    low = table[j, i] * (1.0 - x) + table[j, i + 1] * x
-    high = table[j + 1, i] * (1.0 - x) + table[j + 1, i + 1] * x
-    return low * (1.0 - y) + high * y
 
 
 @lean(forceinline=True)

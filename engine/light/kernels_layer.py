@@ -16,17 +16,9 @@ import math
 
 from engine.light.arrays import PAIRS_OF_SURFACE
 from engine.light.kernels_lights import FAR, adding_share, pick_light, sample_light
-from engine.light.kernels_path import (
-    CLEAR,
-    ENDED,
-    LAYER_PLACE,
-    PAIRS_OF_CAMERA,
-    PICK,
-    SHORT_OF_LIGHT,
-    add_radiance,
-    beyond,
-)
+from engine.light.kernels_path import ENDED, PAIRS_OF_CAMERA, add_radiance, beyond
 from engine.light.kernels_random import uniform_pair
+from engine.light.kernels_scatter import CLEAR, LAYER_PLACE, PICK, SHORT_OF_LIGHT
 from engine.light.kernels_surface import unit
 from engine.trace.kernels_native import lean
 

@@ -7,20 +7,10 @@ several threads can share the work.
 
 import math
 
-import numpy as np
-
 from engine.light.arrays import BLOCK, PAIRS_OF_SURFACE
-from engine.light.kernels_bsdf import (
-    around,
-    fresnel_dielectric,
-    opaque_sample,
-    opaque_value,
-    sample_cosine,
-    table_value,
-)
+from engine.light.kernels_bsdf import around, fresnel_dielectric, table_value
 from engine.light.kernels_frosted import LEAST_FROST, frosted_sample, frosted_value
 from engine.light.kernels_lights import (
-    FAR,
     emitted,
     environment_density,
     environment_radiance,
@@ -30,6 +20,18 @@ from engine.light.kernels_lights import (
     seen_density,
 )
 from engine.light.kernels_random import fill_pairs, pixel_key
+from engine.light.kernels_scatter import (
+    CHOICE,
+    CLEAR,
+    DIRECTION,
+    PICK,
+    PLACE,
+    SCATTERED,
+    STRAIGHT,
+    ask,
+    leave,
+    scatter,
+)
 from engine.light.kernels_surface import (
     DIFFUSE,
     GLASS,
@@ -47,18 +49,9 @@ from engine.light.kernels_surface import (
 )
 from engine.trace.kernels_native import lean
 
-CLEAR = 1
-"""Mark: every surface so far passed on all light in one direction; the first layer goes on."""
-SCATTERED = 2
-"""Mark: the path has left a matt or rough surface."""
-STRAIGHT = 4
-"""Mark: the path is still the camera's own ray."""
-
 ENDED = -2
 """In place of a face: the ray ended in front of what it would have met."""
 PAIRS_OF_CAMERA = 2
-CHOICE, DIRECTION, PICK, PLACE, LAYER_PLACE = 0, 1, 2, 3, 4
-SHORT_OF_LIGHT = 1.0 - 1e-4
 
 
 @lean(forceinline=True)
@@ -162,14 +155,6 @@ def add_radiance(paths, p, red, green, blue, clamp):
 
 
 @lean(forceinline=True)
-def _leave(paths, p, x, y, z, d_x, d_y, d_z, density):
-    """Send a path on."""
-    paths.origins_world[p, 0], paths.origins_world[p, 1], paths.origins_world[p, 2] = x, y, z
-    paths.directions_world[p, 0], paths.directions_world[p, 1], paths.directions_world[p, 2] = d_x, d_y, d_z
-    paths.densities[p] = density
-
-
-@lean(forceinline=True)
 def _miss(paths, p, lights, environment, rules):
     """A path ends behind everything."""
     d = paths.directions_world[p]
@@ -216,7 +201,7 @@ def _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue):
     paths.weights[p, 1] *= green
     paths.weights[p, 2] *= blue
     x, y, z = lifted(x, y, z, n_x, n_y, n_z)
-    _leave(paths, p, x, y, z, r_x, r_y, r_z, 0.0)
+    leave(paths, p, x, y, z, r_x, r_y, r_z, 0.0)
 
 
 @lean(forceinline=True)
@@ -245,7 +230,7 @@ def _glass(paths, p, materials, m, entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s
         t_x, t_y, t_z = unit(t_x / eta + along * s_x, t_y / eta + along * s_y, t_z / eta + along * s_z)
     paths.inside[p] = m if entering else -1
     x, y, z = lifted(x, y, z, -n_x, -n_y, -n_z)
-    _leave(paths, p, x, y, z, t_x, t_y, t_z, 0.0)
+    leave(paths, p, x, y, z, t_x, t_y, t_z, 0.0)
 
 
 @lean(forceinline=True)
@@ -273,20 +258,6 @@ def _guide(paths, p, red, green, blue, n_x, n_y, n_z):
 
 
 @lean()
-def _ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, blue, clamp):
-    """Ask a light: what it brings if nothing is in its way, no more than ``clamp``."""
-    most = max(red, green, blue)
-    if most > clamp:
-        red, green, blue = red * clamp / most, green * clamp / most, blue * clamp / most
-    shadows.lit[k, 0], shadows.lit[k, 1], shadows.lit[k, 2] = red, green, blue
-    shadows.origins_world[k, 0], shadows.origins_world[k, 1], shadows.origins_world[k, 2] = x, y, z
-    shadows.directions_world[k, 0] = w_x
-    shadows.directions_world[k, 1] = w_y
-    shadows.directions_world[k, 2] = w_z
-    shadows.t_max[k] = distance * SHORT_OF_LIGHT if distance < FAR else np.inf
-
-
-@lean()
 def _frosted_glass(
     paths, p, k, materials, m, entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice,
     lights, rules, shadows, numbers, n,
@@ -306,7 +277,7 @@ def _frosted_glass(
     front_x, front_y, front_z = lifted(x, y, z, n_x, n_y, n_z)
     back_x, back_y, back_z = lifted(x, y, z, -n_x, -n_y, -n_z)
     w = paths.weights[p]
-    clamp = rules.clamp if paths.marks[p] & SCATTERED else np.inf
+    clamp = rules.clamp if paths.marks[p] & SCATTERED else math.inf
     if len(lights.kinds):
         l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
         if l >= 0:
@@ -325,7 +296,7 @@ def _frosted_glass(
                     factor = gain * value / (l_pdf + pdf if lights.seen[l] else l_pdf)
                 if value > 0.0:
                     through = i_z < 0.0
-                    _ask(
+                    ask(
                         shadows, k,
                         back_x if through else front_x, back_y if through else front_y,
                         back_z if through else front_z, w_x, w_y, w_z, distance,
@@ -349,9 +320,9 @@ def _frosted_glass(
     w_x, w_y, w_z = unit(w_x, w_y, w_z)
     if through:
         paths.inside[p] = m if entering else -1
-        _leave(paths, p, back_x, back_y, back_z, w_x, w_y, w_z, pdf)
+        leave(paths, p, back_x, back_y, back_z, w_x, w_y, w_z, pdf)
     else:
-        _leave(paths, p, front_x, front_y, front_z, w_x, w_y, w_z, pdf)
+        leave(paths, p, front_x, front_y, front_z, w_x, w_y, w_z, pdf)
 
 
 @lean(cache=True, nogil=True)
@@ -452,7 +423,6 @@ def meet_surfaces(
         if kind == MIRROR:
             _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue)
             continue
-        # --- a surface that scatters: what lights send to it, and a direction to go on ---
         x, y, z = lifted(x, y, z, n_x, n_y, n_z)
         s_x, s_y, s_z = bumped_normal(
             materials, m, surfaces.corners_world[face], uv, u_t, v_t,
@@ -460,67 +430,13 @@ def meet_surfaces(
         )  # fmt: skip
         if first_thing:
             _guide(paths, p, red, green, blue, s_x, s_y, s_z)
-        a_x, a_y, a_z, b_x, b_y, b_z = around(s_x, s_y, s_z)
-        o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
-        o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
-        o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
-        coat, coat_mean = materials.coat[materials.coats[m]], materials.coat_means[materials.coats[m]]
-        ior, ground, kept = materials.iors[m], materials.grounds[m], materials.kept[m] != 0
-        if len(lights.kinds):
-            l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
-            if l >= 0:
-                u, v = numbers[PLACE, 0, n], numbers[PLACE, 1, n]
-                w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
-                i_z = w_x * s_x + w_y * s_y + w_z * s_z
-                if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
-                    if kind == DIFFUSE:
-                        pdf = i_z / math.pi
-                        f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
-                    else:
-                        f_r, f_g, f_b, pdf = opaque_value(
-                            o_x, o_y, o_z,
-                            w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z,
-                            red, green, blue, metallic, roughness, ior, ground, kept,
-                            materials.mirror, coat, coat_mean,
-                        )  # fmt: skip
-                    factor = 1.0 / share
-                    shadows.straight[k] = l_pdf == 0.0
-                    if l_pdf > 0.0:
-                        l_pdf *= share
-                        factor = 1.0 / (l_pdf + pdf) if lights.seen[l] else 1.0 / l_pdf
-                    w = paths.weights[p]
-                    l_r, l_g, l_b = (
-                        w[0] * f_r * l_r * factor,
-                        w[1] * f_g * l_g * factor,
-                        w[2] * f_b * l_b * factor,
-                    )
-                    clamp = rules.clamp if paths.marks[p] & SCATTERED else np.inf
-                    _ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, l_r, l_g, l_b, clamp)
-        u, v = numbers[DIRECTION, 0, n], numbers[DIRECTION, 1, n]
-        if kind == DIFFUSE:
-            i_x, i_y, i_z = sample_cosine(u, v)
-            pdf = i_z / math.pi
-            f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
-        else:
-            i_x, i_y, i_z = opaque_sample(
-                o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, choice, u, v
-            )
-            f_r, f_g, f_b, pdf = opaque_value(
-                o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, ground, kept,
-                materials.mirror, coat, coat_mean,
-            )  # fmt: skip
-        w_x = i_x * a_x + i_y * b_x + i_z * s_x
-        w_y = i_x * a_y + i_y * b_y + i_z * s_y
-        w_z = i_x * a_z + i_y * b_z + i_z * s_z
-        if not pdf > 0.0 or w_x * n_x + w_y * n_y + w_z * n_z <= 0.0 or f_r + f_g + f_b <= 0.0:
-            paths.alive[p] = False
-            continue
-        paths.weights[p, 0] *= f_r / pdf
-        paths.weights[p, 1] *= f_g / pdf
-        paths.weights[p, 2] *= f_b / pdf
-        paths.marks[p] = (paths.marks[p] | SCATTERED) & ~(CLEAR | STRAIGHT)
-        w_x, w_y, w_z = unit(w_x, w_y, w_z)
-        _leave(paths, p, x, y, z, w_x, w_y, w_z, pdf)
+        scatter(
+            k, p, n, numbers, paths, kind == DIFFUSE, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z,
+            red, green, blue, metallic, roughness,
+            materials.iors[m], materials.grounds[m], materials.kept[m] != 0,
+            materials.mirror, materials.coat[materials.coats[m]], materials.coat_means[materials.coats[m]],
+            lights, rules, shadows,
+        )  # fmt: skip
 
 
 @lean(cache=True, nogil=True)

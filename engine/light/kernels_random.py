@@ -54,16 +54,17 @@ def _upwards(x, seed):
 
 
 @lean()
-def sobol_pair(index):
-    """The first two dimensions of Sobol's sequence, as uint32 fractions."""
-    first = reversed_bits(index)
-    second = np.uint32(first ^ (first << np.uint32(16)))
-    # Pascal's triangle modulo 2 as a product of five sparse matrices.
-    second = np.uint32(second ^ ((second & np.uint32(0x00FF00FF)) << np.uint32(8)))
-    second = np.uint32(second ^ ((second & np.uint32(0x0F0F0F0F)) << np.uint32(4)))
-    second = np.uint32(second ^ ((second & np.uint32(0x33333333)) << np.uint32(2)))
-    second = np.uint32(second ^ ((second & np.uint32(0x55555555)) << np.uint32(1)))
-    return first, second
+def sobol_digits(index):
+    """The first two dimensions of Sobol's sequence as 32 binary digits behind the point, the last one first.
+
+    So they are what is to be scrambled next. The first is the index itself, the second Pascal's triangle
+    modulo 2 on it, as a product of sparse matrices; the index is below 65,536.
+    """
+    second = np.uint32(index ^ ((index & np.uint32(0xFF00FF00)) >> np.uint32(8)))
+    second = np.uint32(second ^ ((second & np.uint32(0xF0F0F0F0)) >> np.uint32(4)))
+    second = np.uint32(second ^ ((second & np.uint32(0xCCCCCCCC)) >> np.uint32(2)))
+    second = np.uint32(second ^ ((second & np.uint32(0xAAAAAAAA)) >> np.uint32(1)))
+    return index, second
 
 
 @lean()
@@ -77,11 +78,10 @@ def uniform_pair(key, sample, pair):
     """Two numbers in [0, 1) for number ``sample`` (below 65,536) in the pair of dimensions ``pair``."""
     seed = hashed(np.uint32(key + np.uint32(0x85EBCA6B) * np.uint32(pair + 1)))
     # The order is scrambled within its 16 bits, so that the first 2^k samples stay a whole block.
-    place = np.uint32(sample) << np.uint32(16)
-    place = reversed_bits(_upwards(reversed_bits(place), seed)) >> np.uint32(16)
-    first, second = sobol_pair(place)
-    first = reversed_bits(_upwards(reversed_bits(first), hashed(np.uint32(seed ^ np.uint32(0x68E31DA4)))))
-    second = reversed_bits(_upwards(reversed_bits(second), hashed(np.uint32(seed ^ np.uint32(0xB5297A4D)))))
+    order = _upwards(reversed_bits(np.uint32(sample) << np.uint32(16)), seed)
+    first, second = sobol_digits(reversed_bits(order) >> np.uint32(16))
+    first = reversed_bits(_upwards(first, hashed(np.uint32(seed ^ np.uint32(0x68E31DA4)))))
+    second = reversed_bits(_upwards(second, hashed(np.uint32(seed ^ np.uint32(0xB5297A4D)))))
     return min(first * SCALE, BELOW_ONE), min(second * SCALE, BELOW_ONE)
 
 
@@ -93,13 +93,19 @@ def fill_uniform(seed, pixels, samples, pair, out):
 
 
 @lean()
+def _fill(keys, samples, count, pair, first, second):
+    """A pair of numbers of each path; without a branch, so that the compiler does many paths at a time."""
+    for k in range(count):
+        u, v = uniform_pair(keys[k], samples[k], pair)
+        first[k] = u
+        second[k] = v
+
+
+@lean()
 def fill_pairs(keys, samples, count, first, numbers):
     """:func:`uniform_pair` of ``count`` paths in the pairs of dimensions from ``first`` on.
 
-    ``numbers`` (pairs, 2, count or more) gets them. The loops go through without a branch, so that the
-    compiler does many paths at a time.
+    ``numbers`` (pairs, 2, count or more) gets them.
     """
     for pair in range(len(numbers)):
-        u, v = numbers[pair, 0], numbers[pair, 1]
-        for k in range(count):
-            u[k], v[k] = uniform_pair(keys[k], samples[k], first + pair)
+        _fill(keys, samples, count, first + pair, numbers[pair, 0], numbers[pair, 1])

@@ -9,8 +9,11 @@ from jaxtyping import Bool, Float32
 
 from engine.edit.affine import scaling, transform, translation
 from engine.errors import ConfigError
-from engine.gaussians.model import FlatGaussians, concatenate
+from engine.gaussians.channels import stacked
+from engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
+from engine.gaussians.model import SH_C0, FlatGaussians, concatenate
 from engine.light.kernels_layer import AMBIENT, RELIT, SHADOWED
+from engine.light.kernels_material_layer import ALBEDO, COLUMNS, LIFT, MATERIAL
 from engine.light.meshes import rotation_matrix
 from engine.light.stage import Stage, StageGaussians
 from engine.rays import RayBatch
@@ -19,6 +22,8 @@ from engine.trace.protocol import Tracer, TraceResult, TraceSettings
 
 FEATURES = 3
 BIAS_OF_SIZE = 0.03
+LIFT_OF_SCALE = 0.5
+"""Rays leave a surface of Gaussians so far above it, of their standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,8 @@ class GaussianLayers:
         on_gaussians: those that cast shadows on Gaussians.
         not_on_gaussians: those that do not; the light that they keep off is in the colours already.
         shadow_bias: Gaussians nearer than this to a lit layer keep nothing off it, world units.
+        with_materials: whether some are surfaces of their materials, with the features of
+            :mod:`engine.light.kernels_material_layer`.
     """
 
     tracer: Tracer
@@ -40,6 +47,7 @@ class GaussianLayers:
     on_gaussians: Tracer | None = None
     not_on_gaussians: Tracer | None = None
     shadow_bias: float = 0.0
+    with_materials: bool = False
 
     def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
         """What lies on rays up to a distance each."""
@@ -71,14 +79,17 @@ def stage_layers(
         ConfigError: an entry without a file, and no scene is rendered.
         SceneFileError: a file cannot be read.
     """
-    parts, features, on_meshes, on_gaussians, biases = [], [], [], [], []
+    parts, features, surfaces, on_meshes, on_gaussians, biases = [], [], [], [], [], []
     for number, scene in enumerate(stage.gaussians):
         if scene.file is None and main is None:
             raise ConfigError(f"gaussians[{number}]: name a file; no scene is rendered here.")
         gaussians = main if scene.file is None else read(folder / scene.file)
         assert gaussians is not None
-        parts.append(moved(gaussians, scene))
-        features.append(np.tile(_features(scene), (len(gaussians), 1)))
+        placed = moved(gaussians, scene)
+        surface = scene.light == "relit" and has_materials(gaussians)
+        parts.append(_black(placed) if surface else placed)
+        features.append(_material_features(placed, scene) if surface else _features(placed, scene))
+        surfaces.append(surface)
         on_meshes.append(np.full(len(gaussians), scene.shadows_on_meshes))
         on_gaussians.append(np.full(len(gaussians), scene.shadows_on_gaussians))
         biases.append(BIAS_OF_SIZE * size if scene.shadow_bias is None else scene.shadow_bias)
@@ -86,7 +97,8 @@ def stage_layers(
         return None
     whole = concatenate(same_degree(parts))
     tracer = make_tracer(settings, threads=threads, build_quality=2)
-    tracer.build(whole, np.concatenate(features).astype(np.float32))
+    columns = COLUMNS if any(surfaces) else FEATURES
+    tracer.build(whole, np.ascontiguousarray(np.concatenate(features)[:, :columns]))
 
     def caster(chosen: Bool[np.ndarray, " n"]) -> Tracer | None:
         if chosen.all() or not chosen.any():
@@ -103,6 +115,7 @@ def stage_layers(
         caster(casting),
         caster(~casting),
         max(biases),
+        any(surfaces),
     )
 
 
@@ -128,10 +141,29 @@ def same_degree(parts: Sequence[FlatGaussians]) -> list[FlatGaussians]:
     ]
 
 
-def _features(scene: StageGaussians) -> Float32[np.ndarray, "3"]:
-    values = np.zeros(FEATURES, np.float32)
+def _features(gaussians: FlatGaussians, scene: StageGaussians) -> Float32[np.ndarray, "n f"]:
+    values = np.zeros((len(gaussians), COLUMNS), np.float32)
     if scene.light == "shadowed":
-        values[SHADOWED] = 1.0 - scene.ambient
+        values[:, SHADOWED] = 1.0 - scene.ambient
     elif scene.light == "relit":
-        values[RELIT], values[AMBIENT] = 1.0, scene.ambient
+        values[:, RELIT], values[:, AMBIENT] = 1.0, scene.ambient
     return values
+
+
+def _material_features(gaussians: FlatGaussians, scene: StageGaussians) -> Float32[np.ndarray, "n f"]:
+    values = np.zeros((len(gaussians), COLUMNS), np.float32)
+    values[:, MATERIAL] = 1.0
+    values[:, ALBEDO:LIFT] = stacked(gaussians.channels, tuple(MATERIAL_WIDTHS))
+    values[:, LIFT] = (
+        LIFT_OF_SCALE * np.sqrt(gaussians.scales.prod(axis=1))
+        if scene.shadow_bias is None
+        else scene.shadow_bias
+    )
+    return values
+
+
+def _black(gaussians: FlatGaussians) -> FlatGaussians:
+    """The same Gaussians without a colour of their own."""
+    sh = np.zeros((len(gaussians), 1, 3), np.float32)
+    sh[:, 0] = -1.0 / SH_C0
+    return replace(gaussians, sh=sh)

@@ -1,7 +1,7 @@
 """From a stage to the arrays that paths are traced through."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +68,10 @@ class LitMeshes:
             self.triangles.closest_query, self.triangles.any_query, self.obstacles.any_query,
             self.glass.closest_query, self.glass_faces,
         )  # fmt: skip
+
+    def lit_by(self, lights: LightArrays) -> "LitMeshes":
+        """The same meshes in other light, their environment unseen by the camera."""
+        return replace(self, lights=lights, environment_visible=False)
 
 
 def stage_meshes(

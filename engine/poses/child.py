@@ -15,6 +15,9 @@ from engine.errors import DatasetError
 from engine.events import Event
 from engine.poses.config import FOUND, Request
 
+_CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
+"""COLMAP would print where it was first, which can wait for ever for a lock that the crash left closed."""
+
 
 def main() -> NoReturn:
     """Search as asked and exit."""
@@ -34,6 +37,8 @@ def main() -> NoReturn:
     try:
         from engine.poses.search import Search
 
+        for number in _CRASHES:
+            signal.signal(number, signal.SIG_DFL)
         search = Search(request.images, request.names, request.work, request.config, request.threads, tell)
         search.run(request.work / FOUND)
         write({"kind": "done"})

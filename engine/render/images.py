@@ -6,6 +6,7 @@ its readers expect, linear light: ``exr_layers`` converts.
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -108,6 +109,16 @@ def write_exr(path: Path, channels: Mapping[str, Float32[np.ndarray, "h w"]], *,
     _write(path, spec, stacked)
 
 
+def write_rgbe(path: Path, rgb_linear: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write linear light as a Radiance picture, three bytes and a shared exponent a pixel, atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    height, width, channels = rgb_linear.shape
+    _write(path, oiio.ImageSpec(width, height, channels, oiio.FLOAT), rgb_linear.astype(np.float32))
+
+
 def read_image(path: Path) -> Float32[np.ndarray, "h w c"]:
     """An image with all its channels, as stored: 8- and 16-bit values scaled to [0, 1], floats unchanged.
 
@@ -142,7 +153,8 @@ def resized(image: Float32[np.ndarray, "h w c"], max_side_px: int) -> Float32[np
     return np.asarray(shrunk.get_pixels(oiio.FLOAT), dtype=np.float32).reshape(size[1], size[0], channels)
 
 
-def _write(path: Path, spec: "oiio.ImageSpec", pixels: np.ndarray) -> None:
+def _write(path: Path, spec: Any, pixels: np.ndarray) -> None:
+    # Not called by its type, an ImageSpec: the tests' type checker would keep that beyond OpenImageIO's end.
     spec.attribute(_AS_STORED, 1)
     try:
         with replacing(path) as temporary:

@@ -22,15 +22,18 @@ class KeptImages:
         identity: of everything that decides what the images show; those of another are never taken.
         resume: go on with what is there.
         or_anew: forget an unfinished series of another identity rather than refuse to go on.
+        record: name of the record, where several series share a folder.
 
     Raises:
         ConfigError: there is an unfinished series in the folder, and it is not to be gone on with, or is of
             another identity.
     """
 
-    def __init__(self, folder: Path, identity: str, *, resume: bool, or_anew: bool = False) -> None:
+    def __init__(
+        self, folder: Path, identity: str, *, resume: bool, or_anew: bool = False, record: str = RECORD
+    ) -> None:
         self.folder = folder
-        self.record = folder / RECORD
+        self.record = folder / record
         self._identity = identity
         self._digests = self._read(resume, or_anew)
 

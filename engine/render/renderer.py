@@ -1,5 +1,6 @@
 """Whole images from a tracer, a band of rows at a time."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ class RenderedImage:
         depth: expected distance along the ray, world units; 0 where nothing was met.
         depth_median: distance at which half of the light is gone, 0 where it never is.
         normal_world: mean normal, turned to the viewer and of unit length; 0 where nothing was met.
+        layers: what else the shading model shows, by name.
     """
 
     rgb_srgb: Float32[np.ndarray, "h w 3"]
@@ -32,6 +34,7 @@ class RenderedImage:
     depth: Float32[np.ndarray, "h w"]
     depth_median: Float32[np.ndarray, "h w"]
     normal_world: Float32[np.ndarray, "h w 3"]
+    layers: Mapping[str, Float32[np.ndarray, "h w _"]]
 
 
 def render_rays(
@@ -45,12 +48,14 @@ def render_rays(
     Where ``shading`` has features, ``tracer`` must have been built with them.
     """
     height, width = image.height_px, image.width_px
+    layers: dict[str, Float32[np.ndarray, "h w _"]] = {}
     out = RenderedImage(
         np.empty((height, width, 3), np.float32),
         np.empty((height, width), np.float32),
         np.empty((height, width), np.float32),
         np.empty((height, width), np.float32),
         np.empty((height, width, 3), np.float32),
+        layers,
     )
     rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
     for top in range(0, height, rows):
@@ -58,7 +63,10 @@ def render_rays(
         order = tile_order(min(rows, height - top), width)
         rays = image.rays[top * width + order]
         seen = tracer.trace(rays)
-        rgb = shading.develop(Sight(rays, seen, tracer)).over(background)
+        developed = shading.develop(Sight(rays, seen, tracer))
+        rgb = developed.over(background)
+        for name, values in developed.layers.items():
+            layers.setdefault(name, np.empty((height, width, values.shape[1]), np.float32))
         length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
         for part, values in (
             (out.rgb_srgb, np.clip(rgb, 0, 1)),
@@ -66,6 +74,7 @@ def render_rays(
             (out.depth, seen.expected_depth),
             (out.depth_median, seen.depth_median),
             (out.normal_world, seen.normal_world / np.maximum(length, 1e-12)),
+            *((layers[name], values) for name, values in developed.layers.items()),
         ):
             part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
     return out

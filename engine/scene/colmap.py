@@ -231,8 +231,6 @@ def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> Sp
         warnings.append(
             f"{int((~finite).sum())} points of the model in {folder} are not finite and left out."
         )
-    if not finite.any():
-        warnings.append(f"The model in {folder} has no 3D points; the start will be random.")
     return SparsePoints(xyz[finite], rgb[finite], tracks[finite], errors[finite])
 
 

@@ -22,7 +22,7 @@ from engine.scene.directions import (
 )
 from engine.scene.load import load_scene
 from engine.scene.model import SceneModel, SparsePoints, View
-from engine.scene.split import split_views
+from engine.scene.split import measured_views, split_views
 from engine.scene.views_file import ViewsRecord, views_record
 
 MaskUse = Literal["ignore", "alpha"]
@@ -46,7 +46,8 @@ class Dataset:
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
         extent: radius of the training cameras, see :func:`engine.scene.model.scene_extent`.
-        near_world: distance from the cameras at which anything is seen.
+        near_world: distance from the cameras at which anything is seen; where it is given, all views are
+            held out.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Dataset:
         held_out: Sequence[str] | None = None,
         masks: MaskUse = "ignore",
         near: float = 0.0,
+        near_world: float | None = None,
     ) -> None:
         self.root: Path = scene.root
         self.views: tuple[View, ...] = scene.views
@@ -67,8 +69,9 @@ class Dataset:
         self.warnings: list[str] = [*scene.warnings, *cache.warnings]
         self.train_indices: Int64[np.ndarray, " train"]
         self.test_indices: Int64[np.ndarray, " test"]
-        self.train_indices, self.test_indices = split_views(
-            [view.name for view in scene.views], test_every, held_out
+        names = [view.name for view in scene.views]
+        self.train_indices, self.test_indices = (
+            split_views(names, test_every, held_out) if near_world is None else measured_views(names)
         )
         self.record: ViewsRecord = views_record(scene, cache.digests, self.test_indices)
         self.has_masks: bool = len(cache.mask.values) > 0
@@ -100,7 +103,7 @@ class Dataset:
                 "images; these pixels do not count."
             )
         self.extent: float = self.record.extent_world
-        self.near_world: float = near * self.extent
+        self.near_world: float = near * self.extent if near_world is None else near_world
         self._train_pixels: Int64[np.ndarray, " train"] = np.cumsum(
             self._sizes[self.train_indices].prod(axis=1)
         )
@@ -146,11 +149,7 @@ class Dataset:
             ConfigError: a setting is out of range.
         """
         scene = load_scene(root, max_side=max_side, model_folder=model_folder)
-        if masks == "alpha" and all(view.mask_path is None for view in scene.views):
-            raise DatasetError(
-                f"Masks are to be the alpha, but {root / 'masks'} holds none of any photograph; put them "
-                f"there (as {scene.views[0].name}.png) or leave --masks alpha out."
-            )
+        _require_masks(scene, root, masks)
         # Complain before the long work.
         _, test_indices = split_views([view.name for view in scene.views], test_every, held_out)
         digests = None
@@ -160,6 +159,39 @@ class Dataset:
         cache = open_pixel_cache(scene, cache_dir, digests, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, max_table_bytes)
         return cls(scene, cache, tables, test_every=test_every, held_out=held_out, masks=masks, near=near)
+
+    @classmethod
+    def open_measured(
+        cls,
+        root: Path,
+        cache_dir: Path,
+        *,
+        near_world: float,
+        max_side: int | None = None,
+        masks: MaskUse = "ignore",
+        threads: int = 0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> "Dataset":
+        """Photographs to measure a scene by that was trained on others: all are held out, one is enough.
+
+        Args:
+            root: as in :meth:`open`; the model needs no points.
+            cache_dir: folder of the cache.
+            near_world: distance at which anything is seen, that of the scene.
+            max_side: cap on the longer side of the photographs, in pixels.
+            masks: as in :meth:`open`.
+            threads: decoding threads; 0 takes one a processor.
+            progress: told (photographs done, photographs in all) while decoding.
+
+        Raises:
+            DatasetError: something is missing, damaged or does not fit together.
+            OutputError: the cache cannot be written.
+        """
+        scene = load_scene(root, max_side=max_side, least_views=1, for_training=False)
+        _require_masks(scene, root, masks)
+        cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)
+        tables = open_ray_tables(scene.cameras, cache_dir, MAX_TABLE_BYTES)
+        return cls(scene, cache, tables, masks=masks, near_world=near_world)
 
     @property
     def train_pixel_count(self) -> int:
@@ -287,6 +319,14 @@ class Dataset:
             known = np.isfinite(found).all(axis=1)
             rotations = self._rotations_world_from_cam[view[chosen[known]]]
             directions[chosen[known]] = np.einsum("nij,nj->ni", rotations, found[known])
+
+
+def _require_masks(scene: SceneModel, root: Path, masks: MaskUse) -> None:
+    if masks == "alpha" and all(view.mask_path is None for view in scene.views):
+        raise DatasetError(
+            f"Masks are to be the alpha, but {root / 'masks'} holds none of any photograph; put them "
+            f"there (as {scene.views[0].name}.png) or leave --masks alpha out."
+        )
 
 
 def _int64(values: Int[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:

@@ -35,7 +35,14 @@ _IMAGE_SUFFIXES = frozenset(
 )
 
 
-def load_scene(root: Path, *, max_side: int | None = None, model_folder: Path | None = None) -> SceneModel:
+def load_scene(
+    root: Path,
+    *,
+    max_side: int | None = None,
+    model_folder: Path | None = None,
+    least_views: int = MIN_VIEWS,
+    for_training: bool = True,
+) -> SceneModel:
     """Read the model of a scene and the headers of its photographs, but no pixels.
 
     Args:
@@ -44,6 +51,8 @@ def load_scene(root: Path, *, max_side: int | None = None, model_folder: Path | 
         max_side: cap on the longer side of the photographs, in pixels.
         model_folder: of a model that was found for the photographs, see :mod:`engine.poses`; ``root`` may
             then be a bare folder of photographs.
+        least_views: so many photographs must be posed.
+        for_training: warn of what matters to training only.
 
     Raises:
         DatasetError: something is missing, damaged or does not fit together.
@@ -61,12 +70,14 @@ def load_scene(root: Path, *, max_side: int | None = None, model_folder: Path | 
             )
         raise DatasetError(f"{root} has no folder images; put the photographs into {root / 'images'}.")
     model = read_colmap_model(root, model_folder)
-    if len(model.images) < MIN_VIEWS:
+    if len(model.images) < least_views:
         raise DatasetError(
             f"The model in {model.folder} has {len(model.images)} posed images; "
-            f"at least {MIN_VIEWS} are needed."
+            f"at least {least_views} {'is' if least_views == 1 else 'are'} needed."
         )
     warnings = list(model.warnings)
+    if for_training and len(model.points) == 0:
+        warnings.append(f"The model in {model.folder} has no 3D points; the start will be random.")
     paths = _image_paths(photograph_folder(root), model, warnings, tell_unposed=model_folder is None)
     masks = _mask_paths(root, [image.name for image in model.images], warnings)
     if model_folder is None:

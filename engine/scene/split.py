@@ -42,6 +42,13 @@ def split_views(
     return np.flatnonzero(~is_test).astype(np.int64), np.flatnonzero(is_test).astype(np.int64)
 
 
+def measured_views(
+    names: Sequence[str],
+) -> tuple[Int64[np.ndarray, " train"], Int64[np.ndarray, " test"]]:
+    """The split of photographs that are only measured: none to train on, all held out."""
+    return np.zeros(0, np.int64), np.arange(len(names), dtype=np.int64)
+
+
 def write_held_out(path: Path, names: Sequence[str]) -> None:
     """Write the names of the held-out views to ``path`` as a JSON list, atomically."""
     write_json(path, list(names))

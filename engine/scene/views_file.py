@@ -154,10 +154,10 @@ def views_record(
     Args:
         scene: the scene.
         digests: of the files of its views, in their order.
-        test_indices: views that are held out.
+        test_indices: views that are held out; where all are, they give the extent.
     """
     held_out = set(test_indices.tolist())
-    train = [index for index in range(len(scene.views)) if index not in held_out]
+    train = [index for index in range(len(scene.views)) if index not in held_out] or sorted(held_out)
     return ViewsRecord(
         extent_world=_extent(scene, np.array(train)),
         points_sha256=_points_digest(scene.points),

@@ -14,7 +14,7 @@ from jaxtyping import Float32, Int64
 from engine.gaussians.model import FlatGaussians
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
-from engine.trace.protocol import GaussianGradients
+from engine.trace.protocol import GaussianGradients, Tracer
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 _STATE = ("log_gains", "offsets", "first", "second", "steps")
@@ -37,6 +37,7 @@ class Exposures:
         offsets: of each view, display values.
         first: first moments of Adam, gains before offsets; ``second`` holds the second ones.
         steps: each view's steps.
+        inner: the model whose colours are exposed.
     """
 
     name = "exposure"
@@ -49,15 +50,19 @@ class Exposures:
         self.steps: Int64[np.ndarray, " v"] = np.zeros(views, np.int64)
         self._rate = rate
         self._decay = decay
-        self._inner = inner
+        self.inner = inner
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
         """Those of the model inside."""
-        return self._inner.features(gaussians)
+        return self.inner.features(gaussians)
+
+    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+        """The model inside looks around."""
+        self.inner.settle(gaussians, tracer, progress=progress)
 
     def develop(self, sight: Sight) -> Developed:
         """Colours as the rays' views show them; exposures say nothing about other views."""
-        inner = self._inner.develop(sight)
+        inner = self.inner.develop(sight)
         if sight.view is None:
             return inner
         gains, offsets = np.exp(self.log_gains)[sight.view], self.offsets[sight.view]
@@ -80,7 +85,7 @@ class Exposures:
         terms = np.concatenate([by_rgb * gains * inner.rgb_srgb, by_rgb * alpha[:, None]], axis=1)
         sums = np.stack([np.bincount(place, terms[:, c], len(used)) for c in range(6)], axis=1)
         by_alpha = (by_rgb * self.offsets[view]).sum(axis=1)
-        below = self._inner.reverse(sight, inner, by_rgb * gains, by_transmittance - by_alpha)
+        below = self.inner.reverse(sight, inner, by_rgb * gains, by_transmittance - by_alpha)
         own = {"exposure.views": used, "exposure.sums": sums}
         return Reversed(below.seen, below.further, {**below.parameters, **own})
 
@@ -93,7 +98,7 @@ class Exposures:
         progress: float,
     ) -> None:
         """One step of Adam for the views of the batch, then the mean over all views so far is taken out."""
-        self._inner.step(gaussians, gradients, parameters, progress=progress)
+        self.inner.step(gaussians, gradients, parameters, progress=progress)
         used, sums = parameters["exposure.views"], parameters["exposure.sums"]
         self.steps[used] += 1
         steps = self.steps[used, None]
@@ -110,10 +115,10 @@ class Exposures:
 
     def state(self) -> dict[str, np.ndarray]:
         """Gains, offsets and moments, and what the model inside keeps."""
-        return {**self._inner.state(), **{f"exposure.{name}": getattr(self, name) for name in _STATE}}
+        return {**self.inner.state(), **{f"exposure.{name}": getattr(self, name) for name in _STATE}}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Take them back."""
-        self._inner.restore(state)
+        self.inner.restore(state)
         for name in _STATE:
             setattr(self, name, state[f"exposure.{name}"])

@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from engine.gaussians.model import FlatGaussians
 from engine.shading.protocol import Developed, Reversed, Sight
-from engine.trace.protocol import GaussianGradients, TraceGradients
+from engine.trace.protocol import GaussianGradients, TraceGradients, Tracer
 
 
 class Plain:
@@ -17,6 +17,9 @@ class Plain:
 
     def features(self, gaussians: FlatGaussians) -> None:
         """No features."""
+
+    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+        """Nothing to see."""
 
     def develop(self, sight: Sight) -> Developed:
         """What was seen."""

@@ -46,11 +46,14 @@ class Developed:
         rgb_srgb: display colour, premultiplied by 1 - ``transmittance``.
         transmittance: share of the background that shines through; 0 where a model brings its own.
         kept: whatever the model needs to :meth:`ShadingModel.reverse` this.
+        layers: what else can be looked at, by name, a row a ray, 0 where there is nothing; only for views
+            that were not trained on.
     """
 
     rgb_srgb: Float32[np.ndarray, "r 3"]
     transmittance: Float32[np.ndarray, " r"]
     kept: object = None
+    layers: Mapping[str, Float32[np.ndarray, "r _"]] = field(default_factory=dict)
 
     def over(self, background_srgb: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "r 3"]:
         """Display colours in front of a background."""
@@ -87,6 +90,14 @@ class ShadingModel(Protocol):
         """What the tracer has to blend of each Gaussian beside its colour, e.g. its material; None: nothing.
 
         The array stays the same one until the next call: :meth:`step` may change its values.
+        """
+        ...
+
+    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+        """Look around in the scene of which ``tracer`` has just built the hierarchy.
+
+        Channels of the Gaussians, and the features, may be changed: to what follows from their geometry and
+        ``progress`` alone, so that a training that goes on finds the same.
         """
         ...
 

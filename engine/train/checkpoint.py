@@ -17,7 +17,7 @@ from engine.train.optimiser import Adam
 from engine.train.state import TrainState
 from engine.writing import replacing
 
-FORMAT = 2
+FORMAT = 3
 KEEP = 2
 _PREFIX = "iteration_"
 _GROUPS = ("gaussians", "adam", "densifier", "shading")

@@ -10,7 +10,9 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from engine.errors import ConfigError
+from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from engine.gaussians.octagon import CHI2_3_99
+from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import TraceSettings
 
 PresetName = Literal["fast", "standard", "paper"]
@@ -37,7 +39,14 @@ class LearningRates(_Frozen):
     colour: float = Field(1e-2, ge=0, description="of the display colour; harmonics get it over C0")
     sh_rest_ratio: float = Field(0.05, ge=0, description="of the constant harmonic's step")
     exposure: float = Field(2e-3, ge=0, description="of the views' log gains and offsets, where learnt")
+    albedo: float = Field(0.03, ge=0, description="of the logit, as for the two below")
+    metallic: float = Field(0.03, ge=0)
+    roughness: float = Field(0.03, ge=0)
     decay: float = Field(0.1, gt=0, le=1)
+
+    def of_channel(self, name: str) -> float:
+        """The rate of a named channel; 0 where it is not trained."""
+        return {ALBEDO: self.albedo, METALLIC: self.metallic, ROUGHNESS: self.roughness}.get(name, 0.0)
 
 
 class LossWeights(_Frozen):
@@ -64,6 +73,9 @@ class McmcConfig(_Frozen):
     interval: int = Field(100, ge=1)
     growth: float = Field(0.2, ge=0, description="fraction added at each interval")
     dead_opacity: float = Field(0.012, gt=0, lt=1)
+    copies: Literal["opacity", "area"] = Field(
+        "opacity", description="what a Gaussian and its copies share: area suits opaque surfaces"
+    )
     error_power: float = Field(
         0.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it"
     )
@@ -134,6 +146,7 @@ class TrainConfig(_Frozen):
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
     trace: TraceSettings = TraceSettings()
+    materials: MaterialSettings = MaterialSettings()
     near: float = Field(0.01, ge=0, description="nearest distance at which a Gaussian is seen, of the extent")
     densify: McmcConfig | PaperConfig = Field(McmcConfig(), discriminator="kind")
     rebuild_every: int = Field(
@@ -185,6 +198,25 @@ def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
     A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
     """
     return config.rebuild_every * (1 + gaussians // 500_000)
+
+
+def with_materials(config: TrainConfig) -> TrainConfig:
+    """A configuration for shiny things: materials are learnt, and geometry keeps still enough for mirrors.
+
+    Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
+    show reflections lie behind the surface, so there are none.
+    """
+    rates = {"quat": 0.004, "mean": 0.03, "mean_final": 1e-3, "log_scale": 0.01, "opacity": 0.05}
+    return config.model_copy(
+        update={
+            "materials": config.materials.model_copy(update={"learn": True}),
+            "rates": config.rates.model_copy(update=rates),
+            "lift_pixels": False,
+            "densify": McmcConfig(copies="area", stop_fraction=0.4),
+            "initial_opacity": 0.8,
+            "max_gaussians_auto": min(config.max_gaussians_auto, 60_000),
+        }
+    )
 
 
 def preset(name: str) -> TrainConfig:

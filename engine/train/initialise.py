@@ -11,8 +11,10 @@ from scipy.spatial import cKDTree
 
 from engine.errors import DatasetError
 from engine.gaussians.frames import frames_from_normals, quaternions
+from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
 from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.scene import Dataset
+from engine.shading.material_settings import MaterialSettings
 from engine.train.config import TrainConfig, most_gaussians
 from engine.train.dense_points import dense_points
 
@@ -57,6 +59,15 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1
         extent=dataset.extent,
         opacity=config.initial_opacity,
         rng=rng,
+    )
+
+
+def with_first_materials(gaussians: FlatGaussians, settings: MaterialSettings) -> FlatGaussians:
+    """The same Gaussians with the materials that a training begins with, all alike."""
+    values = (settings.first_albedo,) * 3, (settings.first_metallic,), (settings.first_roughness,)
+    first = dict(zip(MATERIAL_WIDTHS, values, strict=True)) | {AMBIENT: (1.0,)}
+    return gaussians.with_channels(
+        {name: np.tile(np.array(value, np.float32), (len(gaussians), 1)) for name, value in first.items()}
     )
 
 

@@ -5,6 +5,9 @@ import math
 import numpy as np
 from numba import njit, prange
 
+LEAST_SHARE = 1e-3
+"""Numbers between 0 and 1 stay this far from both, so that they can come back."""
+
 
 @njit
 def _update(
@@ -82,3 +85,24 @@ def adam_step(
                     first, second, i, column, rate, c1, c2, beta1, beta2, epsilon,
                 )  # fmt: skip
                 column += 1
+
+
+@njit(cache=True, parallel=True)
+def adam_shares(ids, steps, first, second, column, values, g_values, rate, beta1, beta2, epsilon):
+    """One step for numbers in (0, 1) of the Gaussians ``ids``, taken by their logits.
+
+    Their moments begin at ``column``; ``steps`` were counted already. A ``rate`` of 0 changes nothing.
+    """
+    for k in prange(len(ids)):
+        i = ids[k]
+        c1 = 1.0 / (1.0 - beta1 ** steps[i])
+        c2 = 1.0 / (1.0 - beta2 ** steps[i])
+        for place in range(values.shape[1]):
+            value = min(max(np.float64(values[i, place]), LEAST_SHARE), 1.0 - LEAST_SHARE)
+            gradient = np.float64(g_values[k, place]) * value * (1.0 - value)
+            logit = _update(
+                math.log(value / (1.0 - value)), gradient,
+                first, second, i, column + place, rate, c1, c2, beta1, beta2, epsilon,
+            )  # fmt: skip
+            value = 1.0 / (1.0 + math.exp(-logit))
+            values[i, place] = min(max(value, LEAST_SHARE), 1.0 - LEAST_SHARE)

@@ -3,7 +3,7 @@
 After "Adam: A Method for Stochastic Optimization" (https://arxiv.org/abs/1412.6980).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -12,7 +12,7 @@ from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.gaussians.rows import join_rows, row_arrays, select_rows
 from engine.trace.protocol import GaussianGradients
 from engine.train.config import LearningRates, LossWeights
-from engine.train.kernels_adam import adam_step
+from engine.train.kernels_adam import adam_shares, adam_step
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 _GEOMETRY_COLUMNS = 3 + 4 + 2 + 1
@@ -23,21 +23,26 @@ class Adam:
     """First and second moments of every parameter, one row a Gaussian, and each Gaussian's step count.
 
     Columns: mean 3, quaternion 4, log scales 2, opacity 1, then the harmonics. A Gaussian that no ray of
-    the batch hits is left alone: neither its moments nor its parameters change. Named channels have no
-    columns: nothing here trains them.
+    the batch hits is left alone: neither its moments nor its parameters change. Named channels have columns
+    of their own; those are trained for which there is a rate, and only where they are what was traced.
     """
 
     first: Float32[np.ndarray, "n p"]
     second: Float32[np.ndarray, "n p"]
+    channel_first: Float32[np.ndarray, "n c"]
+    channel_second: Float32[np.ndarray, "n c"]
     steps: Int32[np.ndarray, " n"]
 
     @classmethod
     def fresh(cls, gaussians: FlatGaussians) -> "Adam":
         """Zero moments for ``gaussians``."""
         count, columns = len(gaussians), _GEOMETRY_COLUMNS + 3 * gaussians.sh.shape[1]
+        named = sum(gaussians.channels.widths.values())
         return cls(
             np.zeros((count, columns), np.float32),
             np.zeros((count, columns), np.float32),
+            np.zeros((count, named), np.float32),
+            np.zeros((count, named), np.float32),
             np.zeros(count, np.int32),
         )
 
@@ -58,7 +63,7 @@ class Adam:
         """Room for ``basis_count`` harmonics; the new ones start with zero moments."""
         extra = _GEOMETRY_COLUMNS + 3 * basis_count - self.first.shape[1]
         pad = ((0, 0), (0, extra))
-        return Adam(np.pad(self.first, pad), np.pad(self.second, pad), self.steps)
+        return replace(self, first=np.pad(self.first, pad), second=np.pad(self.second, pad))
 
     def step(
         self,
@@ -74,7 +79,8 @@ class Adam:
 
         Args:
             gaussians: parameters.
-            gradients: of the Gaussians that were hit.
+            gradients: of the Gaussians that were hit; their features' are those of the channels side by side
+                where the channels are trained.
             rates: learning rates.
             loss: weights of the regularisers on those Gaussians.
             progress: 0 at the first iteration, 1 at the last.
@@ -101,4 +107,20 @@ class Adam:
             float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
             BETA1, BETA2, EPSILON, moved,
         )  # fmt: skip
+        self._step_channels(gaussians, gradients, rates, decay)
         return moved
+
+    def _step_channels(
+        self, gaussians: FlatGaussians, gradients: GaussianGradients, rates: LearningRates, decay: float
+    ) -> None:
+        column = 0
+        if gradients.features.shape[1] < self.channel_first.shape[1]:
+            return  # the shading model traces something else
+        for name, values in gaussians.channels.items():
+            rate, width = rates.of_channel(name), values.shape[1]
+            if rate > 0:
+                adam_shares(
+                    gradients.ids, self.steps, self.channel_first, self.channel_second, column, values,
+                    gradients.features[:, column : column + width], rate * decay, BETA1, BETA2, EPSILON,
+                )  # fmt: skip
+            column += width

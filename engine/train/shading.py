@@ -1,13 +1,29 @@
 """The shading model that a configuration asks for."""
 
+from engine.shading.deferred import Deferred
 from engine.shading.exposure import Exposures
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import ShadingModel
 from engine.train.config import TrainConfig
 
 
-def make_shading(config: TrainConfig, views: int) -> ShadingModel:
-    """The model, untrained, for a dataset of so many views."""
+def make_shading(config: TrainConfig, views: int, extent_world: float) -> ShadingModel:
+    """The model, untrained, for a dataset of so many views and that extent."""
+    inner: ShadingModel = PLAIN
+    if config.materials.learn:
+        inner = make_deferred(config, extent_world)
     if config.exposure:
-        return Exposures(views, rate=config.rates.exposure, decay=config.rates.decay)
-    return PLAIN
+        return Exposures(views, rate=config.rates.exposure, decay=config.rates.decay, inner=inner)
+    return inner
+
+
+def make_deferred(config: TrainConfig, extent_world: float) -> Deferred:
+    """The model of materials, with an environment of which nothing is known yet."""
+    return Deferred(config.materials, extent_world=extent_world, window_rays=config.window_rays)
+
+
+def deferred_of(shading: ShadingModel) -> Deferred | None:
+    """The model of materials that a shading model is, or has inside."""
+    if isinstance(shading, Exposures):
+        return deferred_of(shading.inner)
+    return shading if isinstance(shading, Deferred) else None

@@ -14,6 +14,7 @@ from engine.train.batches import BatchSource, TrainingData
 from engine.train.checkpoint import save_checkpoint
 from engine.train.config import TrainConfig, most_gaussians
 from engine.train.densify import make_densifier
+from engine.train.densify.propagating import Propagating
 from engine.train.iteration import Differentiated, Machinery, iterate
 from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
@@ -78,7 +79,9 @@ class Trainer:
             iterations=self.schedule.iterations,
             max_gaussians=most_gaussians(config, pixels),
         )
-        self.shading = shading or make_shading(config, len(dataset.views))
+        if config.materials.learn and config.materials.propagation:
+            densifier = Propagating(densifier, config.materials, iterations=self.schedule.iterations)
+        self.shading = shading or make_shading(config, len(dataset.views), dataset.extent)
         if state.densifier:
             densifier.restore(state.densifier)
         if state.shading:
@@ -118,8 +121,10 @@ class Trainer:
                     self._onlooker(state.iteration, machinery.tracer)
 
     def _build(self) -> None:
-        gaussians = self.state.gaussians
-        self._machinery.tracer.build(gaussians, self._machinery.shading.features(gaussians))
+        gaussians, machinery = self.state.gaussians, self._machinery
+        machinery.tracer.build(gaussians, machinery.shading.features(gaussians))
+        progress = self.schedule.progress(self.state.iteration)
+        machinery.shading.settle(gaussians, machinery.tracer, progress=progress)
 
     def _pause(self, watch: Stopwatch, *, resumed: bool) -> None:
         """Measure and keep the state where that is due, and stop if asked to.

@@ -19,17 +19,24 @@ from worker_bench import ROOT, Bench, alive, child_pids
 
 from benchmarks.chaos import journal_faults
 from benchmarks.chaos_kind import ChainOptions, undisturbed
+from workers.settings import WorkerSettings
 from workers.store.opening import open_storage
 
 pytestmark = pytest.mark.heavy
 
-TAKEN_OVER_SECONDS = 25.0
-OPTIONS = ChainOptions(seed=1, steps=450, seconds=0.1)
+OF_THE_DEFAULTS = 0.4
+"""Share of the times that users get, all of them alike."""
+TIMES = {
+    f"{name}_seconds": OF_THE_DEFAULTS * WorkerSettings.model_fields[f"{name}_seconds"].default
+    for name in ("heartbeat", "stale", "rescue", "poll")
+}
+TAKEN_OVER_SECONDS = TIMES["stale_seconds"] + 5.0
+STEPS = 40
 PHOTOGRAPHS = {"images/a.png": b"not looked at by this kind", "images/b.png": b"x" * 100_000}
 
 
 class Hosts:
-    """Two hosts with the settings that users get."""
+    """Two hosts, at :data:`TIMES`."""
 
     def __init__(self, bench: Bench, found: list[Host], database: str, store: str) -> None:
         self.bench = bench
@@ -46,6 +53,7 @@ class Hosts:
             "OCTASPLAT_DATA": str(folder),
             "OCTASPLAT_STORAGE": self.store,
             "OCTASPLAT_FLOOR_BYTES": "0",
+            **{f"OCTASPLAT_{name.upper()}": str(seconds) for name, seconds in TIMES.items()},
             "OCTASPLAT_KIND_MODULES": '["benchmarks.chaos_kind"]',
             "PYTHONPATH": str(ROOT),
         }
@@ -107,8 +115,9 @@ def dataset(two: Hosts, store: str) -> uuid.UUID:
 def test_second_host_takes_over(two: Hosts, how: str) -> None:
     bench, store = two.bench, two.store
     first = two.worker(0)
-    job_id = bench.submit("chain", dataset_id=dataset(two, store), options=OPTIONS.model_dump())
-    kept = bench.wait(job_id, lambda job: (job.checkpoint or {}).get("step", 0) >= 20, 90).checkpoint
+    options = ChainOptions(seed=1, steps=STEPS, seconds=0.05, gate=str(bench.gate))
+    job_id = bench.submit("chain", dataset_id=dataset(two, store), options=options.model_dump())
+    kept = bench.wait(job_id, lambda job: (job.checkpoint or {}).get("step", 0) >= STEPS // 2, 90).checkpoint
     assert kept is not None
     (child,) = child_pids(first)
     second = two.worker(1)
@@ -127,6 +136,7 @@ def test_second_host_takes_over(two: Hosts, how: str) -> None:
     bench.wait(job_id, lambda _: any(e.kind == "resumed" for e in bench.events(job_id)), 20)
     if how == "cut off":
         two.found[0].plug_in()
+    bench.open_gate()
     job = bench.over(job_id, 120)
     assert (job.state, job.attempt, job.rescues, job.worker) == ("succeeded", 2, 0, "host1")
     events = [
@@ -140,5 +150,5 @@ def test_second_host_takes_over(two: Hosts, how: str) -> None:
         ((name, sha256),) = connection.execute(
             "SELECT name, sha256 FROM artifacts WHERE job_id = %s", [job_id]
         ).fetchall()
-    assert (name, b"".join(storage.read(sha256))) == ("chain.bin", undisturbed(PHOTOGRAPHS, OPTIONS))
+    assert (name, b"".join(storage.read(sha256))) == ("chain.bin", undisturbed(PHOTOGRAPHS, options))
     print(f"taken over {seconds:.1f} s after the first was {how}")  # noqa: T201 - shown on request

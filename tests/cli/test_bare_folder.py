@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from neighbouring_photographs import write_neighbours
 
 from engine.render.images import write_png
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 pytestmark = pytest.mark.heavy
 
@@ -17,13 +17,8 @@ pytestmark = pytest.mark.heavy
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Seven photographs of one thing, neighbours on a ring, and one of noise."""
-    root = tmp_path_factory.mktemp("bare")
-    config = GeneratedSceneConfig(views=40, width_px=480, height_px=360, samples_per_side=1, points=300)
-    write_generated_scene(root / "scene", config)
-    folder = root / "photographs"
-    folder.mkdir()
-    for path in sorted((root / "scene" / "images").iterdir())[:7]:
-        (folder / path.name).hardlink_to(path)
+    folder = tmp_path_factory.mktemp("bare") / "photographs"
+    write_neighbours(folder, 7)
     noise = np.random.default_rng(5).random((360, 480, 3)).astype(np.float32)
     write_png(folder / "zz_noise.png", noise)
     return folder

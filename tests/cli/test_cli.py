@@ -103,7 +103,7 @@ def test_unknown_preset_is_a_usage_error(octasplat, scene, tmp_path):
 
 
 def test_unexpected_errors_are_one_line_too(octasplat, run, monkeypatch):
-    monkeypatch.setattr("engine.pipeline.evaluate", _broken)
+    monkeypatch.setattr("engine.evaluate.runs.evaluate", _broken)
     monkeypatch.delenv("OCTASPLAT_DEBUG", raising=False)
     line = one_error_line(octasplat("evaluate", run.output), code=70)
     assert "ZeroDivisionError" in line and "OCTASPLAT_DEBUG=1" in line
@@ -114,13 +114,15 @@ def test_unexpected_errors_are_one_line_too(octasplat, run, monkeypatch):
 
 
 def test_interrupted_commands_end_with_130(octasplat, run, monkeypatch):
-    monkeypatch.setattr("engine.pipeline.evaluate", _interrupted)
+    monkeypatch.setattr("engine.evaluate.runs.evaluate", _interrupted)
     one_error_line(octasplat("evaluate", run.output), code=130)
 
 
 def test_threads_are_capped_at_the_cores(octasplat, run, monkeypatch):
     asked = []
-    monkeypatch.setattr("engine.pipeline.evaluate", lambda *_, **options: asked.append(options["threads"]))
+    monkeypatch.setattr(
+        "engine.evaluate.runs.evaluate", lambda *_, **options: asked.append(options["threads"])
+    )
     assert octasplat("evaluate", run.output, "--threads", "100000").exit_code == 0
     assert octasplat("evaluate", run.output, "--threads", "1").exit_code == 0
     assert asked == [available_threads(), 1]

@@ -107,6 +107,47 @@ def test_only_what_moved_is_changed(make_scene: Make, exported) -> None:
     np.testing.assert_allclose(result.sh, g.sh, atol=2e-4)
 
 
+def test_octagons_cut_by_a_selection_are_told_and_snapped(make_scene: Make, exported) -> None:
+    g = make_scene(400)
+    mesh = exported(g)
+    old = mesh.vertices.reshape(-1, SIDES, 3)
+    inside = old[:, :, 0] > 0  # what a box in the editor takes, corner by corner
+    cut = inside.any(axis=1) & ~inside.all(axis=1)
+    assert cut.sum() > 5
+    lifted = old + np.where(inside[:, :, None], [0.0, 3.0, 0.0], 0.0)
+    edited = moved(mesh, lambda _: lifted.reshape(-1, 3))
+    _, report = recover(g, edited)
+    assert report.partial == cut.sum() and report.snapped == 0
+    result, report = recover(g, edited, whole_octagons=True)
+    assert report.partial == report.snapped == cut.sum() and report.crumpled == 0
+    # Everything is where it was or three units up, in its own shape.
+    gids = mesh.gid.astype(int).reshape(-1, SIDES)[:, 0]
+    up = np.zeros(len(g), bool)
+    up[gids] = 2 * inside.sum(axis=1) >= SIDES
+    np.testing.assert_allclose(
+        result.means_world, g.means_world + np.where(up[:, None], [0, 3, 0], 0), atol=2e-6
+    )
+    assert covariance_errors(result, covariances(g)).max() < 1e-3
+    assert_same(result.select(~up), g.select(~up))
+
+
+def test_a_part_that_was_turned_as_a_whole_is_neither_mirrored_nor_flipped(
+    make_scene: Make, exported
+) -> None:
+    g = make_scene(600)
+    mesh = exported(g)
+    middle = np.array([0.5, 0.0, 0.0])
+    for seed in range(4):
+        turn = random_turn(seed)
+        chosen = np.linalg.norm(g.means_world - middle, axis=1) < 0.6
+        assert 10 < chosen.sum() < 500
+        mine = chosen[mesh.gid.astype(int)][:, None]
+        turned = (mesh.vertices - middle) @ turn.T + middle + [0, 2, 0]
+        edited = replace(mesh, vertices=np.where(mine, turned, mesh.vertices))
+        _, report = recover(g, edited, axes="x0")
+        assert (report.mirrored, report.flipped, report.crumpled) == (0, 0, 0), seed
+
+
 def test_rotation_and_uniform_scale(make_scene: Make, exported) -> None:
     g = make_scene(300)
     turn, shift = random_turn(3), np.array([0.4, -1.0, 2.0])

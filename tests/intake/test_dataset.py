@@ -274,30 +274,20 @@ def damaged_models(draw: st.DrawFn) -> dict[str, bytes]:
     return files
 
 
-def assert_told(storage: LocalStorage, files: dict[str, bytes]) -> None:
-    model = [TreeFile(path=f.path, sha256=f.sha256, size_bytes=f.size_bytes) for f in stored(storage, files)]
+@pytest.mark.heavy
+@settings(
+    deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], database=None, max_examples=40
+)
+@given(files=damaged_models())
+def test_damaged_models_are_told(local_storage: LocalStorage, files: dict[str, bytes]) -> None:
+    found = stored(local_storage, files)
+    model = [TreeFile(path=f.path, sha256=f.sha256, size_bytes=f.size_bytes) for f in found]
     sizes = {f"v{i}.png": (32, 24) for i in range(4)}
-    answer = check_model(storage, model, sizes, ModelLimits(seconds=20))
+    answer = check_model(local_storage, model, sizes, ModelLimits(seconds=20))
     if answer.faults:
         assert all(fault.code and fault.detail.endswith(".") for fault in answer.faults)
     else:
         assert answer.views >= 3
-
-
-FUZZ = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], database=None)
-
-
-@settings(FUZZ, max_examples=12)
-@given(files=damaged_models())
-def test_damaged_models_are_told(local_storage: LocalStorage, files: dict[str, bytes]) -> None:
-    assert_told(local_storage, files)
-
-
-@pytest.mark.heavy
-@settings(FUZZ, max_examples=100)
-@given(files=damaged_models())
-def test_many_damaged_models_are_told(local_storage: LocalStorage, files: dict[str, bytes]) -> None:
-    assert_told(local_storage, files)
 
 
 @pytest.mark.real

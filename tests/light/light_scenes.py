@@ -60,6 +60,32 @@ def table_with_a_box() -> FlatGaussians:
     return concatenate(sheets)
 
 
+def shiny_ball(
+    count: int, radius: float, *, albedo: tuple[float, ...], metallic: float, roughness: float
+) -> FlatGaussians:
+    """Opaque Gaussians on a sphere, evenly spread (Fibonacci's spiral), of one material."""
+    k = np.arange(count) + 0.5
+    polar, around = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
+    n = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=1)
+    u = np.cross(n, np.where(np.abs(n[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    scale = radius * np.sqrt(4 * np.pi / count) * 0.6
+    scene = FlatGaussians(
+        (radius * n).astype(np.float32),
+        quaternions(np.stack([n, u, np.cross(n, u)], axis=2)).astype(np.float32),
+        np.full((count, 2), np.log(scale), np.float32),
+        np.full(count, 6.0, np.float32),
+        np.zeros((count, 1, 3), np.float32),
+    )
+    return scene.with_channels(
+        {
+            "albedo": np.tile(np.float32(albedo), (count, 1)),
+            "metallic": np.full((count, 1), metallic, np.float32),
+            "roughness": np.full((count, 1), roughness, np.float32),
+        }
+    )
+
+
 def _sheet(
     centre: np.ndarray, u: np.ndarray, v: np.ndarray, half: float, side: int, rgb: tuple[float, ...]
 ) -> FlatGaussians:

@@ -7,7 +7,12 @@ import pytest
 from scipy.stats import chi2
 
 from engine.errors import ConfigError
-from engine.light.environment import EnvironmentMap, environment_frame, read_environment
+from engine.light.environment import (
+    EnvironmentMap,
+    environment_frame,
+    read_environment,
+    write_environment,
+)
 from engine.light.lights import light_arrays, look_up_environment, sample_lights
 from engine.light.stage import DirectionalLight, PointLight, RectangleLight, SpotLight
 from engine.render.images import write_exr
@@ -150,3 +155,14 @@ def test_an_environment_that_is_no_picture_is_refused(tmp_path: Path) -> None:
     write_exr(tmp_path / "bad.exr", {"R": bad, "G": bad, "B": bad})
     with pytest.raises(ConfigError, match="not finite"):
         read_environment(tmp_path / "bad.exr")
+
+
+def test_a_written_environment_comes_back(tmp_path: Path) -> None:
+    radiance = np.random.default_rng(0).lognormal(0, 2, (16, 32, 3)).astype(np.float32)
+    write_environment(tmp_path / "map.exr", radiance)
+    np.testing.assert_array_equal(read_environment(tmp_path / "map.exr"), radiance)
+    write_environment(tmp_path / "map.hdr", radiance)
+    brightest = radiance.max(axis=2, keepdims=True)  # shares its exponent with the pixel's other two
+    assert (np.abs(read_environment(tmp_path / "map.hdr") - radiance) <= 0.01 * brightest).all()
+    with pytest.raises(ConfigError, match=r"written as \.hdr or \.exr"):
+        write_environment(tmp_path / "map.png", radiance)

@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,23 +11,33 @@ import psutil
 import pycolmap
 import pytest
 from jaxtyping import Float64
+from neighbouring_photographs import write_neighbours
 
 from engine.errors import Cancelled, DatasetError, PosesCrashed
 from engine.events import Event, StageFinished, StageProgress, StageStarted
 from engine.poses import find_poses
 from engine.poses.find import PosesConfig
 from engine.render.images import write_png
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 pytestmark = pytest.mark.heavy
 
 
+COUNT = 16
+"""The whole ring: without its end there would be nothing to hold the focal length."""
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Photographs of one thing, and where they were taken from."""
+
+    folder: Path
+    centres_world: dict[str, Float64[np.ndarray, "3"]]
+
+
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("poses") / "scene"
-    config = GeneratedSceneConfig(views=24, width_px=480, height_px=360, samples_per_side=2, points=300)
-    write_generated_scene(root, config)
-    return root
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Photographs:
+    folder = tmp_path_factory.mktemp("poses") / "images"
+    return Photographs(folder, write_neighbours(folder, COUNT))
 
 
 def centres(model: Path) -> dict[str, Float64[np.ndarray, "3"]]:
@@ -44,18 +55,18 @@ def aligned(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return moved
 
 
-def test_poses_are_those_of_the_cameras(scene: Path, tmp_path: Path) -> None:
+def test_poses_are_those_of_the_cameras(taken: Photographs, tmp_path: Path) -> None:
     events: list[Event] = []
     model = tmp_path / "poses"
-    find_poses(scene / "images", model, threads=2, listener=events.append)
+    find_poses(taken.folder, model, threads=2, listener=events.append)
     assert [path.name for path in tmp_path.iterdir()] == ["poses"]
-    found, truth = centres(model), centres(scene / "sparse" / "0")
+    found, truth = centres(model), taken.centres_world
     assert len(found) >= 0.8 * len(truth) and found.keys() <= truth.keys()
     names = sorted(found)
     a, b = np.stack([found[n] for n in names]), np.stack([truth[n] for n in names])
     errors = np.linalg.norm(aligned(a, b) - b, axis=1)
     assert np.median(errors) < 0.015 * np.linalg.norm(b - b.mean(0), axis=1).mean()
-    wanted = [("features", 24), ("matches", 24 * 23 // 2), ("poses", 24)]
+    wanted = [("features", COUNT), ("matches", COUNT * (COUNT - 1) // 2), ("poses", COUNT)]
     begun = [event for event in events if isinstance(event, StageStarted)]
     assert [(event.stage, event.total_steps) for event in begun] == wanted
     assert [event.stage for event in events if isinstance(event, StageFinished)] == [
@@ -65,10 +76,10 @@ def test_poses_are_those_of_the_cameras(scene: Path, tmp_path: Path) -> None:
         steps = [e.step for e in events if isinstance(e, StageProgress) and e.stage == stage]
         assert steps == sorted(steps) and steps[-1] == (len(found) if stage == "poses" else total)
     record = json.loads((model / "poses.json").read_text())
-    assert (record["placed"], record["photographs"]) == (len(found), 24)
+    assert (record["placed"], record["photographs"]) == (len(found), COUNT)
     assert set(record["left_out"]) == truth.keys() - found.keys()
     events.clear()
-    find_poses(scene / "images", model, listener=events.append)
+    find_poses(taken.folder, model, listener=events.append)
     assert events == []
 
 
@@ -88,10 +99,10 @@ def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
         find_poses(tmp_path / "images", tmp_path / "out")
 
 
-def test_most_photographs_must_be_placed(scene: Path, tmp_path: Path) -> None:
+def test_most_photographs_must_be_placed(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
-    for path in sorted((scene / "images").iterdir())[:7]:
+    for path in sorted((taken.folder).iterdir())[:7]:
         (images / path.name).hardlink_to(path)
     rng = np.random.default_rng(5)
     for number in range(3):
@@ -100,17 +111,17 @@ def test_most_photographs_must_be_placed(scene: Path, tmp_path: Path) -> None:
         find_poses(images, tmp_path / "out", config=PosesConfig(min_share=1.0), threads=2)
 
 
-def test_stops_when_asked(scene: Path, tmp_path: Path) -> None:
+def test_stops_when_asked(taken: Photographs, tmp_path: Path) -> None:
     asked = iter(range(1000))
     with pytest.raises(Cancelled):
-        find_poses(scene / "images", tmp_path / "out", threads=1, should_stop=lambda: next(asked) >= 1)
+        find_poses(taken.folder, tmp_path / "out", threads=1, should_stop=lambda: next(asked) >= 1)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_same_photographs_give_the_same_bytes(scene: Path, tmp_path: Path) -> None:
+def test_the_same_photographs_give_the_same_bytes(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
-    for number, path in enumerate(sorted((scene / "images").iterdir())[:10]):
+    for number, path in enumerate(sorted((taken.folder).iterdir())[:10]):
         (images / f"view {number}.png").hardlink_to(path)  # a name with a space
     quick = PosesConfig(exhaustive_up_to=5, partners=4)  # pairs are chosen
     for threads in (1, 2):
@@ -123,24 +134,24 @@ def test_the_same_photographs_give_the_same_bytes(scene: Path, tmp_path: Path) -
     assert {name.startswith("view ") for name in centres(tmp_path / "poses1")} == {True}
 
 
-def test_a_result_of_other_photographs_is_refused(scene: Path, tmp_path: Path) -> None:
+def test_a_result_of_other_photographs_is_refused(taken: Photographs, tmp_path: Path) -> None:
     images = tmp_path / "images"
-    shutil.copytree(scene / "images", images)
+    shutil.copytree(taken.folder, images)
     (tmp_path / "poses").mkdir()
-    record = {"photographs": 24, "placed": 24, "photographs_sha256": "another"}
+    record = {"photographs": COUNT, "placed": COUNT, "photographs_sha256": "another"}
     (tmp_path / "poses" / "poses.json").write_text(json.dumps(record))
     with pytest.raises(DatasetError, match="other photographs"):
         find_poses(images, tmp_path / "poses")
 
 
-def test_death_of_colmap_is_told(scene: Path, tmp_path: Path) -> None:
+def test_death_of_colmap_is_told(taken: Photographs, tmp_path: Path) -> None:
     def kill(event: Event) -> None:
         if isinstance(event, StageStarted) and event.stage == "features":
             (child,) = psutil.Process().children()
             child.send_signal(signal.SIGSEGV)
 
     with pytest.raises(PosesCrashed, match=r"SIGSEGV while looking for features.*run the same command again"):
-        find_poses(scene / "images", tmp_path / "poses", threads=1, listener=kill)
+        find_poses(taken.folder, tmp_path / "poses", threads=1, listener=kill)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -25,14 +25,14 @@ def test_only_what_nobody_takes_is_given_up(conninfo: str) -> None:
                 jobs = {
                     name: await create_job(connection, SLIPS, NewJob("me", "toy", {}, queue))
                     for name, queue in (
-                        ("absent", "gpuu"), ("busy", "cpu"), ("runs", "cpu"), ("served", "gpu"),
-                        ("new", "gpuu"),
+                        ("absent", "lagre"), ("busy", "cpu"), ("runs", "cpu"), ("served", "large"),
+                        ("new", "lagre"),
                     )
                 }  # fmt: skip
                 await connection.execute(
                     "UPDATE jobs SET queued_at = now() - interval '2 hours' WHERE id <> %s", [jobs["new"].id]
                 )
-                await see_worker(connection, new_id(), name="w", queues=["gpu"], slots=1, facts={})
+                await see_worker(connection, new_id(), name="w", queues=["large"], slots=1, facts={})
                 slip = jobs["runs"].slip
             assert slip is not None
             running = await claim(pool, jobs["runs"].id, slip, "w")
@@ -42,7 +42,7 @@ def test_only_what_nobody_takes_is_given_up(conninfo: str) -> None:
             async with pool.connection() as connection:
                 job = await get_job(connection, jobs["absent"].id)
             assert job is not None and job.state == "failed" and job.error is not None and job.slip is None
-            assert job.error["type"] == "no_worker" and "--queues gpuu" in job.error["message"]
+            assert job.error["type"] == "no_worker" and "--queues lagre" in job.error["message"]
             # A worker that restarts, or is gone for less than the time, gives nothing up.
             async with pool.connection() as connection:
                 await connection.execute("UPDATE workers SET seen_at = now() - interval '1 minute'")

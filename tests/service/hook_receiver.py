@@ -21,6 +21,11 @@ class Receiver:
         return f"http://127.0.0.1:{self.port}/hook"
 
 
+class _Server(ThreadingHTTPServer):
+    request_queue_size = 128
+    """By default 5: of 40 messages at once some would knock again and again, up to their limit."""
+
+
 @contextmanager
 def receiving(*statuses: int) -> Iterator[Receiver]:
     """Hear messages until the block ends."""
@@ -40,7 +45,7 @@ def receiving(*statuses: int) -> Iterator[Receiver]:
         def log_message(self, format: str, *args: Any) -> None:
             pass
 
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+    with _Server(("127.0.0.1", 0), Handler) as server:
         receiver.port = server.server_address[1]
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
         thread.start()

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from neighbouring_photographs import write_neighbours
 
 from benchmarks.chaos_machine import ROOT, Machine
 from engine.render.images import write_png
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from workers.client.api import Api
 
 pytestmark = pytest.mark.heavy
@@ -46,12 +46,8 @@ def machine(short_root: Path) -> Iterator[Machine]:
 
 
 def test_a_folder_of_photographs_is_enough(machine: Machine, octasplat: Octasplat, tmp_path: Path) -> None:
-    config = GeneratedSceneConfig(views=40, width_px=480, height_px=360, samples_per_side=1, points=300)
-    write_generated_scene(tmp_path / "scene", config)
     images = tmp_path / "photographs"
-    images.mkdir()
-    for path in sorted((tmp_path / "scene" / "images").iterdir())[:8]:  # neighbours on the lowest ring
-        (images / path.name).hardlink_to(path)
+    write_neighbours(images, 8)
     result = tmp_path / "result"
     done = octasplat(
         "submit", images, "--wait", "-o", result, "--preset", "fast", *FEW, "--max-side", "96",

@@ -69,7 +69,7 @@ def test_what_no_worker_can_write_is_refused(talk: Callable[[Conversation], None
         assert "disabled" not in boxes["mesh.glb"] and "checked" in boxes["mesh.glb"]
         await worker_lives(service, "usd")  # another one that can
         assert (await http.post("/v1/jobs", json=body)).status_code == 202
-        elsewhere = {**body, "queue": "gpu", "options": {"exports": ["scene.usdz"]}}
+        elsewhere = {**body, "queue": "large", "options": {"exports": ["scene.usdz"]}}
         assert (await http.post("/v1/jobs", json=elsewhere)).status_code == 202  # nobody is there
 
     talk(conversation)

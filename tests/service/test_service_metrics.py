@@ -61,9 +61,11 @@ def test_numbers_are_those_of_the_tables(talk: Callable[..., None]) -> None:
         assert "octasplat_job_heartbeat_age_seconds" not in before and before["octasplat_workers"] == 0
         assert before["octasplat_storage_free_bytes"] > 0 and before["process_resident_memory_bytes"] > 1e6
         dataset = await committed_dataset(service)
-        jobs = [await new_job(http, dataset) for _ in range(4)] + [await new_job(http, dataset, queue="gpu")]
+        jobs = [await new_job(http, dataset) for _ in range(4)] + [
+            await new_job(http, dataset, queue="large")
+        ]
         async with service.pool.connection() as connection:
-            await see_worker(connection, new_id(), name="w", queues=["cpu", "gpu"], slots=3, facts={})
+            await see_worker(connection, new_id(), name="w", queues=["cpu", "large"], slots=3, facts={})
             await connection.execute("UPDATE workers SET seen_at = now() - interval '7 seconds'")
             await connection.execute("UPDATE jobs SET queued_at = now() - interval '90 seconds'")
         first = await claimed(service, jobs[0])
@@ -74,9 +76,9 @@ def test_numbers_are_those_of_the_tables(talk: Callable[..., None]) -> None:
                 "UPDATE jobs SET heartbeat_at = now() - interval '9 s' WHERE state = 'running'"
             )
         seen = await read(http)
-        assert (seen["octasplat_queue_depth[cpu]"], seen["octasplat_queue_depth[gpu]"]) == (1, 1)
+        assert (seen["octasplat_queue_depth[cpu]"], seen["octasplat_queue_depth[large]"]) == (1, 1)
         assert 89 < seen["octasplat_queue_oldest_seconds[cpu]"] < 120
-        assert (seen["octasplat_jobs_running[cpu]"], seen["octasplat_jobs_running[gpu]"]) == (2, 0)
+        assert (seen["octasplat_jobs_running[cpu]"], seen["octasplat_jobs_running[large]"]) == (2, 0)
         assert (seen["octasplat_worker_slots[cpu]"], seen["octasplat_workers"]) == (3, 1)
         assert 6.9 < seen["octasplat_worker_heartbeat_age_seconds"] < 19
         assert 8.9 < seen["octasplat_job_heartbeat_age_seconds"] < 30

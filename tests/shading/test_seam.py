@@ -19,7 +19,7 @@ from engine.rays import RayBatch
 from engine.shading.exposure import Exposures
 from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
 from engine.trace.cpu import CpuTracer
-from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
+from engine.trace.protocol import GaussianGradients, TraceGradients, Tracer, TraceResult, TraceSettings
 from engine.train.batches import Batch, BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import McmcConfig
@@ -47,6 +47,9 @@ class Lamp:
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n 3"]:
         assert len(gaussians) == len(self.albedo)
         return self.albedo
+
+    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+        self.settled = progress
 
     def _facing(self, sight: Sight) -> Float32[np.ndarray, "r 1"]:
         return (1 - (sight.seen.normal_world * sight.rays.directions_world).sum(axis=1))[:, None] / 2
@@ -83,7 +86,7 @@ class Lamp:
         *,
         progress: float,
     ) -> None:
-        assert 0 <= progress < 1
+        assert 0 <= self.settled <= progress < 1
         self.lamp -= np.float32(0.1) * parameters["lamp.lamp"]
         self.albedo[gradients.ids] -= np.float32(10) * gradients.features
 

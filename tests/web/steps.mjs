@@ -302,6 +302,8 @@ const steps = {
         const [download] = await Promise.all([page.waitForEvent("download"), page.click("#light a[download]")]);
         found.saved = { name: download.suggestedFilename(), same: readFileSync(await download.path(), "utf8") === await text() };
         found.nameless = await nameless(page);
+        await page.waitForFunction(() => document.querySelector(".light-estimate").textContent);
+        found.estimate = await page.textContent(".light-estimate");
         await page.click("[data-do=views]");
         await page.waitForURL((url) => !url.pathname.endsWith(job.job));
         found.job = page.url().split("/").pop();

@@ -180,8 +180,9 @@ def test_silent_program_is_tried_again(bench: Bench) -> None:
     bench.worker(SILENT_SECONDS="0.8")
     job_id = bench.submit(options={"steps": 20, "silent_at": 15, "checkpoint_every": 5})
     job = bench.over(job_id)
-    assert (job.state, job.attempt) == ("failed", 4)
-    assert job.error is not None and job.error["type"] == "silent"
+    # On a busy machine a program may be killed before it begins; the attempt that gets further forgives that.
+    assert (job.state, job.rescues) == ("failed", 3) and job.attempt >= 4
+    assert job.error is not None and job.error["type"] == "silent" and "4 times" in job.error["message"]
 
 
 def test_program_that_needs_too_much_memory_is_stopped(bench: Bench) -> None:
@@ -227,13 +228,13 @@ def test_results_published_before_a_crash_are_adopted(bench: Bench) -> None:
 def test_priority_and_queues(bench: Bench) -> None:
     low = bench.submit(options={"steps": 2}, priority=-5)
     high = bench.submit(options={"steps": 2}, priority=5)
-    elsewhere = bench.submit(options={"steps": 2}, queue="gpu")
+    elsewhere = bench.submit(options={"steps": 2}, queue="large")
     bench.worker()
     bench.over(low)
     assert bench.job(high).started_at < bench.job(low).started_at  # type: ignore[operator]
     assert bench.job(elsewhere).state == "queued"
-    bench.worker(queues="gpu", name="gpu")
-    assert bench.over(elsewhere).worker == "gpu"
+    bench.worker(queues="large", name="large")
+    assert bench.over(elsewhere).worker == "large"
 
 
 def test_the_log_tells_the_stages_and_the_cause_without_paths(bench: Bench) -> None:

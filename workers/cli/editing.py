@@ -101,7 +101,9 @@ def write_scene(gaussians: FlatGaussians, target: Path, say: Say, *, warn: bool 
     if warn:
         warn_of_losses(gaussians, target)
     export_scene(gaussians, target)
-    say(f"Wrote {target} ({len(gaussians):,} Gaussians).")
+    say(
+        f"Wrote {target}: {exporter_for(target).description.partition(';')[0]}, {len(gaussians):,} Gaussians."
+    )
 
 
 def speaker(quiet: bool) -> Say:
@@ -137,7 +139,10 @@ def run_edit(
             if warning:
                 click.echo(warning, err=True)
         for line in edit_lines(path, report):
-            say(line)
+            if line.startswith("Warning"):
+                click.echo(line, err=True)
+            else:
+                say(line)
         write_scene(result, target, say, warn=target == targets[0])
         reports.append({"mesh": str(path), "output": str(target), **asdict(report)})
     if report_path is not None:
@@ -170,8 +175,14 @@ def edit_lines(path: Path, report: EditReport) -> list[str]:
         (report.crumpled, "crumpled (folded, without area or far from flat)"),
         (report.flipped, "flipped against their surroundings"),
         (report.dropped, "left out as damaged"),
+        (report.snapped, "moved in part, taken as a whole"),
     )
     lines += [f"  {count:,} {what}" for count, what in counts if count]
+    if report.partial > report.snapped:
+        lines.append(
+            f"Warning: {report.partial - report.snapped:,} octagons moved with some corners only, which "
+            "makes long streaks: select whole octagons in the editor (Select Linked) or say --whole-octagons."
+        )
     if report.foreign_vertices:
         lines.append(f"  {report.foreign_vertices:,} vertices belong to no octagon and were passed over")
     if report.ambiguous_corners:

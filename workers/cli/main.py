@@ -26,6 +26,7 @@ from workers.cli.commands.info import info
 from workers.cli.commands.merge import merge
 from workers.cli.commands.quota import quota
 from workers.cli.commands.reconstruct import reconstruct
+from workers.cli.commands.relight import relight
 from workers.cli.commands.render import render
 from workers.cli.commands.serve import serve
 from workers.cli.commands.stage import stage
@@ -87,7 +88,7 @@ def cli() -> None:
 
 
 for _command in (
-    reconstruct, evaluate, info, export, import_, render, stage, surface,
+    reconstruct, evaluate, info, export, import_, render, relight, stage, surface,
     edit, deform, transform, crop, merge, clean, demo,
     serve, worker, token, fsck, quota, *CLIENT_COMMANDS,
 ):  # fmt: skip

@@ -17,14 +17,8 @@ from engine.gaussians.model import FlatGaussians
 from engine.light.stage import Stage
 from engine.light.stage_file import named_files
 from engine.render.identity import identity_of
-from engine.render.jobs import (
-    Paint,
-    Shot,
-    camera_shots,
-    scene_paint,
-    view_shots,
-)
-from engine.render.kept import KeptImages
+from engine.render.jobs import Paint, Shot, camera_shots, gaussian_turntable, scene_paint, view_shots
+from engine.render.kept import RECORD, KeptImages
 from engine.render.names import names_by_number
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
@@ -44,7 +38,7 @@ ANY_SIDE_PX = 1 << 30
 
 
 @dataclass(frozen=True)
-class _Source:
+class Source:
     """A scene to render; what only a run knows is None for a bare file of Gaussians."""
 
     gaussians: FlatGaussians
@@ -52,6 +46,14 @@ class _Source:
     near_world: float = 0.0
     background: str = "black"
     viewpoints: SplitViewpoints | None = None
+    max_side: int | None = None
+
+    @property
+    def extent_world(self) -> float:
+        """Radius of the cameras, or of a turntable that fits."""
+        if self.viewpoints is not None:
+            return self.viewpoints.extent
+        return gaussian_turntable(self.gaussians).radius
 
 
 @dataclass(frozen=True)
@@ -115,17 +117,17 @@ def render_files(
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
         cameras, fps = path.cameras, options["fps"] or path.fps
-    source = _read_run(options) if is_run(options["source"]) else _read_file(options, say)
+    source = read_source(options, say)
     if mode in ("turntable", "camera"):
         cameras = cameras_of_options(source.gaussians, source.viewpoints, options, fps)
     if cameras is not None:
         cameras = tuple(replace(camera, near_world=source.near_world) for camera in cameras)
-    shots = camera_shots(cameras) if cameras is not None else _views(source, options)
-    _check_one_file(output, 1 if options.get("preview") else len(shots))
+    shots = camera_shots(cameras) if cameras is not None else run_shots(source, options)
+    check_one_file(output, 1 if options.get("preview") else len(shots))
     transparent = options["background"] == "transparent"
     background = background_colour("black" if transparent else options["background"] or source.background)
     exr = options["exr"] or (stage is not None and stage.stage.integrator.layers)
-    series = _Series(output, shots, fps, exr, keeping)
+    series = Series(output, shots, fps, exr, keeping)
     what = source.gaussians, source.settings, background, transparent, cameras, stage and stage.identity()
     of_views = None if cameras is not None else (source.viewpoints, source.near_world)
     if stage is not None:
@@ -158,7 +160,7 @@ def _as_asked(stage: Stage, options: dict[str, Any]) -> Stage:
 
 
 @dataclass(frozen=True)
-class _Series:
+class Series:
     """Images or a film to write."""
 
     output: Path
@@ -169,15 +171,18 @@ class _Series:
 
     @property
     def is_film(self) -> bool:
+        """Whether it is a film."""
         return self.output.suffix.lower() == ".mp4"
 
     def kept(self, identity: str) -> KeptImages:
         """What there is already of images that look as ``identity`` says."""
         keeping, output = self.keeping, self.output
-        folder = output.parent if output.suffix.lower() in (".png", ".exr") else output
+        folder, record = output, RECORD
+        if output.suffix.lower() in (".png", ".exr"):
+            folder, record = output.parent, f"{output.name}.{RECORD}"
         if self.is_film:
             folder = keeping.frames or output.with_name(f"{output.name}.frames")
-        return KeptImages(folder, identity, resume=keeping.resume, or_anew=keeping.or_anew)
+        return KeptImages(folder, identity, resume=keeping.resume, or_anew=keeping.or_anew, record=record)
 
     def render(self, paint: Paint, kept: KeptImages, listener: Listener) -> tuple[Path, ...]:
         """Do so; returns the files."""
@@ -186,11 +191,11 @@ class _Series:
             if self.is_film:
                 render_film(self.shots, self.output, self.fps, paint, kept, count, on_kept)
                 return (self.output,)
-            names = _FileNames(self.output, self.exr)
+            names = FileNames(self.output, self.exr)
             return render_series(self.shots, names, paint, kept, count, on_kept)
 
 
-def _check_one_file(output: Path, images: int) -> None:
+def check_one_file(output: Path, images: int) -> None:
     """Refuse the name of one image where there are several.
 
     Raises:
@@ -202,13 +207,14 @@ def _check_one_file(output: Path, images: int) -> None:
 
 
 @dataclass(frozen=True)
-class _FileNames:
+class FileNames:
     """The file of a shot: by number in a pattern, by name in a folder."""
 
     output: Path
     exr: bool
 
     def __call__(self, number: int, shot: Shot) -> Path:
+        """The file of a shot and its number."""
         if self.output.suffix.lower() in (".png", ".exr"):
             if not names_by_number(self.output):
                 return self.output
@@ -216,25 +222,35 @@ class _FileNames:
         return self.output / f"{shot.name}{'.exr' if self.exr else '.png'}"
 
 
-def _read_run(options: dict[str, Any]) -> _Source:
+def read_source(options: dict[str, Any], say: Callable[[str], None]) -> Source:
+    """The scene that the options ``source``, ``scene`` and ``max_side`` name: of a run, or of a file.
+
+    Raises:
+        OctasplatError: it cannot be read.
+    """
+    return _read_run(options) if is_run(options["source"]) else _read_file(options, say)
+
+
+def _read_run(options: dict[str, Any]) -> Source:
     run: Path = options["source"]
     config = read_config(run / CONFIG)
     if not (run / SCENE).exists():
         raise OutputError(f"{run} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume.")
     viewpoints = run_viewpoints(run, scene=options["scene"], max_side=options["max_side"])
-    return _Source(
+    return Source(
         read_gaussian_ply(run / SCENE)[0],
         config.train.trace,
         config.train.near * viewpoints.extent,
         config.evaluate_background,
         viewpoints,
+        config.max_side,
     )
 
 
-def _read_file(options: dict[str, Any], say: Callable[[str], None]) -> _Source:
+def _read_file(options: dict[str, Any], say: Callable[[str], None]) -> Source:
     path: Path = options["source"]
     gaussians = open_scene(path, say)
-    return _Source(gaussians, TraceSettings(), read_near_world(path))
+    return Source(gaussians, TraceSettings(), read_near_world(path))
 
 
 def stage_place(
@@ -252,7 +268,7 @@ def stage_place(
         OctasplatError: the source cannot be read.
     """
     options = {"source": source, "scene": scene, "max_side": None}
-    found = _read_run(options) if is_run(source) else _read_file(options, say)
+    found = read_source(options, say)
     place = StagePlace(
         found.gaussians, found.settings, _full_size(options), source.parent,
         lambda path: open_scene(path, say), background_colour(found.background), 0,
@@ -267,7 +283,13 @@ def _full_size(options: dict[str, Any]) -> Viewpoints | None:
     return run_viewpoints(options["source"], scene=options["scene"], max_side=ANY_SIDE_PX)
 
 
-def _views(source: _Source, options: dict[str, Any]) -> tuple[Shot, ...]:
+def run_shots(source: Source, options: dict[str, Any]) -> tuple[Shot, ...]:
+    """The views of a run's photographs: those of the option ``photographs``, or as ``views`` says.
+
+    Raises:
+        ConfigError: there is no such photograph.
+        OutputError: there are no such views.
+    """
     viewpoints = source.viewpoints
     assert viewpoints is not None
     names = {view.name: number for number, view in enumerate(viewpoints.views)}

@@ -58,6 +58,12 @@ def mean_metrics(metrics: dict[str, Any]) -> str:
     return f"Mean over {count} held-out view{'s' if count > 1 else ''}: {', '.join(known)}"
 
 
+def measured_summary(path: Path) -> list[str]:
+    """What was measured on other photographs into ``path``, and where it is shown."""
+    metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return [mean_metrics(metrics), f"{'Report:':8}{path.with_name('report.html')}"]
+
+
 def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
     """What a finished run in ``output`` reached and where its files are."""
     metrics: dict[str, Any] = json.loads((output / "metrics.json").read_text(encoding="utf-8"))

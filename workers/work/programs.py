@@ -8,12 +8,12 @@ from typing import Any
 
 from engine.config import read_config
 from engine.errors import Cancelled, ExportFailed
+from engine.evaluate.runs import evaluate as evaluate_run
 from engine.events import CheckpointWritten, Event, Listener, StageFinished, StageProgress, Warned, broadcast
 from engine.files import ExportOptions
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.files.several import export_files
 from engine.light.stage_file import named_files
-from engine.pipeline import evaluate as evaluate_run
 from engine.pipeline import reconstruct as reconstruct_scene
 from engine.plain_colours import PlainScene
 from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE

@@ -46,7 +46,8 @@ def shared_scale(
 class Mcmc:
     """Moves dead Gaussians to, and adds new ones at, places chosen by opacity and by the error seen there.
 
-    A chosen Gaussian and its copies share its opacity and shrink; copies are scattered inside it. The count
+    A chosen Gaussian and its copies share its opacity and shrink, or keep its opacity and share its area;
+    copies are scattered inside it. The count
     grows by a fixed fraction each time and never passes the cap.
 
     Not done: the paper's noise on the means; the copies are scattered instead.
@@ -95,13 +96,19 @@ class Mcmc:
         chosen = rng.choice(count, size=wanted, p=score / score.sum())
         copies = np.minimum(np.bincount(chosen, minlength=count) + 1, MAX_COPIES)
         sources = np.flatnonzero(copies > 1)
-        a = np.clip(opacities[sources], 1e-4, 1 - 1e-4)
-        new_a = np.maximum(shared_opacity(a, copies[sources]), config.dead_opacity * 1.5)
-        gaussians.opacity_logits[sources] = np.log(new_a / (1 - new_a))
-        gaussians.log_scales[sources] += np.log(shared_scale(a, copies[sources]))[:, None].astype(np.float32)
+        if config.copies == "area":
+            shrunk = -0.5 * np.log(copies)
+        else:
+            shrunk = np.zeros(count)
+            a = np.clip(opacities[sources], 1e-4, 1 - 1e-4)
+            new_a = np.maximum(shared_opacity(a, copies[sources]), config.dead_opacity * 1.5)
+            gaussians.opacity_logits[sources] = np.log(new_a / (1 - new_a))
+            shrunk[sources] = np.log(shared_scale(a, copies[sources]))
+        before = gaussians.scales[chosen] if config.copies == "area" else None
+        gaussians.log_scales[sources] += shrunk[sources, None].astype(np.float32)
         adam.reset(sources)
         made = gaussians.select(chosen)
-        spread = rng.standard_normal((wanted, 2)) * made.scales
+        spread = rng.standard_normal((wanted, 2)) * (made.scales if before is None else before)
         made.means_world += np.einsum("nij,nj->ni", made.rotations[:, :, 1:], spread).astype(np.float32)
         gaussians.put(dead, made.view(slice(len(dead))))
         adam.reset(dead)

@@ -50,6 +50,11 @@ from workers.cli.options import quiet_option, report_option, scenes_output_optio
     help="Octagons further from an affine image than this many standard deviations are crumpled.  "
     "[default: 1]",
 )
+@click.option(
+    "--whole-octagons",
+    is_flag=True,
+    help="Octagons of which only some corners moved move as a whole, or not at all if most stayed.",
+)
 @report_option
 @quiet_option
 def edit(
@@ -61,6 +66,7 @@ def edit(
     axes: str,
     q: float | None,
     max_residual: float | None,
+    whole_octagons: bool,
     report: Path | None,
     quiet: bool,
 ) -> None:
@@ -72,6 +78,13 @@ def edit(
     from workers.cli.editing import run_edit
     from workers.cli.signals import orderly_termination
 
-    given = {"method": method, "damaged": damaged, "axes": axes, "q": q, "max_residual": max_residual}
+    given = {
+        "method": method,
+        "damaged": damaged,
+        "axes": axes,
+        "q": q,
+        "max_residual": max_residual,
+        "whole_octagons": whole_octagons,
+    }
     with orderly_termination():
         run_edit(source, meshes, output, given, report_path=report, quiet=quiet)

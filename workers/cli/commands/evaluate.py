@@ -14,19 +14,31 @@ from workers.cli.options import quiet_option, threads_option
     type=click.Path(path_type=Path),
     help="Where the photographs are now, if they were moved or the run was downloaded.",
 )
+@click.option(
+    "--on",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Measure all photographs of another folder (images/ and sparse/0 in the same world as the run's) "
+    "instead; the results go to OUT/on/<its name>.",
+)
 @threads_option
 @quiet_option
-def evaluate(output: Path, scene: Path | None, threads: int, quiet: bool) -> None:
+def evaluate(output: Path, scene: Path | None, on: Path | None, threads: int, quiet: bool) -> None:
     """Measure the run in the folder OUT again: metrics.json, report.html and renders/ are written anew."""
-    from engine import pipeline
+    if scene is not None and on is not None:
+        raise click.UsageError("Choose one of --scene (the run's own photographs) and --on (others).")
     from engine.config import read_config
+    from engine.evaluate import runs
     from engine.run_folder import CONFIG
     from workers.cli.progress import show_progress
     from workers.cli.signals import orderly_termination
-    from workers.telling.wording import run_summary
+    from workers.telling.wording import measured_summary, run_summary
 
     with orderly_termination(), show_progress(quiet=quiet) as listener:
-        pipeline.evaluate(output, scene=scene, threads=threads, listener=listener)
-    if not quiet:
+        metrics = runs.evaluate(output, scene=scene, on=on, threads=threads, listener=listener)
+    if on is not None and not quiet:
+        for line in measured_summary(metrics):
+            click.echo(line)
+    elif not quiet:
         for line in run_summary(output, read_config(output / CONFIG).exports):
             click.echo(line)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from workers.cli.options import quiet_option
+
 if TYPE_CHECKING:
     from engine.gaussians.model import FlatGaussians
 
@@ -73,6 +75,7 @@ class _ExportCommand(click.Command):
     help="GLB, OBJ: side of the texture that holds the fall-off.",
 )
 @click.option("--no-ids", is_flag=True, help="GLB: leave out the numbers by which edits find back.")
+@quiet_option
 @click.option(
     "--q",
     type=click.FloatRange(0, 100, min_open=True),
@@ -91,6 +94,7 @@ def export(
     texture_size: int,
     no_ids: bool,
     q: float | None,
+    quiet: bool,
 ) -> None:
     """Write the Gaussians of IN, the folder of a run or a file of any splat format, to OUT in another format.
 
@@ -106,7 +110,7 @@ def export(
     if opaque and exporter.name != "glb":
         raise click.UsageError(f"--opaque is for GLB; {target} is written as {exporter.name}.")
     chosen = _colour(colour, source)
-    gaussians = open_scene(source)
+    gaussians = open_scene(source, quiet=quiet)
     options = ExportOptions(
         q=CHI2_2_99 if q is None else q,
         min_opacity=min_opacity,
@@ -122,7 +126,7 @@ def export(
         if not exporter.holds_harmonics:
             gaussians = _one_colour(gaussians, source, chosen)
         files = export_scene(gaussians, target, options, exporter.name)
-    for path in files:
+    for path in () if quiet else files:
         click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")
 
 

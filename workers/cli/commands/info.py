@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from workers.cli.camera_options import AXES
 from workers.cli.options import threads_option
 
 if TYPE_CHECKING:
     from workers.rendering.facts import Found
 
-AXES = ("x", "-x", "y", "-y", "z", "-z")
 BAR = 24
 WIDTH = 60
 """Columns of the picture in a terminal."""

@@ -58,6 +58,11 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
     type=click.Choice(["ignore", "alpha"]),
     help="Leave masked pixels out, or take the mask as the object's alpha.  [default: ignore]",
 )
+@click.option(
+    "--materials",
+    is_flag=True,
+    help="Learn materials and the environment of shiny things; environment.hdr lies beside the scene then.",
+)
 @background_option("Behind renders and photographs with alpha in the evaluation.  [default: black]")
 @exports_option
 @click.option("--seed", type=int, metavar="N", help="Seed of everything random.  [default: 0]")
@@ -96,7 +101,9 @@ def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
     """The settings asked for; with ``--resume`` and none given, those of the run."""
     from engine.config import read_config, resolve_config
 
-    given = any(value not in (None, ()) for name, value in options.items() if name not in _NOT_SETTINGS)
+    given = any(
+        value not in (None, (), False) for name, value in options.items() if name not in _NOT_SETTINGS
+    )
     exports = export_names(options["exports"])
     if options["resume"] and not given and (output / "config.json").exists():
         config = read_config(output / "config.json")
@@ -105,6 +112,7 @@ def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
     assignments = [f"{name}={options[name]}" for name in direct if options[name] is not None]
     return resolve_config(
         options["preset"] or "standard",
+        materials=options["materials"],
         settings={
             "max_side": options["max_side"],
             "poses": options["poses"],

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workers.cli.commands.render import AXES
+from workers.cli.camera_options import AXES
 from workers.cli.options import quiet_option
 
 

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import click
 
+from workers.cli.camera_options import AXES
 from workers.cli.options import quiet_option
-
-AXES = ("x", "-x", "y", "-y", "z", "-z")
 
 
 @click.command(short_help="Move, turn or scale a scene.")

@@ -12,12 +12,12 @@ from engine.config import ReconstructionConfig
 from engine.errors import SceneFileError
 from engine.files import exporter_for
 from engine.light.stage import Stage
-from engine.train.config import preset
+from engine.train.config import preset, with_materials
 
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _TAKEN = frozenset(
     {"scene.ply", "config.json", "held_out.json", "views.json", "events.jsonl", "metrics.json", "report.html"}
-    | {"training.json", "renders", "checkpoints", "cache", "poses"}
+    | {"training.json", "environment.hdr", "renders", "checkpoints", "cache", "poses"}
 )  # fmt: skip
 
 
@@ -130,6 +130,11 @@ class RenderJobOptions(BaseModel):
         return self
 
 
+def _learns_materials(train: object) -> bool:
+    materials = train.get("materials") if isinstance(train, Mapping) else None
+    return isinstance(materials, Mapping) and materials.get("learn") is True
+
+
 def resolve_reconstruction(asked: Mapping[str, Any]) -> ReconstructOptions:
     """Complete options: the preset's training settings with what was asked for on top.
 
@@ -138,8 +143,11 @@ def resolve_reconstruction(asked: Mapping[str, Any]) -> ReconstructOptions:
     """
     name = asked.get("preset", "standard")
     known = name in ("fast", "standard", "paper")
-    base = preset(str(name)).model_dump(mode="json") if known else {}
     train = asked.get("train")
+    base: dict[str, Any] = {}
+    if known:
+        chosen = preset(str(name))
+        base = (with_materials(chosen) if _learns_materials(train) else chosen).model_dump(mode="json")
     merged = _merged(base, train) if isinstance(train, Mapping) else base if train is None else train
     return ReconstructOptions.model_validate({**asked, "train": merged})
 

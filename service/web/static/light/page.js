@@ -9,6 +9,9 @@ const PREVIEW = { samples: 4, side: 320 };
 const LOOK_MS = 300;
 const TURN = { frames: 96, width_px: 640, height_px: 480 };
 
+const PAUSE_MS = 500;
+const WHAT = { views: { mode: "views", format: "png" }, turntable: { mode: "turntable", ...TURN } };
+
 const section = document.getElementById("light");
 const form = section.querySelector("form");
 const find = (selector) => section.querySelector(selector);
@@ -17,6 +20,7 @@ const picture = find(".spot-picture"), spot = find(".spot"), fault = find(".faul
 let cameras = null, extent = 1, text = "", link = null;
 let sent = { key: "", id: null }; // the files that were sent last
 let trial = null; // the preview under way
+let asking = 0, latest = 0; // for estimates
 
 const say = (words) => { state.textContent = words; };
 const chosen = () => form.elements.view.selectedOptions[0];
@@ -69,6 +73,20 @@ function show() {
     if (link) URL.revokeObjectURL(link);
     link = URL.createObjectURL(new Blob([text], { type: "application/toml" }));
     find("a[download]").href = link;
+    clearTimeout(asking);
+    asking = setTimeout(showEstimates, PAUSE_MS);
+}
+
+/** What the renders would take, or why the service does not take them. */
+async function showEstimates() {
+    const number = ++latest, headers = { "Content-Type": "application/json" };
+    const [views, turntable] = await Promise.all(Object.values(WHAT).map(async (options) => {
+        const body = { kind: "render", source_id: source, queue, options: { ...options, stage: text } };
+        const response = await fetch("/v1/estimates", { method: "POST", headers, body: JSON.stringify(body) }).catch(() => null);
+        const told = await response?.json().catch(() => null);
+        return told?.estimate?.text ?? told?.errors?.[0]?.detail ?? "";
+    }));
+    if (number === latest && views) find(".light-estimate").textContent = `The held-out views take at most ${views}; a turntable of ${TURN.frames} frames ${turntable}; both within a factor of two.`;
 }
 
 /** The files of the stage as a dataset, sent once; null where it names none. */
@@ -214,8 +232,8 @@ form.addEventListener("submit", (event) => {
     event.preventDefault();
     if (cameras) preview();
 });
-find("[data-do=views]").addEventListener("click", ({ target }) => render({ mode: "views", format: "png" }, target));
-find("[data-do=turntable]").addEventListener("click", ({ target }) => render({ mode: "turntable", ...TURN }, target));
+find("[data-do=views]").addEventListener("click", ({ target }) => render(WHAT.views, target));
+find("[data-do=turntable]").addEventListener("click", ({ target }) => render(WHAT.turntable, target));
 
 show();
 const buttons = form.querySelectorAll("[data-do]");

@@ -1,0 +1,171 @@
+"""The scene of a run measured: on the photographs that it held out, or on those of another folder."""
+
+import json
+from pathlib import Path
+
+from engine.config import ReconstructionConfig, read_config
+from engine.errors import OutputError
+from engine.evaluate.held_out import evaluate_held_out
+from engine.evaluate.truth import find_truth
+from engine.events import Listener, StageProgress, Warned
+from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
+from engine.light.environment import read_environment
+from engine.poses.find import read_record
+from engine.run_folder import (
+    CACHE,
+    CONFIG,
+    ENVIRONMENT,
+    ON,
+    POSES,
+    SCENE,
+    TRAINING,
+    VIEWS,
+    found_model,
+    open_photographs,
+    photographs_folder,
+)
+from engine.scene import Dataset
+from engine.scene.views_file import read_views, write_views
+from engine.shading.protocol import ShadingModel
+from engine.stages import stage
+from engine.threads import use_threads
+from engine.train.config import TrainConfig
+from engine.train.shading import deferred_of, make_shading
+from engine.versions import versions
+
+
+def evaluate(
+    output: Path,
+    *,
+    scene: Path | None = None,
+    on: Path | None = None,
+    threads: int = 0,
+    listener: Listener = lambda _event: None,
+) -> Path:
+    """Measure the scene of a finished run again and write its metrics, renders and report anew.
+
+    Args:
+        output: folder of the run.
+        scene: where the photographs are now; None takes the folder that the run was made from.
+        on: other photographs of the same scene in the same world, with a COLMAP model of their own; all of
+            them are measured, into a folder of their name in ``output / "on"``, and the run's own results
+            stay as they are.
+        threads: for everything; 0 means all cores.
+        listener: hears the progress.
+
+    Returns:
+        The path of ``metrics.json``.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+        DatasetError: the photographs cannot be used.
+        OutputError: there is no scene yet, or other photographs of that name were measured before.
+    """
+    use_threads(threads)
+    config = read_config(output / CONFIG)
+    if not (output / SCENE).exists():
+        raise OutputError(
+            f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."
+        )
+    if on is not None:
+        return _evaluate_on(on, output, config, threads, listener)
+    dataset = open_photographs(
+        photographs_folder(output, scene),
+        output,
+        config,
+        threads,
+        listener,
+        model_folder=found_model(output),
+    )
+    if (output / VIEWS).exists():
+        difference = read_views(output / VIEWS).difference(dataset.record)
+        if difference is not None:
+            listener(Warned(f"{output} was made from other photographs or another model ({difference})."))
+    with stage("evaluate", listener, len(dataset.test_indices)):
+        measure_run(dataset, output, config, threads, listener)
+    return output / "metrics.json"
+
+
+def measure_run(
+    dataset: Dataset,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    into: Path | None = None,
+) -> None:
+    """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
+    truth = find_truth(dataset.root)
+    gaussians, _ = read_gaussian_ply(output / SCENE)
+    training = json.loads((output / TRAINING).read_text(encoding="utf-8"))
+    evaluate_held_out(
+        dataset,
+        gaussians,
+        into or output,
+        settings=config.train.trace,
+        shading=finished_shading(output, config.train, dataset),
+        background=config.evaluate_background,
+        run={
+            "gaussians": len(gaussians),
+            "iterations": training["iterations"],
+            "seconds": training["seconds"],
+            "seed": config.train.seed,
+            "resolution": {"max_side": config.max_side},
+            "background": config.evaluate_background,
+            "versions": versions(),
+            **_placed(output),
+        },
+        config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
+        threads=threads,
+        tell=tell,
+        truth=truth,
+    )
+
+
+def finished_shading(output: Path, config: TrainConfig, dataset: Dataset) -> ShadingModel:
+    """The shading model of a finished run, with the environment that it left.
+
+    Raises:
+        ConfigError: the run learnt materials and its environment is missing or damaged.
+    """
+    extent = read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
+    shading = make_shading(config, len(dataset.views), extent)
+    if (deferred := deferred_of(shading)) is not None:
+        deferred.light.put(read_environment(output / ENVIRONMENT))
+    return shading
+
+
+def _evaluate_on(
+    on: Path, output: Path, config: ReconstructionConfig, threads: int, listener: Listener
+) -> Path:
+    """Measure other photographs into a folder of their own."""
+    name = on.resolve().name
+    into = output / ON / name
+    dataset = Dataset.open_measured(
+        on,
+        output / CACHE / ON / name,
+        near_world=read_near_world(output / SCENE),
+        max_side=config.max_side,
+        masks=config.masks,
+        threads=threads,
+        progress=lambda done, total: listener(StageProgress("load", done, total)),
+    )
+    for warning in dataset.warnings:
+        listener(Warned(warning))
+    if (into / VIEWS).exists():
+        difference = read_views(into / VIEWS).difference(dataset.record)
+        if difference is not None:
+            raise OutputError(
+                f"{into} holds the measures of other photographs than {on} has ({difference}); delete or "
+                "rename that folder."
+            )
+    with stage("evaluate", listener, len(dataset.test_indices)):
+        write_views(into / VIEWS, dataset.record)
+        measure_run(dataset, output, config, threads, listener, into)
+    return into / "metrics.json"
+
+
+def _placed(output: Path) -> dict[str, object]:
+    """How many photographs have poses, where a run found these by itself."""
+    record = read_record(output / POSES)
+    return {"poses": {name: record[name] for name in ("placed", "photographs")}} if record else {}

@@ -1,0 +1,67 @@
+"""Materials of Gaussians: what the named channels that make one mean, and whether a scene has them.
+
+A material is that of "Physically Based Shading at Disney" (Burley 2012,
+https://media.disneyanimation.com/uploads/production/publication_asset/48/asset/s2012_pbs_disney_brdf_notes_v3.pdf)
+cut down to what real-time renderers and glTF share: base colour, metallic and roughness. All values are kept
+as they mean, in [0, 1], not as their logits; the base colour is linear.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from engine.errors import ConfigError
+from engine.gaussians.channels import Channels
+from engine.gaussians.model import FlatGaussians
+
+ALBEDO, METALLIC, ROUGHNESS = "albedo", "metallic", "roughness"
+MATERIAL_WIDTHS: Mapping[str, int] = {ALBEDO: 3, METALLIC: 1, ROUGHNESS: 1}
+"""The channels of a material and their widths, in the order in which they are traced.
+
+``albedo`` is the linear base colour: of the matt ground, and of what a metal reflects head-on. ``roughness``
+is perceptual: GGX's alpha is its square.
+"""
+AMBIENT = "ambient"
+"""A channel beside them, which follows from the geometry: share of the light from all around that arrives."""
+DIELECTRIC_F0 = 0.04
+"""What a surface that is no metal reflects head-on, that of an index of refraction of 1.5."""
+
+
+def has_materials(gaussians: FlatGaussians) -> bool:
+    """Whether a scene has all three channels of a material, each of its width."""
+    widths = gaussians.channels.widths
+    return all(widths.get(name) == width for name, width in MATERIAL_WIDTHS.items())
+
+
+def require_materials(gaussians: FlatGaussians, path: Path) -> None:
+    """Make sure that a scene has materials.
+
+    Args:
+        gaussians: the scene.
+        path: the file that it was read from, for the message.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    if not has_materials(gaussians):
+        raise ConfigError(
+            f"{path} has no materials (the channels {', '.join(MATERIAL_WIDTHS)}); "
+            "train it with: octasplat reconstruct SCENE -o OUT --materials."
+        )
+
+
+def f0_linear(
+    albedo_linear: Float[np.ndarray, "*n 3"], metallic: Float[np.ndarray, "*n 1"]
+) -> Float[np.ndarray, "*n 3"]:
+    """What a surface reflects head-on: 0.04 (1 - metallic) + metallic * albedo."""
+    return DIELECTRIC_F0 * (1 - metallic) + metallic * albedo_linear
+
+
+def split_materials(features: Float[np.ndarray, "n 5"]) -> Channels:
+    """The channels of a material from their columns side by side, copied, as float32 in [0, 1]."""
+    clipped = np.clip(features, 0.0, 1.0).astype(np.float32)
+    return Channels({ALBEDO: clipped[:, :3], METALLIC: clipped[:, 3:4], ROUGHNESS: clipped[:, 4:5]}).map(
+        np.ascontiguousarray
+    )

@@ -1,0 +1,121 @@
+"""A path at a surface that scatters: what one light sends to it, and the direction in which it goes on.
+
+The two ways in which light is found are joined by multiple importance sampling with the balance heuristic
+("Optimally Combining Sampling Techniques for Monte Carlo Rendering", Veach and Guibas 1995).
+"""
+
+import math
+
+import numpy as np
+
+from engine.light.kernels_bsdf import around, opaque_sample, opaque_value, sample_cosine
+from engine.light.kernels_lights import FAR, pick_light, sample_light
+from engine.light.kernels_surface import unit
+from engine.trace.kernels_native import lean
+
+CLEAR = 1
+"""Mark: every surface so far passed on all light in one direction; the first layer goes on."""
+SCATTERED = 2
+"""Mark: the path has left a matt or rough surface."""
+STRAIGHT = 4
+"""Mark: the path is still the camera's own ray."""
+FRONT = 8
+"""Mark: what the camera sees in this place is a surface of Gaussians with materials."""
+
+CHOICE, DIRECTION, PICK, PLACE, LAYER_PLACE = 0, 1, 2, 3, 4
+"""Pairs of uniform numbers of a surface."""
+SHORT_OF_LIGHT = 1.0 - 1e-4
+
+
+@lean(forceinline=True)
+def leave(paths, p, x, y, z, d_x, d_y, d_z, density):
+    """Send a path on."""
+    paths.origins_world[p, 0], paths.origins_world[p, 1], paths.origins_world[p, 2] = x, y, z
+    paths.directions_world[p, 0], paths.directions_world[p, 1], paths.directions_world[p, 2] = d_x, d_y, d_z
+    paths.densities[p] = density
+
+
+@lean(forceinline=True)
+def ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, blue, clamp):
+    """Ask a light: what it brings if nothing is in its way, no more than ``clamp``."""
+    most = max(red, green, blue)
+    if most > clamp:
+        red, green, blue = red * clamp / most, green * clamp / most, blue * clamp / most
+    shadows.lit[k, 0], shadows.lit[k, 1], shadows.lit[k, 2] = red, green, blue
+    shadows.origins_world[k, 0], shadows.origins_world[k, 1], shadows.origins_world[k, 2] = x, y, z
+    shadows.directions_world[k, 0] = w_x
+    shadows.directions_world[k, 1] = w_y
+    shadows.directions_world[k, 2] = w_z
+    shadows.t_max[k] = distance * SHORT_OF_LIGHT if distance < FAR else np.inf
+
+
+@lean(forceinline=True)
+def scatter(
+    k, p, n, numbers, paths, matt, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue, metallic,
+    roughness, ior, ground, kept, mirror, coat, coat_mean, lights, rules, shadows,
+):  # fmt: skip
+    """Ask a light, into row ``k`` of ``shadows``, and send path ``p`` on from a point off its surface.
+
+    Column ``n`` of ``numbers`` holds pairs of uniform ones. The normal n is the surface's own, s the one that
+    it is shaded by; a ``matt`` surface has a colour alone.
+    """
+    d = paths.directions_world[p]
+    a_x, a_y, a_z, b_x, b_y, b_z = around(s_x, s_y, s_z)
+    o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
+    o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
+    o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
+    if len(lights.kinds):
+        l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
+        if l >= 0:
+            u, v = numbers[PLACE, 0, n], numbers[PLACE, 1, n]
+            w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
+            i_z = w_x * s_x + w_y * s_y + w_z * s_z
+            if i_z > 0.0 and w_x * n_x + w_y * n_y + w_z * n_z > 0.0 and l_r + l_g + l_b > 0.0:
+                if matt:
+                    pdf = i_z / math.pi
+                    f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
+                else:
+                    f_r, f_g, f_b, pdf = opaque_value(
+                        o_x, o_y, o_z,
+                        w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z,
+                        red, green, blue, metallic, roughness, ior, ground, kept,
+                        mirror, coat, coat_mean,
+                    )  # fmt: skip
+                factor = 1.0 / share
+                shadows.straight[k] = l_pdf == 0.0
+                if l_pdf > 0.0:
+                    l_pdf *= share
+                    factor = 1.0 / (l_pdf + pdf) if lights.seen[l] else 1.0 / l_pdf
+                w = paths.weights[p]
+                l_r, l_g, l_b = (
+                    w[0] * f_r * l_r * factor,
+                    w[1] * f_g * l_g * factor,
+                    w[2] * f_b * l_b * factor,
+                )
+                clamp = rules.clamp if paths.marks[p] & SCATTERED else np.inf
+                ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, l_r, l_g, l_b, clamp)
+    u, v = numbers[DIRECTION, 0, n], numbers[DIRECTION, 1, n]
+    if matt:
+        i_x, i_y, i_z = sample_cosine(u, v)
+        pdf = i_z / math.pi
+        f_r, f_g, f_b = red * pdf, green * pdf, blue * pdf
+    else:
+        i_x, i_y, i_z = opaque_sample(
+            o_x, o_y, o_z, red, green, blue, metallic, roughness, coat, numbers[CHOICE, 0, n], u, v
+        )
+        f_r, f_g, f_b, pdf = opaque_value(
+            o_x, o_y, o_z, i_x, i_y, i_z, red, green, blue, metallic, roughness, ior, ground, kept,
+            mirror, coat, coat_mean,
+        )  # fmt: skip
+    w_x = i_x * a_x + i_y * b_x + i_z * s_x
+    w_y = i_x * a_y + i_y * b_y + i_z * s_y
+    w_z = i_x * a_z + i_y * b_z + i_z * s_z
+    if not pdf > 0.0 or w_x * n_x + w_y * n_y + w_z * n_z <= 0.0 or f_r + f_g + f_b <= 0.0:
+        paths.alive[p] = False
+        return
+    paths.weights[p, 0] *= f_r / pdf
+    paths.weights[p, 1] *= f_g / pdf
+    paths.weights[p, 2] *= f_b / pdf
+    paths.marks[p] = (paths.marks[p] | SCATTERED) & ~(CLEAR | STRAIGHT)
+    w_x, w_y, w_z = unit(w_x, w_y, w_z)
+    leave(paths, p, x, y, z, w_x, w_y, w_z, pdf)

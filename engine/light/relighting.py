@@ -1,0 +1,104 @@
+"""Scenes with materials in another light: what a camera sees of them under an environment."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from engine.colour import linear_to_srgb
+from engine.gaussians.model import FlatGaussians
+from engine.light.environment import EnvironmentMap
+from engine.light.integrator import LitScene, PathTracer
+from engine.light.layers import stage_layers
+from engine.light.lights import light_arrays, look_up_environment
+from engine.light.stage import Integrator, Stage, StageGaussians
+from engine.light.staging import stage_meshes
+from engine.rays import ImageRays
+from engine.trace.protocol import TraceSettings
+
+Part = Callable[[float], None]
+
+
+def _silent(_share: float) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class RelitImage:
+    """One picture, in front of nothing yet.
+
+    Attributes:
+        linear: radiance of what is seen of the scene, not multiplied by its coverage, without upper limit.
+        coverage: how much of each pixel the scene covers.
+    """
+
+    linear: Float32[np.ndarray, "h w 3"]
+    coverage: Float32[np.ndarray, "h w"]
+
+    def over(
+        self, background_srgb: Float32[np.ndarray, "3"] | Float32[np.ndarray, "h w 3"]
+    ) -> Float32[np.ndarray, "h w 3"]:
+        """Display values over a background, composited as such; beyond 1 where there is more light."""
+        covered = self.coverage[..., None]
+        return np.asarray(covered * linear_to_srgb(self.linear) + (1 - covered) * background_srgb, np.float32)
+
+
+@runtime_checkable
+class Relighter(Protocol):
+    """Shows a scene in the light of an environment."""
+
+    def put(self, environment: EnvironmentMap) -> None:
+        """Take this environment from now on."""
+        ...
+
+    def render(self, image: ImageRays, part: Part = _silent) -> RelitImage:
+        """What a camera sees; ``part`` is told the share that is done."""
+        ...
+
+
+class PathRelighter:
+    """By paths of light: right up to noise, with all shadows and inter-reflection.
+
+    Args:
+        gaussians: a scene with materials.
+        settings: where rays are cut off.
+        integrator: samples, depth and seed.
+        threads: to use; 0 takes all.
+    """
+
+    def __init__(
+        self, gaussians: FlatGaussians, settings: TraceSettings, integrator: Integrator, *, threads: int = 0
+    ) -> None:
+        stage = Stage(gaussians=(StageGaussians(light="relit"),), integrator=integrator)
+        self._layers = stage_layers(stage, gaussians, _no_file, Path(), settings, size=1.0, threads=threads)
+        self._meshes = stage_meshes(stage, Path(), threads=threads)
+        self._integrator = integrator
+        self._threads = threads
+        self._tracer: PathTracer | None = None
+
+    def put(self, environment: EnvironmentMap) -> None:
+        """Take this environment from now on."""
+        lights = light_arrays((), environment.frame[1], environment)
+        meshes = self._meshes.lit_by(lights)
+        self._tracer = PathTracer(LitScene(meshes, self._layers), self._integrator, threads=self._threads)
+
+    def render(self, image: ImageRays, part: Part = _silent) -> RelitImage:
+        """What a camera sees; ``part`` is told the share that is done."""
+        assert self._tracer is not None, "an environment must be put first"
+        film = self._tracer.render(image, lambda done, of: part(done / of))
+        return RelitImage(*film.surface())
+
+
+def surroundings(environment: EnvironmentMap, image: ImageRays) -> Float32[np.ndarray, "h w 3"]:
+    """Display values of the environment itself behind the pixels of a picture."""
+    lights = light_arrays((), environment.frame[1], environment)
+    directions: Float64[np.ndarray, "n 3"] = image.directions_world.reshape(-1, 3).astype(np.float64)
+    radiance, _ = look_up_environment(lights, directions)
+    return linear_to_srgb(radiance).astype(np.float32).reshape(image.height_px, image.width_px, 3)
+
+
+def _no_file(path: Path) -> FlatGaussians:
+    raise AssertionError(f"{path}: nothing is read here")

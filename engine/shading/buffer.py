@@ -1,0 +1,73 @@
+"""What is blended along rays before anything is shaded: materials, normals and depths, with the way back."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from engine.rays import RayBatch
+from engine.shading.split_sum import Surface
+from engine.trace.protocol import TraceResult
+
+LEAST_ALPHA = 0.02
+"""Rays that met less show nothing that could be shaded."""
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """What was blended along the rays that met something.
+
+    Attributes:
+        which: numbers of these rays.
+        alpha: what each met.
+        depth: mean distance, lengths of the direction.
+        length: of the blended normal.
+        surface: materials, normals and directions, not yet dimmed by anything.
+    """
+
+    which: Int64[np.ndarray, " p"]
+    alpha: Float64[np.ndarray, " p"]
+    depth: Float64[np.ndarray, " p"]
+    length: Float64[np.ndarray, " p"]
+    surface: Surface
+
+
+def gather(rays: RayBatch, seen: TraceResult) -> Buffer:
+    """The buffer of a trace whose first features are materials."""
+    alpha = 1.0 - seen.transmittance.astype(np.float64)
+    which = np.flatnonzero(alpha > LEAST_ALPHA)
+    alpha = alpha[which]
+    sums = seen.normal_world[which].astype(np.float64)
+    length = np.maximum(np.linalg.norm(sums, axis=1), 1e-9)
+    surface = Surface.alone(
+        seen.features[which, :5] / alpha[:, None], sums / length[:, None], rays.directions_world[which]
+    )
+    return Buffer(which, alpha, seen.depth_sum[which] / alpha, length, surface)
+
+
+def spread_back(
+    buffer: Buffer,
+    by_material: Float64[np.ndarray, "p 5"],
+    by_unit_normal: Float64[np.ndarray, "p 3"],
+    by_features: Float64[np.ndarray, "r f"],
+    by_alpha: Float64[np.ndarray, " r"],
+    by_normal: Float64[np.ndarray, "r 3"],
+) -> None:
+    """Add gradients by a buffer's materials and unit normals to those by what was blended."""
+    which, surface = buffer.which, buffer.surface
+    by_features[which, :5] += by_material / buffer.alpha[:, None]
+    by_alpha[which] -= (by_material * surface.material).sum(axis=1) / buffer.alpha
+    along = (by_unit_normal * surface.normal_world).sum(axis=1, keepdims=True)
+    by_normal[which] += (by_unit_normal - along * surface.normal_world) / buffer.length[:, None]
+
+
+def reflected_rays(rays: RayBatch, buffer: Buffer, of: Int64[np.ndarray, " s"], gap_world: float) -> RayBatch:
+    """Rays from the points of a buffer along their reflected directions, begun a little off the surface."""
+    which = buffer.which[of]
+    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[which]
+    directions = rays.directions_world[which].astype(np.float64)
+    normals = buffer.surface.normal_world[of]
+    points = origins + buffer.depth[of, None] * directions + gap_world * normals
+    mirrored = directions - 2 * (directions * normals).sum(axis=1, keepdims=True) * normals
+    mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
+    return RayBatch(points, mirrored, gap_world)

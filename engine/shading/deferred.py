@@ -1,0 +1,329 @@
+"""Deferred shading: materials and normals are blended along each ray, then shaded once by the split sum.
+
+A share of the pixels sends a ray along the reflected direction through the same Gaussians: its transmittance
+says how much of the environment is seen there, and what it meets is shaded too.
+
+After "Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282), whose visibility comes from a mesh.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from engine.colour import linear_to_srgb, srgb_to_linear
+from engine.gaussians.channels import stacked
+from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
+from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
+from engine.shading.ambient import ambient_visibility
+from engine.shading.buffer import Buffer, gather, reflected_rays, spread_back
+from engine.shading.environment_frame import environment_frame
+from engine.shading.geometry_terms import (
+    depth_normal_term,
+    smooth_normal_term,
+    smoothness_term,
+    spread_term,
+)
+from engine.shading.learnt_light import LearntLight
+from engine.shading.material_settings import SEED_MATERIAL, SEED_REACH, MaterialSettings
+from engine.shading.protocol import Developed, Reversed, Sight
+from engine.shading.split_sum import Surface, shade, shade_reverse
+from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
+
+AMBIENT_COLUMN = 5
+HIDDEN = 0.5
+"""Transmittance below which the seed's way of seeing counts the environment as hidden."""
+TURNS = 1 << 20
+"""So finely the share of the training that is done says whose turn it is."""
+
+
+@dataclass(frozen=True)
+class _Reflection:
+    """What the reflected rays of some pixels saw: of ``of`` (places in a buffer)."""
+
+    of: Int64[np.ndarray, " s"]
+    seen: TraceResult
+    buffer: Buffer | None
+    linear: Float64[np.ndarray, "q 3"] | None
+
+
+@dataclass(frozen=True)
+class _Kept:
+    buffer: Buffer
+    surface: Surface
+    linear: Float64[np.ndarray, "p 3"]
+    shown: Float64[np.ndarray, "p 3"]
+    reflection: _Reflection | None
+    shaded: float
+
+
+class Deferred:
+    """Materials, normals and an environment make the colours; follows the protocol of shading models.
+
+    The materials themselves are channels of the Gaussians, stepped by their optimiser.
+
+    Args:
+        settings: how they are learnt.
+        extent_world: the scene's extent.
+        window_rays: rays of a window of the training's batches, see
+            :class:`engine.train.batches.BatchSource`; 1 where there are none.
+
+    Attributes:
+        light: the environment.
+        frame: its right, up and forward in the world, as rows.
+    """
+
+    name = "materials"
+
+    def __init__(self, settings: MaterialSettings, *, extent_world: float, window_rays: int = 1) -> None:
+        self.settings = settings
+        self.light = LearntLight(settings)
+        self.frame = environment_frame(np.array(settings.up_world, np.float64))
+        self._gap = settings.start * extent_world
+        self._window = window_rays
+        self._started_over = np.zeros(1, bool)
+        self._features: Float32[np.ndarray, "n f"] = np.empty((0, 5), np.float32)
+
+    def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"]:
+        """The materials side by side, and the ambient visibility where it is known."""
+        names = [name for name in (*MATERIAL_WIDTHS, AMBIENT) if name in gaussians.channels]
+        self._features = stacked(gaussians.channels, names)
+        return self._features
+
+    def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
+        """Measure the ambient visibility of some of the Gaussians, by turns."""
+        settings = self.settings
+        if not settings.ambient or progress < settings.secondary_from or AMBIENT not in gaussians.channels:
+            return
+        parts = settings.ambient_parts
+        turn = int(progress * TURNS) * 7919 % parts
+        ids = np.arange(turn, len(gaussians), parts)
+        visible = ambient_visibility(
+            gaussians, ids, tracer, rays=settings.ambient_rays, gap_world=2 * self._gap
+        )
+        gaussians.channels[AMBIENT][ids, 0] = visible
+        self._features[ids, 5] = visible
+
+    def develop(self, sight: Sight) -> Developed:
+        """Display colours, shaded as far as the training has handed over to that."""
+        share = self.settings.handed_over(sight.progress)
+        seen = sight.seen
+        if share == 0:
+            return Developed(seen.rgb_srgb, seen.transmittance)
+        buffer = gather(sight.rays, seen)
+        surface, reflection = self._dimmed(seen, buffer, self.settings.blurred(sight.progress)), None
+        if sight.progress >= self.settings.secondary_from:
+            surface, reflection = self._reflect(sight, buffer, surface)
+        linear = shade(surface, self.light.levels, self.frame)
+        rgb = seen.rgb_srgb * np.float32(1 - share)
+        if self.settings.recipe == "seed":
+            shown = linear
+            if self.settings.is_seed_deferred(sight.progress):
+                matt = 1 - surface.material[:, 3:4]
+                rgb[buffer.which] = matt * seen.rgb_srgb[buffer.which]
+        else:
+            shown = linear_to_srgb(np.minimum(linear, 1.0))
+        rgb[buffer.which] += (share * buffer.alpha[:, None] * shown).astype(np.float32)
+        kept = _Kept(buffer, surface, linear, shown, reflection, share)
+        return Developed(rgb, seen.transmittance, kept)
+
+    def reverse(
+        self,
+        sight: Sight,
+        developed: Developed,
+        by_rgb: Float32[np.ndarray, "r 3"],
+        by_transmittance: Float32[np.ndarray, " r"],
+    ) -> Reversed:
+        """Gradients by what was blended, by what reflected rays met, and by the environment."""
+        settings, seen, kept = self.settings, sight.seen, developed.kept
+        by_alpha = -by_transmittance.astype(np.float64)
+        by_normal = np.zeros((len(by_rgb), 3))
+        by_features = np.zeros((len(by_rgb), seen.features.shape[1]))
+        by_depth = np.zeros(len(by_rgb))
+        further: tuple[tuple[Recording, TraceGradients], ...] = ()
+        parameters: dict[str, np.ndarray] = {}
+        if not isinstance(kept, _Kept):
+            rgb = by_rgb
+        else:
+            buffer, which = kept.buffer, kept.buffer.which
+            by_shown = by_rgb[which] * kept.shaded
+            by_alpha[which] += (by_shown * kept.shown).sum(axis=1)
+            by_linear = by_shown * buffer.alpha[:, None]
+            if settings.recipe != "seed":
+                by_linear *= encoding_slope(kept.linear)
+            back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear)
+            normal = back.normal + back.reflected if settings.reflected_gradient else back.normal
+            by_material, rgb = back.material, by_rgb * np.float32(1 - kept.shaded)
+            if settings.is_seed_deferred(sight.progress):
+                rgb[which] = by_rgb[which] * (1 - kept.surface.material[:, 3:4])
+                by_material[:, 3] -= (by_rgb[which] * seen.rgb_srgb[which]).sum(axis=1)
+            elif kept.shaded == 1:
+                weight = np.float32(settings.harmonics_weight * 2 / (3 * len(by_rgb)))
+                rgb = weight * (seen.rgb_srgb - developed.rgb_srgb)
+            spread_back(buffer, by_material, normal, by_features, by_alpha, by_normal)
+            by_texels = back.texels(len(self.light.levels.texels))
+            further = self._reflected_back(kept, back.indirect, by_texels)
+            parameters = {"materials.texels": by_texels}
+            self._regularise(sight, buffer, by_features, by_alpha, by_normal, by_depth)
+        narrow = (x.astype(np.float32) for x in (rgb, -by_alpha, by_depth, by_normal, by_features))
+        rgb, transmittance, depth, normal, features = narrow
+        back_seen = TraceGradients(
+            rgb_srgb=rgb,
+            transmittance=transmittance,
+            depth_sum=depth,
+            normal_world=normal,
+            features=features,
+        )
+        return Reversed(back_seen, further, parameters)
+
+    def step(
+        self,
+        gaussians: FlatGaussians,
+        gradients: GaussianGradients,
+        parameters: Mapping[str, np.ndarray],
+        *,
+        progress: float,
+    ) -> None:
+        """A step of the environment; what the optimiser made of the materials is taken over."""
+        ids = gradients.ids
+        if (
+            self.settings.recipe == "seed"
+            and not self._started_over[0]
+            and self.settings.is_seed_deferred(progress)
+        ):
+            self._start_over(gaussians)
+            return
+        first = 0
+        for name, width in MATERIAL_WIDTHS.items():
+            self._features[ids, first : first + width] = gaussians.channels[name][ids]
+            first += width
+        if "materials.texels" in parameters:
+            self.light.step(
+                parameters["materials.texels"], rate=self.settings.environment_rate * 0.1**progress
+            )
+
+    def _start_over(self, gaussians: FlatGaussians) -> None:
+        """Do as the seed's code does when its second stage begins."""
+        first = 0
+        for name, width in MATERIAL_WIDTHS.items():
+            gaussians.channels[name][:] = SEED_MATERIAL[first : first + width]
+            self._features[:, first : first + width] = SEED_MATERIAL[first : first + width]
+            first += width
+        self.light.start_over()
+        self._started_over[:] = True
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The environment."""
+        own = {f"materials.{name}": value for name, value in self.light.state().items()}
+        return {**own, "materials.started_over": self._started_over}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Take it back."""
+        own = {name.removeprefix("materials."): value for name, value in state.items()}
+        self._started_over = own["started_over"].copy()
+        self.light.restore(own)
+
+    def _dimmed(self, seen: TraceResult, buffer: Buffer, roughest: float = 0.0) -> Surface:
+        """The surface of a buffer with its ambient visibility, to which no gradient goes, and blurred."""
+        surface = buffer.surface
+        if roughest > 0:
+            material = surface.material.copy()
+            material[:, 4] = np.maximum(material[:, 4], roughest)
+            surface = replace(surface, material=material)
+        if self.settings.recipe == "seed":  # the seed's matt part is a colour of its own
+            return replace(surface, ambient=np.zeros(len(buffer.which)))
+        if not self.settings.ambient or seen.features.shape[1] <= AMBIENT_COLUMN:
+            return surface
+        return replace(surface, ambient=seen.features[buffer.which, AMBIENT_COLUMN] / buffer.alpha)
+
+    def _reflect(
+        self, sight: Sight, buffer: Buffer, surface: Surface
+    ) -> tuple[Surface, "_Reflection | None"]:
+        """The surface with what reflected rays say of it."""
+        settings = self.settings
+        if not settings.visibility:
+            return surface, None
+        of = np.arange(len(buffer.which))
+        if sight.view is not None and settings.secondary_share < 1:
+            # Every so-manieth pixel of the batch, which is drawn at random itself.
+            of = of[(of * settings.secondary_share) % 1 < settings.secondary_share]
+        rays = reflected_rays(sight.rays, buffer, of, self._gap)
+        seed = settings.recipe == "seed"
+        if seed:
+            rays = RayBatch(rays.origins_world, rays.directions_world, rays.t_min, SEED_REACH)
+        seen = sight.tracer.trace(rays, record=sight.view is not None)
+        visibility = surface.visibility.copy()
+        visibility[of] = seen.transmittance > HIDDEN if seed else seen.transmittance
+        indirect = np.zeros_like(surface.indirect_linear)
+        below, linear = None, None
+        if settings.indirect == "shaded" and not seed:
+            below = gather(rays, seen)
+            below = replace(below, surface=self._dimmed(seen, below))
+            linear = shade(below.surface, self.light.levels, self.frame)
+            indirect[of[below.which]] = below.alpha[:, None] * linear
+        elif seed and settings.indirect != "none":
+            indirect[of] = (1.0 - visibility[of, None]) * seen.rgb_srgb
+        elif settings.indirect == "harmonics":
+            alpha = np.maximum(1.0 - seen.transmittance.astype(np.float64), 1e-6)[:, None]
+            indirect[of] = srgb_to_linear(seen.rgb_srgb / alpha) * alpha
+        surface = replace(surface, visibility=visibility, indirect_linear=indirect)
+        return surface, _Reflection(of, seen, below, linear)
+
+    def _reflected_back(
+        self, kept: _Kept, by_indirect: Float64[np.ndarray, "p 3"], by_texels: Float64[np.ndarray, "t 3"]
+    ) -> tuple[tuple[Recording, TraceGradients], ...]:
+        """Gradients by what reflected rays met: its materials and normals, or its harmonics; no geometry."""
+        reflection = kept.reflection
+        if reflection is None or (hits := reflection.seen.hits) is None:
+            return ()
+        seen, count = reflection.seen, len(reflection.of)
+        nothing = np.zeros((count, 3), np.float32)
+        if self.settings.recipe == "seed":
+            hidden = seen.transmittance <= HIDDEN
+            by_rgb = (by_indirect[reflection.of] * hidden[:, None]).astype(np.float32)
+            return ((hits, TraceGradients(rgb_srgb=by_rgb)),)
+        if self.settings.indirect == "harmonics":
+            alpha = np.maximum(1.0 - seen.transmittance.astype(np.float64), 1e-6)[:, None]
+            slope = 1.0 / encoding_slope(srgb_to_linear(seen.rgb_srgb / alpha))
+            by_rgb = (by_indirect[reflection.of] * slope).astype(np.float32)
+            return ((hits, TraceGradients(rgb_srgb=by_rgb)),)
+        below = reflection.buffer
+        if below is None:
+            return ()
+        by_linear = by_indirect[reflection.of[below.which]] * below.alpha[:, None]
+        back = shade_reverse(below.surface, self.light.levels, self.frame, by_linear)
+        by_texels += back.texels(len(by_texels))
+        by_features = np.zeros((count, seen.features.shape[1]))
+        by_alpha, by_normal = np.zeros(count), np.zeros((count, 3))
+        spread_back(below, back.material, np.zeros_like(back.normal), by_features, by_alpha, by_normal)
+        gradients = TraceGradients(rgb_srgb=nothing, features=by_features.astype(np.float32))
+        return ((hits, gradients),)
+
+    def _regularise(
+        self,
+        sight: Sight,
+        buffer: Buffer,
+        by_features: Float64[np.ndarray, "r f"],
+        by_alpha: Float64[np.ndarray, " r"],
+        by_normal: Float64[np.ndarray, "r 3"],
+        by_depth: Float64[np.ndarray, " r"],
+    ) -> None:
+        """Add the gradients of the terms that hold normals, depths and materials together."""
+        settings = self.settings
+        spread_term(buffer, settings.normal_weight / len(by_alpha), by_alpha, by_normal)
+        if self._window > 1 and settings.depth_normal_weight > 0:
+            depth_normal_term(
+                sight, self._window, settings.depth_normal_weight, by_alpha, by_normal, by_depth
+            )
+        if self._window > 1 and settings.smooth_normal_weight > 0:
+            smooth_normal_term(sight, self._window, settings.smooth_normal_weight, by_normal)
+        if self._window > 1 and settings.smooth_weight > 0:
+            smoothness_term(sight, self._window, settings.smooth_weight, by_features, by_alpha)
+
+
+def encoding_slope(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+    """Slope of the display values by the linear ones; beyond white that at white, so that light can fall."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92, (1.055 / 2.4) * np.maximum(x, 0.0031308) ** (1 / 2.4 - 1))

@@ -1,0 +1,158 @@
+"""Terms of the loss that hold normals, depths and materials together, by their gradients alone.
+
+Batches of training rays come in windows: square grids of rays with one random pixel of each cell. Neighbours
+in a window are neighbours on the surface, so that differences between them mean something.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from engine.shading.buffer import Buffer
+from engine.shading.protocol import Sight
+
+OPAQUE = 0.9
+"""Accumulated alpha from which on a ray shows a surface."""
+STEEPEST = 0.15
+"""Neighbours that span a surface seen at a smaller cosine lie on two surfaces."""
+SMOOTH = 0.8
+"""Cosine from which on the normals of neighbours count as those of one smooth surface."""
+_ALL, _FROM, _TO = slice(None), slice(1, None), slice(None, -1)
+_NEIGHBOURS = (((_ALL, _ALL, _FROM), (_ALL, _ALL, _TO)), ((_ALL, _FROM), (_ALL, _TO)))
+"""The two of each pair of neighbours in a grid of rays, across and down."""
+EDGE = 0.02
+"""Difference of materials at which their smoothness turns from a square to a straight line."""
+
+
+def spread_term(
+    buffer: Buffer,
+    weight: float,
+    by_alpha: Float64[np.ndarray, " r"],
+    by_normal: Float64[np.ndarray, "r 3"],
+) -> None:
+    """Half of the sum of w |n - N|^2 over a ray's Gaussians, N the direction of the blended normal.
+
+    That is the accumulated alpha minus the length of the blended normal: it needs no neighbours.
+    """
+    by_alpha[buffer.which] += weight
+    by_normal[buffer.which] -= weight * buffer.surface.normal_world
+
+
+def depth_normal_term(
+    sight: Sight,
+    window_rays: int,
+    weight: float,
+    by_alpha: Float64[np.ndarray, " r"],
+    by_normal: Float64[np.ndarray, "r 3"],
+    by_depth: Float64[np.ndarray, " r"],
+) -> None:
+    """One minus the cosine between the blended normal and that of the points of three neighbouring rays."""
+    side, first = _grid(sight, window_rays)
+    if first is None:
+        return
+    seen, rays = sight.seen, sight.rays
+    alpha = 1.0 - seen.transmittance[first:].astype(np.float64)
+    solid = np.maximum(alpha, 1e-6)
+    depth = seen.depth_sum[first:] / solid
+    directions = rays.directions_world[first:].astype(np.float64)
+    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[first:]
+    points = (origins + depth[:, None] * directions).reshape(-1, side, side, 3)
+    middle, right, below = points[:, :-1, :-1], points[:, :-1, 1:], points[:, 1:, :-1]
+    a, b = right - middle, below - middle
+    cross = np.cross(a, b)
+    length = np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-12)
+    towards = -directions.reshape(points.shape)[:, :-1, :-1]
+    turned = np.where((cross * towards).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    spanned = turned * cross / length
+    sums = seen.normal_world[first:].astype(np.float64).reshape(points.shape)[:, :-1, :-1]
+    normal_length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
+    normal = sums / normal_length
+    opaque = alpha.reshape(points.shape[:3]) > OPAQUE
+    counted = opaque[:, :-1, :-1] & opaque[:, :-1, 1:] & opaque[:, 1:, :-1]
+    counted &= (spanned * towards).sum(axis=-1) > STEEPEST
+    share = np.where(counted, weight / len(seen.transmittance), 0.0)[..., None]
+    cosine = (spanned * normal).sum(axis=-1, keepdims=True)
+    by_sums = -share * (spanned - cosine * normal) / normal_length
+    by_cross = -share * turned * (normal - cosine * spanned) / length
+    by_a, by_b = np.cross(b, by_cross), np.cross(by_cross, a)
+    by_points = np.zeros_like(points)
+    by_points[:, :-1, 1:] += by_a
+    by_points[:, 1:, :-1] += by_b
+    by_points[:, :-1, :-1] -= by_a + by_b
+    along = (by_points.reshape(-1, 3) * directions).sum(axis=1)
+    by_depth[first:] += along / solid
+    by_alpha[first:] -= along * depth / solid
+    whole = np.zeros_like(points)
+    whole[:, :-1, :-1] = by_sums
+    by_normal[first:] += whole.reshape(-1, 3)
+
+
+def smooth_normal_term(
+    sight: Sight, window_rays: int, weight: float, by_normal: Float64[np.ndarray, "r 3"]
+) -> None:
+    """One minus the cosine between the normals of neighbouring rays, where these show one smooth surface.
+
+    A surface that is bent evenly has no gradient from it.
+    """
+    side, first = _grid(sight, window_rays)
+    if first is None:
+        return
+    sums = sight.seen.normal_world[first:].astype(np.float64).reshape(-1, side, side, 3)
+    length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
+    normal = sums / length
+    opaque = (sight.seen.transmittance[first:] < 1 - OPAQUE).reshape(-1, side, side)
+    gradient = np.zeros_like(normal)
+    for one, other in _NEIGHBOURS:
+        cosine = (normal[one] * normal[other]).sum(axis=-1, keepdims=True)
+        counted = (opaque[one] & opaque[other])[..., None] & (cosine > SMOOTH)
+        share = np.where(counted, weight / len(sight.seen.transmittance), 0.0)
+        gradient[one] -= share * (normal[other] - cosine * normal[one])
+        gradient[other] -= share * (normal[one] - cosine * normal[other])
+    by_normal[first:] += (gradient / length).reshape(-1, 3)
+
+
+def smoothness_term(
+    sight: Sight,
+    window_rays: int,
+    weight: float,
+    by_features: Float64[np.ndarray, "r f"],
+    by_alpha: Float64[np.ndarray, " r"],
+) -> None:
+    """Differences of materials between neighbouring rays: their size, rounded off near zero."""
+    side, first = _grid(sight, window_rays)
+    if first is None:
+        return
+    alpha = 1.0 - sight.seen.transmittance[first:].astype(np.float64)
+    solid = np.maximum(alpha, 1e-6)[:, None]
+    flat = sight.seen.features[first:, :5] / solid
+    material = flat.reshape(-1, side, side, 5)
+    opaque = (alpha > OPAQUE).reshape(-1, side, side)
+    gradient = np.zeros_like(material)
+    for one, other in _NEIGHBOURS:
+        difference = material[one] - material[other]
+        slope = difference / np.sqrt(difference**2 + EDGE**2)
+        slope = _where(opaque[one] & opaque[other], slope) * (weight / len(sight.seen.transmittance))
+        gradient[one] += slope
+        gradient[other] -= slope
+    by_flat = gradient.reshape(-1, 5)
+    by_features[first:, :5] += by_flat / solid
+    by_alpha[first:] -= (by_flat * flat).sum(axis=1) / solid[:, 0]
+
+
+def _where(
+    mask: Bool[np.ndarray, "*shape"], values: Float64[np.ndarray, "*shape 5"]
+) -> Float64[np.ndarray, "*shape 5"]:
+    return np.where(mask[..., None], values, 0.0)
+
+
+def _grid(sight: Sight, window_rays: int) -> tuple[int, int | None]:
+    """Side of the windows, and the first ray that is in one; None if there are none.
+
+    Windows come last, since patches are not mixed with materials.
+    """
+    side = math.isqrt(window_rays)
+    count = len(sight.seen.transmittance)
+    if sight.view is None or count < window_rays:
+        return side, None
+    return side, count % window_rays

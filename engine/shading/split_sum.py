@@ -1,0 +1,175 @@
+"""Split-sum shading: light of an environment off a surface of a material, as pure functions with gradients.
+
+    colour = (F0 A(N.V, r) + B(N.V, r)) (V L(R, r) + indirect) + (1 - m) albedo (ambient E(N) + bounced)
+
+in linear light, with F0 = 0.04 (1 - m) + m albedo; L are the prefiltered levels of the environment in the
+reflected direction R, E its irradiance over pi, and A, B a table that is integrated here. After "Real Shading
+in Unreal Engine 4" (Karis 2013, https://blog.selfshadow.com/publications/s2013-shading-course/) and
+"Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282), whose matt part is another.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64, Int32
+
+from engine.shading.environment_levels import LightLevels
+from engine.shading.kernels_split_sum import (
+    TAPS,
+    add_to_texels,
+    integrate_table,
+    reverse_pixels,
+    shade_pixels,
+)
+
+TABLE_ROUGHNESSES = 32
+TABLE_COSINES = 64
+TABLE_SAMPLES = 512
+
+
+@lru_cache(maxsize=1)
+def split_sum_table() -> Float64[np.ndarray, "a c 2"]:
+    """Scale A and bias B of F0: rows are roughness 0 to 1, columns the cosine to the viewer 0 to 1."""
+    table = np.empty((TABLE_ROUGHNESSES, TABLE_COSINES, 2))
+    integrate_table(TABLE_SAMPLES, table)
+    return table
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What is shaded, ``p`` points of it.
+
+    Attributes:
+        material: albedo (linear), metallic, perceptual roughness.
+        normal_world: unit normals, turned to the viewer.
+        direction_world: unit directions from the viewer to the points.
+        visibility: share of the environment that is seen along the reflected direction.
+        indirect_linear: light that comes from there instead, already times one minus that.
+        ambient: share of the irradiance that arrives.
+        bounced_linear: irradiance over pi that comes from other surfaces.
+    """
+
+    material: Float64[np.ndarray, "p 5"]
+    normal_world: Float64[np.ndarray, "p 3"]
+    direction_world: Float64[np.ndarray, "p 3"]
+    visibility: Float64[np.ndarray, " p"]
+    indirect_linear: Float64[np.ndarray, "p 3"]
+    ambient: Float64[np.ndarray, " p"]
+    bounced_linear: Float64[np.ndarray, "p 3"]
+
+    @classmethod
+    def alone(
+        cls,
+        material: Float[np.ndarray, "p 5"],
+        normal_world: Float[np.ndarray, "p 3"],
+        direction_world: Float[np.ndarray, "p 3"],
+    ) -> "Surface":
+        """Points that nothing hides from the environment."""
+        count = len(material)
+        nothing = np.zeros((count, 3))
+        return cls(
+            material.astype(np.float64),
+            normal_world.astype(np.float64),
+            direction_world.astype(np.float64),
+            visibility=np.ones(count),
+            indirect_linear=nothing,
+            ambient=np.ones(count),
+            bounced_linear=nothing,
+        )
+
+
+class ShadeGradients(NamedTuple):
+    """Gradients of a loss by what went into :func:`shade`.
+
+    Attributes:
+        material: by albedo, metallic and roughness.
+        normal: by the normal, but not through the reflected direction.
+        reflected: by the normal through the reflected direction.
+        visibility: by the visibility.
+        indirect: by the indirect light.
+        ambient: by the ambient visibility.
+        bounced: by the bounced light.
+        specular: by what the lobe sees, each channel.
+        diffuse: by the irradiance.
+        taps: texels that were asked.
+        weights: their weights.
+    """
+
+    material: Float64[np.ndarray, "p 5"]
+    normal: Float64[np.ndarray, "p 3"]
+    reflected: Float64[np.ndarray, "p 3"]
+    visibility: Float64[np.ndarray, " p"]
+    indirect: Float64[np.ndarray, "p 3"]
+    ambient: Float64[np.ndarray, " p"]
+    bounced: Float64[np.ndarray, "p 3"]
+    specular: Float64[np.ndarray, "p 3"]
+    diffuse: Float64[np.ndarray, "p 3"]
+    taps: Int32[np.ndarray, "p 12"]
+    weights: Float64[np.ndarray, "p 12"]
+
+    def texels(self, count: int) -> Float64[np.ndarray, "t 3"]:
+        """Gradients by the texels of all levels, summed pixel after pixel."""
+        sums = np.zeros((count, 3))
+        add_to_texels(self.taps, self.weights, self.specular, self.diffuse, sums)
+        return sums
+
+
+def shade(
+    surface: Surface, light: LightLevels, frame: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "p 3"]:
+    """Linear colours.
+
+    Args:
+        surface: the points.
+        light: the environment's levels.
+        frame: its right, up and forward in the world, as rows.
+    """
+    rgb = np.empty((len(surface.material), 3))
+    shade_pixels(*_arguments(surface, frame), light, split_sum_table(), rgb)
+    return rgb
+
+
+def shade_reverse(
+    surface: Surface,
+    light: LightLevels,
+    frame: Float64[np.ndarray, "3 3"],
+    by_rgb: Float64[np.ndarray, "p 3"],
+    *,
+    blur: float = 0.0,
+) -> ShadeGradients:
+    """Gradients of what :func:`shade` gave.
+
+    Args:
+        surface: the points.
+        light: the environment's levels.
+        frame: its right, up and forward in the world, as rows.
+        by_rgb: gradient by the colours.
+        blur: roughness from which on up the levels may lead the reflected direction: one that sees far,
+            while normals are still wrong. 0 gives the true gradient.
+    """
+    count = len(surface.material)
+    widths = {"material": 5, "taps": TAPS, "weights": TAPS, "visibility": 0, "ambient": 0}
+    arrays = {
+        name: np.empty(
+            (count, widths.get(name, 3)) if widths.get(name, 3) else count,
+            np.int32 if name == "taps" else np.float64,
+        )
+        for name in ShadeGradients._fields
+    }
+    out = ShadeGradients(**arrays)
+    reverse_pixels(*_arguments(surface, frame), light, split_sum_table(), blur, by_rgb, out)
+    return out._replace(normal=out.normal @ frame, reflected=out.reflected @ frame)
+
+
+def _arguments(surface: Surface, frame: Float64[np.ndarray, "3 3"]) -> tuple[np.ndarray, ...]:
+    return (
+        surface.material,
+        np.ascontiguousarray(surface.normal_world @ frame.T),
+        np.ascontiguousarray(surface.direction_world @ frame.T),
+        surface.visibility,
+        surface.indirect_linear,
+        surface.ambient,
+        surface.bounced_linear,
+    )

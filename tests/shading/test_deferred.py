@@ -1,0 +1,179 @@
+"""The model of materials: its gradients through the tracer, a scene of known light, stopping and going on."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engine.errors import Cancelled
+from engine.events import Event, HeldOutMeasured
+from engine.gaussians.channels import stacked
+from engine.gaussians.frames import frames_from_normals, quaternions
+from engine.gaussians.model import FlatGaussians, concatenate
+from engine.rays import RayBatch
+from engine.shading.ambient import ambient_visibility
+from engine.shading.deferred import Deferred
+from engine.shading.material_settings import MaterialSettings
+from engine.shading.protocol import Sight
+from engine.trace.cpu import CpuTracer
+from engine.trace.protocol import TraceSettings
+from engine.train.batches import BatchSource
+from engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from engine.train.initialise import with_first_materials
+from engine.train.iteration import differentiate
+from engine.train.shading import make_deferred
+from engine.train.state import TrainState, fresh_state
+from engine.train.trainer import Trainer
+
+sys.path.append(str(Path(__file__).parents[1] / "train"))
+
+from flat_world import FlatWorld, small_config
+
+BARE = {
+    "learn": True, "environment_height": 16, "ambient_rays": 4, "normal_weight": 0.0,
+    "depth_normal_weight": 0.0, "smooth_weight": 0.0, "smooth_normal_weight": 0.0, "harmonics_weight": 0.0,
+    "white_weight": 0.0, "even_weight": 0.0,
+}  # fmt: skip
+
+
+def wall(normal: tuple[float, float, float], points: np.ndarray, material: list[float]) -> FlatGaussians:
+    count = len(points)
+    gaussians = FlatGaussians(
+        points.astype(np.float32),
+        quaternions(frames_from_normals(np.tile(np.array(normal, float), (count, 1)))).astype(np.float32),
+        np.full((count, 2), np.log(0.1), np.float32),
+        np.full(count, 5.0, np.float32),
+        np.zeros((count, 1, 3), np.float32),
+    )
+    gaussians = with_first_materials(gaussians, MaterialSettings())
+    for name, values in {
+        "albedo": material[:3],
+        "metallic": material[3:4],
+        "roughness": material[4:],
+    }.items():
+        gaussians.channels[name][:] = values
+    return gaussians
+
+
+def floor(side: float, step: float, above: float = 0.0) -> np.ndarray:
+    x, y = np.meshgrid(*[np.arange(-side, side, step)] * 2)
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, above)], axis=1)
+
+
+@pytest.mark.parametrize("indirect", ["shaded", "harmonics"])
+def test_gradients_agree_with_finite_differences(indirect: str) -> None:
+    rng = np.random.default_rng(5)
+    world = FlatWorld()
+    # What reflected rays meet has no gradient by its geometry; nothing is seen that hides the rest by edges.
+    settings = MaterialSettings(**BARE, indirect=indirect, blur=0.0, ambient=False)
+    gaussians = with_first_materials(world.start(opacity=0.6), settings)
+    gaussians.means_world[:, 2] = rng.permutation(np.linspace(-0.4, 0.4, len(gaussians)))
+    for values in gaussians.channels.values():
+        values[:] = rng.uniform(0.2, 0.8, values.shape)
+    model = Deferred(settings, extent_world=1.0)
+    model.light.log_radiance[:] = rng.normal(-1, 0.4, model.light.log_radiance.shape)
+    tracer = CpuTracer(TraceSettings(q=30.0, transmittance_min=1e-6), threads=1)
+    config = small_config(loss={"l1": 0.0, "l2": 1.0})
+    batch = BatchSource(world, config).draw(rng)
+
+    def look() -> tuple[float, dict[str, np.ndarray]]:
+        tracer.build(gaussians, model.features(gaussians))
+        found = differentiate(batch, tracer, model, config.loss, progress=1.0)
+        by_light = model.light._prefilter.transposed(found.shading["materials.texels"])
+        whole = {"light": by_light * model.light.radiance_linear}
+        features = np.zeros((len(gaussians), 6))
+        features[found.gaussians.ids] = found.gaussians.features
+        whole |= {"albedo": features[:, :3], "metallic": features[:, 3:4], "roughness": features[:, 4:5]}
+        return found.loss.value, whole
+
+    for name, gradient in look()[1].items():
+        parameter = model.light.log_radiance if name == "light" else gaussians.channels[name]
+        before = parameter.copy()
+        direction = (gradient / np.linalg.norm(gradient)).astype(np.float32)
+        values = []
+        for sign in (1, -1):
+            parameter[:] = before + sign * np.float32(0.02) * direction
+            model.light._levels = None
+            values.append(look()[0])
+        parameter[:] = before
+        model.light._levels = None
+        expected = float((gradient * direction).sum())
+        assert (values[0] - values[1]) / 0.04 == pytest.approx(expected, rel=0.03), name
+
+
+def test_a_mirror_shows_what_stands_before_it_and_else_the_environment() -> None:
+    mirror = wall((0, 0, 1), floor(1.0, 0.1), [1, 1, 1, 1, 0.05])
+    red = wall((0, 0, 1), floor(1.0, 0.1, above=1.0), [1, 0, 0, 0.0, 1.0])
+    settings = MaterialSettings(**BARE, up_world=(0, 0, 1))
+    model = Deferred(settings, extent_world=1.0)
+    radiance = np.full((16, 32, 3), 0.05, np.float32)
+    radiance[:8] = 0.5  # the upper half
+    model.light.put(radiance)
+    down = np.array([[0.0, 0.05, -1.0]]) / np.hypot(1, 0.05)
+    rays = RayBatch(np.array([[0, 0, 0.5]]), down)
+    # The red wall's lower side: matt, lit by the lower half, and four percent of gloss.
+    for scene, expected in (
+        (mirror, [0.5] * 3),
+        (concatenate([mirror, red]), [0.05 * 1.02, 0.0012, 0.0012]),
+    ):
+        tracer = CpuTracer(threads=1)
+        tracer.build(scene, model.features(scene))
+        shown = model.develop(Sight(rays, tracer.trace(rays), tracer)).rgb_srgb[0]
+        linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+        np.testing.assert_allclose(linear, expected, atol=0.012)
+
+
+def test_ambient_visibility_under_a_lid_is_its_form_factor() -> None:
+    ground = wall((0, 0, 1), np.zeros((1, 3)), [0.5] * 5)
+    lid = wall((0, 0, 1), floor(2.0, 0.08, above=1.0) + 0.04, [0.5] * 5)
+    lid = lid.select(np.linalg.norm(lid.means_world[:, :2], axis=1) < 1)
+    below = lid.copy()  # so that no side of the ground is open
+    below.means_world[:, 2] = -0.2
+    both = concatenate([ground, lid, below])
+    tracer = CpuTracer(threads=1)
+    tracer.build(both)
+    found = ambient_visibility(both, np.array([0]), tracer, rays=2000, gap_world=0.01)
+    radius = 1.1  # the disc and what of its outermost Gaussians is about opaque
+    assert found[0] == pytest.approx(1 - radius**2 / (radius**2 + 1), abs=0.05)
+
+
+def train(
+    folder: Path, *, stop_after: int | None = None, threads: int = 1, recipe: str = "split_sum"
+) -> tuple[Deferred, TrainState, list[float]]:
+    """Train materials; with ``stop_after``, stop there and go on from the checkpoint with a fresh model."""
+    world, events = FlatWorld(), list[Event]()
+    materials = {
+        "learn": True, "environment_height": 16, "ambient_rays": 4, "ambient_parts": 2, "recipe": recipe,
+    }  # fmt: skip
+    config = small_config(materials=materials, sh_degree=0)
+    first = with_first_materials(world.start(opacity=0.6), config.materials)
+    state = fresh_state(first, config.seed)
+
+    def trainer(state: TrainState, last: float) -> tuple[Trainer, Deferred]:
+        model = make_deferred(config, world.extent)
+        return Trainer(
+            world, config, state, folder=folder, fingerprint="test", listener=events.append, threads=threads,
+            should_stop=lambda: state.iteration >= last, shading=model,
+        ), model  # fmt: skip
+
+    if stop_after is not None:
+        with pytest.raises(Cancelled):
+            trainer(state, stop_after)[0].run()
+        path = latest_checkpoint(folder)
+        assert path is not None
+        state = load_checkpoint(path, "test")
+    last, model = trainer(state, np.inf)
+    last.run()
+    return model, state, [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
+
+
+@pytest.mark.parametrize("recipe", ["split_sum", "seed"])
+def test_it_trains_stops_and_goes_on_to_the_same_bytes_on_any_threads(tmp_path: Path, recipe: str) -> None:
+    whole, state, psnr = train(tmp_path / "whole", recipe=recipe)
+    assert psnr[-1] > psnr[0] + 1
+    parts, resumed, _ = train(tmp_path / "parts", stop_after=50, threads=2, recipe=recipe)
+    assert parts.light.log_radiance.tobytes() == whole.light.log_radiance.tobytes()
+    assert stacked(resumed.gaussians.channels).tobytes() == stacked(state.gaussians.channels).tobytes()
+    assert resumed.gaussians.quats_wxyz.tobytes() == state.gaussians.quats_wxyz.tobytes()
+    assert np.ptp(state.gaussians.channels["albedo"]) > 0.05
