@@ -185,7 +185,7 @@ class Film:
             "shadow": (shadow, np.clip(1.0 - shadow.mean(axis=1), 0.0, 1.0)),
             "things": (things, alpha[:, 0]),
         }
-        channels = {}
+        channels: dict[str, Float32[np.ndarray, "h w"]] = {}
         for name, (rgb, a) in parts.items():
             channels |= {f"{name}.{c}": self._picture(rgb[:, k]) for k, c in enumerate("RGB")}
             channels[f"{name}.A"] = self._picture(a)

@@ -8,7 +8,7 @@ several threads can share the work.
 import math
 
 from engine.light.arrays import BLOCK, PAIRS_OF_SURFACE
-from engine.light.kernels_bsdf import around, fresnel_dielectric, table_value
+from engine.light.kernels_bsdf import around, fresnel_dielectric
 from engine.light.kernels_frosted import LEAST_FROST, frosted_sample, frosted_value
 from engine.light.kernels_lights import (
     emitted,
@@ -47,6 +47,7 @@ from engine.light.kernels_surface import (
     unit,
     vertex_colour,
 )
+from engine.shading.kernels_microfacets import table_value
 from engine.trace.kernels_native import lean
 
 ENDED = -2
