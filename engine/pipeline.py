@@ -34,6 +34,7 @@ from engine.events import (
 from engine.files import ExportOptions, check_writable
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
+from engine.gaussians.materials import reflective_share
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import write_environment
 from engine.plain_colours import PlainScene
@@ -70,6 +71,9 @@ from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 from engine.versions import versions
 from engine.writing import write_json
+
+LEAST_REFLECTIVE = 0.01
+"""Share of the surface that must reflect for materials and the environment to be more than guesses."""
 
 Watcher = Callable[[int, Dataset, Tracer], None]
 """Shown a training between two iterations: iterations done, photographs, and the tracer as it is then."""
@@ -286,6 +290,13 @@ def _train(
     gaussians = trainer.run()
     if (deferred := deferred_of(trainer.shading)) is not None:
         write_environment(output / ENVIRONMENT, deferred.light.radiance_linear)
+        if reflective_share(gaussians) < LEAST_REFLECTIVE:
+            tell(
+                Warned(
+                    "Nothing was seen that reflects its surroundings clearly: metallic, roughness and the "
+                    "environment are guesses, and relighting will show it."
+                )
+            )
     write_json(output / TRAINING, {"seconds": clock.stop(), "iterations": trainer.state.iteration})
     return gaussians
 

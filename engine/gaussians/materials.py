@@ -65,3 +65,14 @@ def split_materials(features: Float[np.ndarray, "n 5"]) -> Channels:
     return Channels({ALBEDO: clipped[:, :3], METALLIC: clipped[:, 3:4], ROUGHNESS: clipped[:, 4:5]}).map(
         np.ascontiguousarray
     )
+
+
+def reflective_share(gaussians: FlatGaussians) -> float:
+    """Share of a scene's surface, by area times opacity, that is metal which shows its surroundings.
+
+    Where there is next to none, nothing says how bright the environment is, nor what is metal.
+    """
+    area = gaussians.opacities * np.prod(gaussians.scales, axis=1)
+    shows = (gaussians.channels[METALLIC][:, 0] > 0.5) & (gaussians.channels[ROUGHNESS][:, 0] < 0.5)
+    total = float(area.sum(dtype=np.float64))
+    return float(area[shows].sum(dtype=np.float64)) / total if total > 0 else 0.0

@@ -79,21 +79,27 @@ def with_files(stage: Stage, names: Mapping[str, str]) -> Stage:
     return Stage.model_validate(content)
 
 
+BALL_OF_SIZE = 0.12
+"""Radius of the first stage's ball."""
+
+
 @dataclass(frozen=True)
 class StageFacts:
     """What a first stage of a scene is fitted to.
 
     Attributes:
         up: the direction that is up, a unit vector.
-        floor: a point on what the scene stands on.
+        floor: a point on what the scene stands on, or on which a ball would stand that hangs free.
         size: about as large as what the cameras look at, world units.
         light_direction: the way that the scene's light seems to go.
+        has_floor: whether the scene shows anything level to stand on.
     """
 
     up: tuple[float, float, float]
     floor: tuple[float, float, float]
     size: float
     light_direction: tuple[float, float, float]
+    has_floor: bool = True
 
 
 def write_first_stage(path: Path, facts: StageFacts) -> None:
@@ -102,7 +108,7 @@ def write_first_stage(path: Path, facts: StageFacts) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    radius = 0.12 * facts.size
+    radius = BALL_OF_SIZE * facts.size
     centre = tuple(p + radius * u for p, u in zip(facts.floor, facts.up, strict=True))
     lamp = tuple(p - 2.0 * facts.size * d for p, d in zip(facts.floor, facts.light_direction, strict=True))
     write_text(
@@ -111,6 +117,7 @@ def write_first_stage(path: Path, facts: StageFacts) -> None:
             up=_vector(facts.up),
             centre=_vector(centre),
             floor=_vector(facts.floor),
+            where=ON_FLOOR if facts.has_floor else FREE,
             light=_vector(facts.light_direction),
             lamp=_vector(lamp),
             radius=f"{radius:.4g}",
@@ -118,6 +125,10 @@ def write_first_stage(path: Path, facts: StageFacts) -> None:
             intensity=f"{4.0 * facts.size**2:.4g}",
         ),
     )
+
+
+ON_FLOOR = "A ball on what seems to be the floor, at"
+FREE = "No floor is to be seen: a ball that hangs before what the cameras look at, above"
 
 
 def _vector(values: tuple[float, ...]) -> str:
@@ -174,7 +185,7 @@ light = "shadowed"
 ambient = 0.4                    # what is left of the colour in full shadow
 shadows_on_meshes = true
 
-# A ball on what seems to be the floor, at {floor}.
+# {where} {floor}.
 [[meshes]]
 shape = "sphere"                 # or: file = "thing.obj"
 position = {centre}

@@ -113,7 +113,7 @@ class Deferred:
         if share == 0:
             return Developed(seen.rgb_srgb, seen.transmittance)
         buffer = gather(sight.rays, seen)
-        surface, reflection = self._dimmed(seen, buffer, self.settings.blurred(sight.progress)), None
+        surface, reflection = self._dimmed(seen, buffer), None
         if sight.progress >= self.settings.secondary_from:
             surface, reflection = self._reflect(sight, buffer, surface)
         linear = shade(surface, self.light.levels, self.frame)
@@ -127,7 +127,8 @@ class Deferred:
             shown = linear_to_srgb(np.minimum(linear, 1.0))
         rgb[buffer.which] += (share * buffer.alpha[:, None] * shown).astype(np.float32)
         kept = _Kept(buffer, surface, linear, shown, reflection, share)
-        return Developed(rgb, seen.transmittance, kept)
+        layers = {} if sight.view is not None else self._layers(rgb, buffer, surface, linear)
+        return Developed(rgb, seen.transmittance, kept, layers)
 
     def reverse(
         self,
@@ -153,7 +154,9 @@ class Deferred:
             by_linear = by_shown * buffer.alpha[:, None]
             if settings.recipe != "seed":
                 by_linear *= encoding_slope(kept.linear)
-            back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear)
+                by_linear[(kept.linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
+            blur = settings.blurred(sight.progress)
+            back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
             normal = back.normal + back.reflected if settings.reflected_gradient else back.normal
             by_material, rgb = back.material, by_rgb * np.float32(1 - kept.shaded)
             if settings.is_seed_deferred(sight.progress):
@@ -225,18 +228,37 @@ class Deferred:
         self._started_over = own["started_over"].copy()
         self.light.restore(own)
 
-    def _dimmed(self, seen: TraceResult, buffer: Buffer, roughest: float = 0.0) -> Surface:
-        """The surface of a buffer with its ambient visibility, to which no gradient goes, and blurred."""
+    def _dimmed(self, seen: TraceResult, buffer: Buffer) -> Surface:
+        """The surface of a buffer with its ambient visibility, to which no gradient goes."""
         surface = buffer.surface
-        if roughest > 0:
-            material = surface.material.copy()
-            material[:, 4] = np.maximum(material[:, 4], roughest)
-            surface = replace(surface, material=material)
         if self.settings.recipe == "seed":  # the seed's matt part is a colour of its own
             return replace(surface, ambient=np.zeros(len(buffer.which)))
         if not self.settings.ambient or seen.features.shape[1] <= AMBIENT_COLUMN:
             return surface
         return replace(surface, ambient=seen.features[buffer.which, AMBIENT_COLUMN] / buffer.alpha)
+
+    def _layers(
+        self,
+        rgb_srgb: Float32[np.ndarray, "r 3"],
+        buffer: Buffer,
+        surface: Surface,
+        linear: Float64[np.ndarray, "p 3"],
+    ) -> dict[str, Float32[np.ndarray, "r _"]]:
+        """What is behind a finished picture: radiance, materials, and what reflected rays said."""
+        if self.settings.recipe == "seed":
+            linear = srgb_to_linear(rgb_srgb[buffer.which] / buffer.alpha[:, None])
+        parts = {
+            "linear": linear,
+            "albedo": surface.material[:, :3],
+            "metallic": surface.material[:, 3:4],
+            "roughness": surface.material[:, 4:5],
+            "visibility": surface.visibility[:, None],
+            "indirect": surface.indirect_linear,
+        }
+        layers = {name: np.zeros((len(rgb_srgb), part.shape[1]), np.float32) for name, part in parts.items()}
+        for name, part in parts.items():
+            layers[name][buffer.which] = part
+        return layers
 
     def _reflect(
         self, sight: Sight, buffer: Buffer, surface: Surface

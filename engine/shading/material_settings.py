@@ -37,8 +37,8 @@ class MaterialSettings(BaseModel):
         hdr: whether the environment may be brighter than 1.
         reflected_gradient: whether normals learn through the reflected direction.
         start: distance from the surface at which reflected rays begin, of the extent.
-        blur: roughness that everything has at least at first, so that normals and the environment are
-            found coarse to fine; it falls to 0 until ``blur_until``.
+        blur: roughness of the level that leads reflected directions at first, and sees farther than a
+            sharp one; it falls to 0 until ``blur_until``.
         blur_until: see there.
         normal_weight: of the spread of the normals along a ray.
         depth_normal_weight: of the angle between normals and the surface that the depths span.
@@ -47,12 +47,9 @@ class MaterialSettings(BaseModel):
         white_weight: of the environment's colours; of their logarithms.
         even_weight: of differences between neighbouring texels; of their logarithms.
         harmonics_weight: of the harmonics' distance to what was shaded, once they are no longer seen.
-        propagation: whether smooth, metallic Gaussians grow now and then, to carry their normals on.
+        propagation: whether normals are handed on to neighbours now and then.
         propagation_every: share of the training between two times.
         propagation_until: share of the training at which it ends.
-        propagation_opacity: opacity to which all are raised then.
-        propagation_growth: factor on the scales of those that are metallic and smooth.
-        propagation_roughness: roughness below which a Gaussian is smooth.
         environment_rate: size of a step of the environment's log radiance.
         first_albedo: what materials begin with.
         first_metallic: likewise.
@@ -67,7 +64,7 @@ class MaterialSettings(BaseModel):
     environment_height: int = Field(128, ge=16, le=512, multiple_of=8)
     environment_every: int = Field(4, ge=1)
     hand_over: tuple[float, float] = (0.0, 0.02)
-    secondary_from: float = Field(0.3, ge=0, le=1)
+    secondary_from: float = Field(0.05, ge=0, le=1)
     secondary_share: float = Field(1.0, ge=0, le=1)
     visibility: bool = True
     indirect: Literal["shaded", "harmonics", "none"] = "shaded"
@@ -80,18 +77,15 @@ class MaterialSettings(BaseModel):
     blur: float = Field(0.5, ge=0, le=1)
     blur_until: float = Field(0.3, ge=0, le=1)
     normal_weight: float = Field(0.1, ge=0)
-    depth_normal_weight: float = Field(0.1, ge=0)
-    smooth_normal_weight: float = Field(0.05, ge=0)
+    depth_normal_weight: float = Field(0.5, ge=0)
+    smooth_normal_weight: float = Field(0.3, ge=0)
     smooth_weight: float = Field(0.01, ge=0)
     white_weight: float = Field(0.01, ge=0)
     even_weight: float = Field(0.1, ge=0)
     harmonics_weight: float = Field(0.01, ge=0)
-    propagation: bool = False
+    propagation: bool = True
     propagation_every: float = Field(0.02, gt=0, le=1)
-    propagation_until: float = Field(0.5, ge=0, le=1)
-    propagation_opacity: float = Field(0.9, gt=0, lt=1)
-    propagation_growth: float = Field(1.5, ge=1)
-    propagation_roughness: float = Field(0.2, gt=0, le=1)
+    propagation_until: float = Field(0.6, ge=0, le=1)
     environment_rate: float = Field(0.03, ge=0)
     first_albedo: float = Field(0.5, gt=0, lt=1)
     first_metallic: float = Field(0.5, gt=0, lt=1)
@@ -109,5 +103,5 @@ class MaterialSettings(BaseModel):
         return max(progress - begin, 0.0) / (end - begin)
 
     def blurred(self, progress: float) -> float:
-        """Roughness that everything has at least."""
+        """Roughness of the level that leads reflected directions."""
         return self.blur * max(0.0, 1.0 - progress / self.blur_until) if self.blur_until > 0 else 0.0

@@ -133,6 +133,7 @@ class TrainConfig(_Frozen):
     )
     max_gaussians_auto: int = Field(200_000, ge=1, description="the most that 0 comes to in max_gaussians")
     initial_points: int = Field(100_000, ge=1, description="most points to begin from")
+    plane_points: int = Field(8, ge=3, description="points around one whose plane gives its first normal")
     lift_pixels: bool = Field(
         True, description="where the sparse model has fewer points, lift pixels of the photographs"
     )
@@ -206,15 +207,18 @@ def with_materials(config: TrainConfig) -> TrainConfig:
     Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
     show reflections lie behind the surface, so there are none.
     """
-    rates = {"quat": 0.004, "mean": 0.03, "mean_final": 1e-3, "log_scale": 0.01, "opacity": 0.05}
+    rates = {"quat": 1e-3, "mean": 0.008, "mean_final": 1e-3, "log_scale": 0.004, "opacity": 0.03}
     return config.model_copy(
         update={
             "materials": config.materials.model_copy(update={"learn": True}),
             "rates": config.rates.model_copy(update=rates),
             "lift_pixels": False,
+            "plane_points": 10,
+            "sh_degree": min(config.sh_degree, 1),
+            "rays": 8192,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
-            "max_gaussians_auto": min(config.max_gaussians_auto, 60_000),
+            "max_gaussians_auto": min(config.max_gaussians_auto, 40_000),
         }
     )
 

@@ -21,7 +21,6 @@ from engine.train.dense_points import dense_points
 MIN_POINTS = 50
 """Fewer sparse points than this are no use to begin from; random ones are taken."""
 NEIGHBOURS = 3
-PLANE_NEIGHBOURS = 8
 MAX_ANGLE = 0.3
 """Largest scale as seen from the nearest camera, in radians."""
 FARTHEST = 50.0
@@ -47,6 +46,7 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1
             limit=limit,
             opacity=config.initial_opacity,
             rng=rng,
+            plane_points=config.plane_points,
         )
     view, y, x = dataset.sample_pixels(rng, limit)
     rays = dataset.rays(view, y, x)
@@ -80,12 +80,13 @@ def from_points(
     limit: int,
     opacity: float,
     rng: np.random.Generator,
+    plane_points: int = 8,
 ) -> FlatGaussians:
     """Flat Gaussians on sparse points.
 
     The scales are the mean distance to the three nearest points; the normal is that of the plane through
-    the eight nearest where they lie on one, else it looks at the cameras. More than ``limit`` points are
-    thinned at random.
+    the ``plane_points`` nearest where they lie on one, else it looks at the cameras. More than ``limit``
+    points are thinned at random.
     """
     centre = np.median(camera_centres_world, axis=0)
     far = np.linalg.norm(xyz_world - centre, axis=1) > FARTHEST * extent
@@ -99,7 +100,7 @@ def from_points(
             "No point of the sparse model lies near the cameras; check the model, or delete its points."
         )
     tree = cKDTree(points)
-    wanted = min(count, PLANE_NEIGHBOURS + 1)
+    wanted = min(count, plane_points + 1)
     distances, neighbours = tree.query(points, wanted)
     distances, neighbours = distances.reshape(count, wanted), neighbours.reshape(count, wanted)
     nearest = distances[:, 1 : NEIGHBOURS + 1] if wanted > 1 else np.full((count, 1), 0.01 * extent)
@@ -111,7 +112,7 @@ def from_points(
     to_camera = cKDTree(camera_centres_world).query(points)[0]
     spacing = np.minimum(spacing, np.maximum(MAX_ANGLE * to_camera, 1e-5 * extent))
     normals = _unit(centre - points)
-    if wanted == PLANE_NEIGHBOURS + 1:
+    if wanted == plane_points + 1:
         around = points[neighbours]
         around = around - around.mean(axis=1, keepdims=True)
         values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))

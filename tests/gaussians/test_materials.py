@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from engine.errors import ConfigError
-from engine.gaussians.materials import f0_linear, has_materials, require_materials, split_materials
+from engine.gaussians.materials import (
+    f0_linear,
+    has_materials,
+    reflective_share,
+    require_materials,
+    split_materials,
+)
 from engine.gaussians.model import FlatGaussians
 
 
@@ -37,3 +43,10 @@ def test_metals_reflect_their_colour_and_all_else_four_percent() -> None:
     albedo = np.array([[0.9, 0.5, 0.1]] * 3)
     f0 = f0_linear(albedo, np.array([[0.0], [1.0], [0.5]]))
     np.testing.assert_allclose(f0, [[0.04] * 3, [0.9, 0.5, 0.1], [0.47, 0.27, 0.07]])
+
+
+def test_metal_that_is_not_too_rough_reflects() -> None:
+    values = np.array([[0.5, 0.5, 0.5, 0.9, 0.1], [0.5, 0.5, 0.5, 0.9, 0.9], [0.5, 0.5, 0.5, 0.1, 0.1]])
+    scene = plain(3)
+    scene.log_scales[0] = np.log(2)  # four times the area
+    assert reflective_share(scene.with_channels(split_materials(values))) == pytest.approx(4 / 6)

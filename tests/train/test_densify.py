@@ -70,6 +70,15 @@ def test_copies_share_the_opacity_and_the_coverage(copies: int) -> None:
         assert after == pytest.approx(before, rel=1e-6)
 
 
+def test_copies_may_share_the_area_instead_and_stay_opaque() -> None:
+    before = make([0.9] * 50)
+    after, _ = apply(mcmc(copies="area", growth=1.0), before.copy())
+    assert len(after) == 100
+    np.testing.assert_allclose(after.opacities, 0.9, rtol=1e-5)
+    area = np.exp(after.log_scales.sum(axis=1)).sum()
+    assert area == pytest.approx(np.exp(before.log_scales.sum(axis=1)).sum(), rel=1e-4)
+
+
 def test_growth_stops_at_the_cap() -> None:
     assert len(apply(mcmc(growth=0.25), make([0.5] * 40))[0]) == 50
     assert len(apply(mcmc(45, growth=0.25), make([0.5] * 40))[0]) == 45

@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from engine.gaussians.model import SH_C0, FlatGaussians
+from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import GaussianGradients
 from engine.train.config import LearningRates, LossWeights
+from engine.train.initialise import with_first_materials
 from engine.train.optimiser import Adam
 
 NAMES = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh")
@@ -169,3 +171,23 @@ def test_select_append_reset_widen() -> None:
     assert not wide.second[:, 13:].any()
     adam.reset(np.array([2]))
     assert not adam.first[2].any() and adam.steps.tolist() == [1, 1, 0, 1, 1, 1]
+
+
+def test_channels_are_stepped_by_their_logits_as_torch_does() -> None:
+    rng = np.random.default_rng(8)
+    scene = with_first_materials(gaussians(6), MaterialSettings()).with_channels(
+        {"label": np.full((6, 1), 7.0, np.float32)}
+    )
+    leaf = torch.full((6, 3), 0.0, dtype=torch.float64, requires_grad=True)  # the logit of 0.5
+    judge = torch.optim.Adam([leaf], lr=0.05, eps=1e-15)
+    adam, rates = Adam.fresh(scene), LearningRates(albedo=0.05, decay=1.0)
+    for _ in range(5):
+        given = gradients(scene, np.arange(6), rng)
+        given.features = rng.normal(size=(6, 7)).astype(np.float32)
+        judge.zero_grad()
+        (torch.sigmoid(leaf) * torch.from_numpy(given.features[:, :3]).double()).sum().backward()
+        judge.step()
+        adam.step(scene, given, rates, LossWeights(), progress=0.0, extent=1.0)
+    np.testing.assert_allclose(scene.channels["albedo"], torch.sigmoid(leaf).detach(), rtol=1e-4)
+    assert (scene.channels["ambient"] == 1).all() and (scene.channels["label"] == 7).all()
+    assert (adam.append(Adam.fresh(scene)).channel_first[6:] == 0).all()

@@ -14,6 +14,7 @@ from engine.errors import ConfigError, OutputError
 from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
+from engine.light.companions import companions
 from engine.light.stage import Stage
 from engine.light.stage_file import named_files
 from engine.render.identity import identity_of
@@ -65,7 +66,8 @@ class SetStage:
 
     def identity(self) -> tuple[object, ...]:
         """What of it decides how a picture looks: itself and the content of its files."""
-        return self.stage, [self.folder / name for _, name in named_files(self.stage)]
+        files = [self.folder / name for _, name in named_files(self.stage)]
+        return self.stage, files, [path.parent / name for path in files for name in companions(path)]
 
 
 @dataclass(frozen=True)

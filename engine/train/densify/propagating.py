@@ -1,31 +1,44 @@
-"""Material-aware normal propagation: what reflects well grows over its neighbours and turns them.
+"""Material-aware normal propagation: what reflects well hands its normal on to its neighbours.
 
-A Gaussian whose normal is right shows right reflections; raised in opacity and grown, it hides neighbours
-whose normals are wrong, so that these are trimmed or learn. After "Reflective Gaussian Splatting"
-(https://arxiv.org/abs/2412.19282), whose code also throws the colours of all else about by chance; here they
-are left alone.
+A smooth metal shows by its reflections which way it faces, to a fraction of a degree; what is matt hardly
+does. So now and then each Gaussian turns to the mean of the normals around it, in which those of smooth
+metals count most. New Gaussians, which begin with the normal of the one they come from, find theirs that way.
+
+The idea is that of "Reflective Gaussian Splatting" (https://arxiv.org/abs/2412.19282), whose code instead
+raises all opacities, enlarges the Gaussians that reflect, and throws the colours of all others about by
+chance; the ``seed`` recipe does that.
 """
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
+from scipy.spatial import cKDTree
 
-from engine.gaussians.materials import METALLIC, ROUGHNESS
+from engine.gaussians.frames import quaternions
+from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import GaussianGradients
 from engine.train.densify.protocol import Densifier
 from engine.train.optimiser import Adam
 
-METALLIC_FROM = 0.02
-SEED_ROUGHNESS, SEED_NOISE = 0.01, 0.4
+NEIGHBOURS = 12
+LEAST_COSINE = 0.9
+"""Normals farther apart belong to two surfaces."""
+OFF_PLANE = 0.3
+"""Distance from a Gaussian's plane, of that to its neighbours, from which on another surface is likely."""
+UNLIKE = 0.15
+"""Difference of albedo or metallic from which on another thing is likely."""
+LEAST_TRUST = 0.1
+"""What a matt Gaussian's normal counts against 1 of a perfect mirror's."""
+SEED_OPACITY, SEED_GROWTH, SEED_METALLIC, SEED_ROUGHNESS, SEED_NOISE = 0.9, 1.5, 0.02, 0.01, 0.4
 
 
 class Propagating:
-    """Another strategy, with propagation now and then.
+    """Another strategy, with propagation now and then, after it.
 
     Args:
         inner: the strategy.
-        settings: when, and how much.
+        settings: when, and how.
         iterations: of the whole training.
     """
 
@@ -36,7 +49,7 @@ class Propagating:
         self._every = max(1, round(settings.propagation_every * iterations))
         self._until = settings.propagation_until * iterations
         self._total = iterations
-        self._iteration = np.zeros(1, np.int64)
+        self._iteration = 0
 
     def observe(
         self, count: int, gradients: GaussianGradients, mean_steps_world: Float32[np.ndarray, "u 3"]
@@ -46,18 +59,21 @@ class Propagating:
 
     def due(self, iteration: int) -> bool:
         """When the strategy inside says so, or it is time to propagate."""
-        self._iteration[0] = iteration
-        return self._inner.due(iteration) or self._spreads(iteration)
+        self._iteration = iteration
+        return self._inner.due(iteration) or self._propagates(iteration)
 
     def apply(
         self, gaussians: FlatGaussians, adam: Adam, rng: np.random.Generator, *, extent: float
     ) -> tuple[FlatGaussians, Adam]:
-        """Propagate, then do what the strategy inside does."""
-        iteration = int(self._iteration[0])
-        if self._spreads(iteration):
-            self._spread(gaussians, rng, progress=iteration / self._total)
+        """Do what is due."""
+        iteration = self._iteration
         if self._inner.due(iteration):
-            return self._inner.apply(gaussians, adam, rng, extent=extent)
+            gaussians, adam = self._inner.apply(gaussians, adam, rng, extent=extent)
+        if self._propagates(iteration) and len(gaussians) > NEIGHBOURS:
+            if self._settings.recipe == "seed":
+                self._spread(gaussians, rng, progress=iteration / self._total)
+            else:
+                propagate_normals(gaussians)
         return gaussians, adam
 
     def state(self) -> dict[str, np.ndarray]:
@@ -68,20 +84,54 @@ class Propagating:
         """Take it back."""
         self._inner.restore(state)
 
-    def _spreads(self, iteration: int) -> bool:
+    def _propagates(self, iteration: int) -> bool:
         return iteration <= self._until and iteration % self._every == 0
 
     def _spread(self, gaussians: FlatGaussians, rng: np.random.Generator, *, progress: float) -> None:
-        settings = self._settings
-        seed = settings.recipe == "seed"
-        least = settings.propagation_opacity
-        raised = np.float32(np.log(least / (1 - least)))
+        """What the seed's code does."""
+        raised = np.float32(np.log(SEED_OPACITY / (1 - SEED_OPACITY)))
         gaussians.opacity_logits[:] = np.maximum(gaussians.opacity_logits, raised)
-        metallic = gaussians.channels[METALLIC][:, 0] >= METALLIC_FROM
-        smoothest = SEED_ROUGHNESS if seed else settings.propagation_roughness
-        smooth = gaussians.channels[ROUGHNESS][:, 0] <= smoothest
-        gaussians.log_scales[metallic & smooth] += np.float32(np.log(settings.propagation_growth))
-        if settings.is_seed_deferred(progress):
+        metallic = gaussians.channels[METALLIC][:, 0] >= SEED_METALLIC
+        smooth = gaussians.channels[ROUGHNESS][:, 0] <= SEED_ROUGHNESS
+        gaussians.log_scales[metallic & smooth] += np.float32(np.log(SEED_GROWTH))
+        if self._settings.is_seed_deferred(progress):
             matt = np.flatnonzero(~metallic)
             noise = rng.uniform(-SEED_NOISE, SEED_NOISE, (len(matt), 3)) / SH_C0
             gaussians.sh[matt, 0] += noise.astype(np.float32)
+
+
+def propagate_normals(gaussians: FlatGaussians) -> None:
+    """Turn each Gaussian to the mean normal around it, in place; normals have no sign here.
+
+    Neighbours count by opacity, nearness, likeness, and how well their material shows which way they face.
+    """
+    means = gaussians.means_world.astype(np.float64)
+    frames = gaussians.rotations.astype(np.float64)
+    normals = frames[:, :, 0]
+    distances, near = cKDTree(means).query(means, NEIGHBOURS + 1)
+    reach = np.maximum(distances[:, NEIGHBOURS // 2], 1e-12)[:, None]
+    shown = gaussians.channels[METALLIC][:, 0] * (1 - gaussians.channels[ROUGHNESS][:, 0])
+    trust = gaussians.opacities * (LEAST_TRUST + shown)
+    cosine = np.einsum("ni,nki->nk", normals, normals[near])
+    off = np.einsum("ni,nki->nk", normals, means[near] - means[:, None]) / (OFF_PLANE * reach)
+    looks = np.concatenate([gaussians.channels[ALBEDO], gaussians.channels[METALLIC]], axis=1) / UNLIKE
+    unlike = ((looks[near] - looks[:, None]) ** 2).sum(axis=2)
+    weights = trust[near] * np.exp(-0.5 * ((distances / reach) ** 2 + off**2 + unlike))
+    weights = np.where(np.abs(cosine) > LEAST_COSINE, weights, 0.0) * np.sign(cosine)
+    mean = np.einsum("nk,nki->ni", weights, normals[near])
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    mean = np.where(length > 0, mean / np.maximum(length, 1e-12), normals)
+    turned = np.einsum("nij,njk->nik", _turns(normals, mean), frames)
+    gaussians.quats_wxyz[:] = quaternions(turned).astype(np.float32)
+
+
+def _turns(
+    before: Float64[np.ndarray, "n 3"], after: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 3 3"]:
+    """The smallest rotations that take unit vectors to others which are not opposite to them."""
+    axis = np.cross(before, after)
+    cosine = (before * after).sum(axis=1)
+    cross = np.zeros((len(before), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
+    cross -= cross.transpose(0, 2, 1)
+    return np.eye(3) + cross + (cross @ cross) / (1 + cosine)[:, None, None]

@@ -1,0 +1,69 @@
+"""``reconstruct --materials``: what it leaves, and that a stopped run ends with the same bytes."""
+
+import json
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from engine.files.gaussian_ply import read_gaussian_ply
+from engine.gaussians.materials import has_materials
+from engine.light.environment import read_environment
+
+MATERIALS = (
+    "--materials", "--set", "materials.environment_height=16", "--set", "materials.ambient_rays=4",
+    "--exports", "",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def materials_run(scene, octasplat, tiny, tmp_path_factory):
+    output = tmp_path_factory.mktemp("materials") / "run"
+    result = octasplat("reconstruct", scene, "-o", output, *tiny, *MATERIALS)
+    assert result.exit_code == 0, result.output
+    return output
+
+
+def test_it_leaves_materials_and_an_environment(materials_run):
+    gaussians, _ = read_gaussian_ply(materials_run / "scene.ply")
+    assert has_materials(gaussians)
+    for values in gaussians.channels.values():
+        assert values.min() >= 0 and values.max() <= 1
+    assert np.ptp(gaussians.channels["albedo"]) > 0.02
+    environment = read_environment(materials_run / "environment.hdr")
+    assert environment.shape == (16, 32, 3) and np.ptp(environment) > 0
+    train = json.loads((materials_run / "config.json").read_text())["reconstruction"]["train"]
+    assert train["materials"]["learn"] is True and train["rates"]["quat"] < 0.01
+
+
+def test_it_is_measured_as_it_is_shaded(materials_run, octasplat):
+    before = json.loads((materials_run / "metrics.json").read_text())
+    result = octasplat("evaluate", materials_run)
+    assert result.exit_code == 0, result.output
+    assert json.loads((materials_run / "metrics.json").read_text())["mean"] == before["mean"]
+    (materials_run / "environment.hdr").rename(materials_run / "away.hdr")
+    result = octasplat("evaluate", materials_run)
+    (materials_run / "away.hdr").rename(materials_run / "environment.hdr")
+    assert result.exit_code != 0 and "environment.hdr" in result.output
+    assert "Traceback" not in result.output
+
+
+def test_a_stopped_run_goes_on_to_the_same_bytes(
+    materials_run, scene, start_octasplat, tiny, octasplat, tmp_path
+):
+    output = tmp_path / "run"
+    command = ("reconstruct", scene, "-o", output, *tiny, *MATERIALS)
+    running = start_octasplat(*command)
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and running.poll() is None:
+        told = output / "events.jsonl"
+        if told.exists() and '"iteration": 20' in told.read_text():
+            running.send_signal(signal.SIGINT)
+            break
+        time.sleep(0.01)
+    running.communicate(timeout=120)
+    result = octasplat(*command, "--resume")
+    assert result.exit_code == 0, result.output
+    for name in ("scene.ply", "environment.hdr"):
+        assert (output / name).read_bytes() == (materials_run / name).read_bytes(), name
