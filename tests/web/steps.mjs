@@ -236,7 +236,8 @@ const steps = {
         await page.keyboard.press("KeyK");
         await page.keyboard.press("KeyN");
         await page.keyboard.press("KeyK");
-        const [saved] = await Promise.all([page.waitForEvent("download"), page.click("[data-do=save-path]")]);
+        await page.focus("[data-do=save-path]");
+        const [saved] = await Promise.all([page.waitForEvent("download"), page.keyboard.press("Enter")]);
         found.path = readFileSync(await saved.path(), "utf8");
         await page.locator("#viewer canvas").focus();
         await page.keyboard.press("KeyR");
