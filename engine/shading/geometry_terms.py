@@ -16,7 +16,7 @@ OPAQUE = 0.9
 """Accumulated alpha from which on a ray shows a surface."""
 STEEPEST = 0.15
 """Neighbours that span a surface seen at a smaller cosine lie on two surfaces."""
-SMOOTH = 0.8
+SMOOTH = 0.9
 """Cosine from which on the normals of neighbours count as those of one smooth surface."""
 _ALL, _FROM, _TO = slice(None), slice(1, None), slice(None, -1)
 _NEIGHBOURS = (((_ALL, _ALL, _FROM), (_ALL, _ALL, _TO)), ((_ALL, _FROM), (_ALL, _TO)))

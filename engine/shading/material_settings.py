@@ -77,7 +77,7 @@ class MaterialSettings(BaseModel):
     blur: float = Field(0.5, ge=0, le=1)
     blur_until: float = Field(0.3, ge=0, le=1)
     normal_weight: float = Field(0.1, ge=0)
-    depth_normal_weight: float = Field(1.0, ge=0)
+    depth_normal_weight: float = Field(0.5, ge=0)
     smooth_normal_weight: float = Field(0.3, ge=0)
     smooth_weight: float = Field(0.01, ge=0)
     white_weight: float = Field(0.01, ge=0)

@@ -47,11 +47,22 @@ def test_an_edge_stays_an_edge_and_mirrors_lead() -> None:
     gaussians = scene(points, normals)
     propagate_normals(gaussians)
     assert angles(gaussians, normals).max() < 1e-2
-    # Every other one is wrong by ten degrees and matt, the others are mirrors.
+    # Every other one is wrong by ten degrees and rough, the others are mirrors.
     wrong = np.arange(1800) % 2 == 1
     tilted = np.where(wrong[:, None], unit(normals + np.array([0.0, 0.176, 0.0])), normals)
     gaussians = scene(points, tilted)
-    gaussians.channels["metallic"][:] = np.where(wrong, 0.0, 1.0)[:, None]
-    gaussians.channels["roughness"][:] = 0.0
+    gaussians.channels["metallic"][:] = 1.0
+    gaussians.channels["roughness"][:] = np.where(wrong, 1.0, 0.0)[:, None]
     propagate_normals(gaussians)
     assert angles(gaussians, normals).mean() < 1.5  # five, if all counted the same
+
+
+def test_other_things_keep_their_normals() -> None:
+    rng = np.random.default_rng(1)
+    points = np.concatenate([rng.uniform(0, 1, (2000, 2)), np.zeros((2000, 1))], axis=1)
+    metal = points[:, 0] < 0.5
+    normals = np.where(metal[:, None], [[0.0, 0.0, 1.0]], unit(np.array([[0.2, 0.0, 1.0]])))
+    gaussians = scene(points, normals)
+    gaussians.channels["metallic"][:] = metal[:, None]
+    propagate_normals(gaussians)
+    assert angles(gaussians, normals).max() < 0.1

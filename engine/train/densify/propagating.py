@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
 from engine.gaussians.frames import quaternions
-from engine.gaussians.materials import METALLIC, ROUGHNESS
+from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import GaussianGradients
@@ -22,8 +22,12 @@ from engine.train.densify.protocol import Densifier
 from engine.train.optimiser import Adam
 
 NEIGHBOURS = 12
-LEAST_COSINE = 0.8
+LEAST_COSINE = 0.9
 """Normals farther apart belong to two surfaces."""
+OFF_PLANE = 0.3
+"""Distance from a Gaussian's plane, of that to its neighbours, from which on another surface is likely."""
+UNLIKE = 0.15
+"""Difference of albedo or metallic from which on another thing is likely."""
 LEAST_TRUST = 0.1
 """What a matt Gaussian's normal counts against 1 of a perfect mirror's."""
 SEED_OPACITY, SEED_GROWTH, SEED_METALLIC, SEED_ROUGHNESS, SEED_NOISE = 0.9, 1.5, 0.02, 0.01, 0.4
@@ -99,7 +103,7 @@ class Propagating:
 def propagate_normals(gaussians: FlatGaussians) -> None:
     """Turn each Gaussian to the mean normal around it, in place; normals have no sign here.
 
-    Neighbours count by opacity, nearness, and how well their material shows which way they face.
+    Neighbours count by opacity, nearness, likeness, and how well their material shows which way they face.
     """
     means = gaussians.means_world.astype(np.float64)
     frames = gaussians.rotations.astype(np.float64)
@@ -109,7 +113,10 @@ def propagate_normals(gaussians: FlatGaussians) -> None:
     shown = gaussians.channels[METALLIC][:, 0] * (1 - gaussians.channels[ROUGHNESS][:, 0])
     trust = gaussians.opacities * (LEAST_TRUST + shown)
     cosine = np.einsum("ni,nki->nk", normals, normals[near])
-    weights = trust[near] * np.exp(-0.5 * (distances / reach) ** 2)
+    off = np.einsum("ni,nki->nk", normals, means[near] - means[:, None]) / (OFF_PLANE * reach)
+    looks = np.concatenate([gaussians.channels[ALBEDO], gaussians.channels[METALLIC]], axis=1) / UNLIKE
+    unlike = ((looks[near] - looks[:, None]) ** 2).sum(axis=2)
+    weights = trust[near] * np.exp(-0.5 * ((distances / reach) ** 2 + off**2 + unlike))
     weights = np.where(np.abs(cosine) > LEAST_COSINE, weights, 0.0) * np.sign(cosine)
     mean = np.einsum("nk,nki->ni", weights, normals[near])
     length = np.linalg.norm(mean, axis=1, keepdims=True)
