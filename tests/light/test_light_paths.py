@@ -22,7 +22,7 @@ from engine.light.stage import (
     StageMesh,
 )
 from engine.light.staging import refuse_inside_glass, stage_meshes
-from engine.render.images import write_exr, write_png
+from engine.render.images import write_exr
 
 AHEAD = camera((0, 0, -4), (0, 0, 0), (24, 16), 30)
 WHITE = (1.0, 1.0, 1.0)
@@ -39,6 +39,7 @@ def white_sky(folder: Path, value: float = 1.0) -> Environment:
         Diffuse(colour_srgb=WHITE),
         Mirror(),
         Glass(ior=1.5),
+        Glass(ior=1.5, roughness=0.5),
         Metal(colour_srgb=WHITE, roughness=0.6),
         Metal(colour_srgb=WHITE, roughness=0.15),
         Dielectric(colour_srgb=WHITE, roughness=0.4),
@@ -51,7 +52,7 @@ def test_a_white_furnace_shows_nothing(material, tmp_path: Path) -> None:  # typ
     stage = Stage(gaussians=(), meshes=(ball,), environment=white_sky(tmp_path), integrator=numbers)
     picture = film_of(stage, AHEAD, tmp_path).image().rgb_linear
     assert abs(picture.mean() - 1.0) < 0.01
-    assert np.abs(picture.mean(axis=2) - 1).max() < 0.2
+    assert np.abs(picture.mean(axis=2) - 1).max() < 0.35
 
 
 def test_a_slab_absorbs_by_beers_law_and_reflects_by_fresnels(tmp_path: Path) -> None:
@@ -208,16 +209,3 @@ def test_glass_that_is_open_and_a_camera_inside_glass_are_refused(tmp_path: Path
     (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(ConfigError, match=r"leaf\.obj is not closed"):
         stage_meshes(Stage(meshes=(StageMesh(file="leaf.obj", material=Glass()),)), tmp_path)
-
-
-def test_a_texture_on_an_obj_with_seams_is_refused(tmp_path: Path) -> None:
-    write_png(tmp_path / "grey.png", np.full((4, 4, 3), 0.5, np.float32))
-    whole = (
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\nf 1/1 2/2 3/3\nf 2/2 4/4 3/3\n"
-    )
-    (tmp_path / "one.obj").write_text(whole)
-    (tmp_path / "two.obj").write_text(whole + "vt 0.5 0.5\nf 1/5 2/2 3/3\n")
-    material = Diffuse(texture="grey.png")
-    stage_meshes(Stage(meshes=(StageMesh(file="one.obj", material=material),)), tmp_path)
-    with pytest.raises(ConfigError, match=r"meshes\[0\].*OBJ with seams"):
-        stage_meshes(Stage(meshes=(StageMesh(file="two.obj", material=material),)), tmp_path)
