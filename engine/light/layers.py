@@ -1,7 +1,7 @@
 """The Gaussians of a stage as the path tracer sees them: layers on rays, and what they keep off."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
