@@ -120,6 +120,17 @@ class ImageRays:
         rays = RayBatch(origin_world[None], directions_world.reshape(-1, 3), near_world)
         return cls(rays, height, width)
 
+    def shifted(self, across_px: float, down_px: float) -> "ImageRays":
+        """The rays beside the pixels' centres, by the slopes between neighbours (to the second order)."""
+        if across_px == 0 and down_px == 0:
+            return self
+        ways = self.directions_world.astype(np.float64)
+        for axis, offset in ((1, across_px), (0, down_px)):
+            if ways.shape[axis] > 1:
+                ways = ways + offset * np.gradient(self.directions_world.astype(np.float64), axis=axis)
+        ways /= np.linalg.norm(ways, axis=2, keepdims=True)
+        return ImageRays.of(self.origin_world, ways, float(self.rays.t_min[0]))
+
     @property
     def origin_world(self) -> Float32[np.ndarray, "3"]:
         """Where the camera stands."""

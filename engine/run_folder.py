@@ -14,9 +14,9 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
 )  # fmt: skip
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
+ENVIRONMENT = "environment.hdr"
 ON = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
-ENVIRONMENT = "environment.hdr"
 
 
 def is_run(source: Path) -> bool:

@@ -13,15 +13,19 @@ from engine.evaluate.truth_metrics import (
     best_scales,
     depth_along_axis,
     display,
+    environment_errors,
     intersection_over_union,
     mean_of,
     normal_errors_degrees,
     pooled_psnr,
 )
+from engine.events import Listener, StageProgress
 from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
-from engine.light.relighting import RelitImage
+from engine.light.environment import EnvironmentMap, environment_frame, read_environment
+from engine.light.relighting import Relighter, RelitImage
 from engine.rays import ImageRays
 from engine.render.renderer import RenderedImage
+from engine.scene import Dataset
 
 COVERED = 0.5
 _DECIMALS = 6
@@ -34,10 +38,12 @@ class TruthMeasures:
     Attributes:
         truth: what is known.
         rows: measures by view, in the order in which they came.
+        light: means of the environment and of pictures in other light.
     """
 
     truth: Truth
     rows: dict[str, dict[str, float]] = field(default_factory=dict)
+    light: dict[str, object] = field(default_factory=dict)
     _albedo: list[Float32[np.ndarray, "n 3"]] = field(default_factory=list)
     _true_albedo: list[Float32[np.ndarray, "n 3"]] = field(default_factory=list)
 
@@ -61,6 +67,47 @@ class TruthMeasures:
         if known.mask.any():
             self._add_materials(name, image, known)
 
+    def add_light(
+        self, dataset: Dataset, environment: EnvironmentMap, relighter: Relighter | None, tell: Listener
+    ) -> None:
+        """Measure the environment, and the scene in other light.
+
+        Args:
+            dataset: with the views that were relit.
+            environment: that of the scene.
+            relighter: shows the scene; None measures no pictures.
+            tell: hears the progress.
+
+        Raises:
+            ConfigError: a map of the truth cannot be used.
+            DatasetError: a picture of the truth cannot be used.
+        """
+        frame = environment_frame(self.truth.up_world)
+        if self.truth.environment is not None:
+            true = EnvironmentMap(read_environment(self.truth.environment), frame)
+            raw, scaled, scales = environment_errors(environment, true)
+            self.light |= {
+                "environment_psnr": raw,
+                "environment_psnr_scaled": scaled,
+                "environment_scales": [round(float(scale), _DECIMALS) for scale in scales],
+            }
+        names = {view.name: index for index, view in enumerate(dataset.views)}
+        wanted = [name for name in self.truth.content.relight.views if name in names]
+        if relighter is None or not self.rows or not wanted:
+            return
+        pictures, true_pictures, labels = [], [], []
+        for folder, path in self.truth.relit:
+            relighter.put(EnvironmentMap(read_environment(path), frame))
+            for name in wanted:
+                rays = dataset.view_rays(names[name])
+                pictures.append(relighter.render(rays))
+                side = max(rays.height_px, rays.width_px)
+                true_pictures.append(self.truth.relit_picture(folder, name, side))
+                labels.append((folder.name, name))
+                tell(StageProgress("evaluate", len(labels), len(wanted) * len(self.truth.relit)))
+        if pictures:
+            self.light |= relit_measures(pictures, true_pictures, labels)
+
     def as_dict(self) -> dict[str, object]:
         """The measures as ``metrics.json`` holds them: by view, and their means."""
         keys = [key for key in TRUTH_DEFINITIONS if any(key in row for row in self.rows.values())]
@@ -70,7 +117,7 @@ class TruthMeasures:
         if self._albedo:
             mean |= self._albedo_mean()
         return {
-            "mean": mean,
+            "mean": {**mean, **self.light},
             "views": {name: _rounded(row) for name, row in self.rows.items()},
             "definitions": dict(TRUTH_DEFINITIONS),
         }

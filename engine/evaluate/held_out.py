@@ -6,8 +6,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numba
-import numpy as np
-from jaxtyping import Float32
 
 from engine.colour import composited
 from engine.evaluate.against_truth import TruthMeasures
@@ -18,6 +16,8 @@ from engine.evaluate.truth import Truth
 from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
 from engine.events import Listener, StageProgress
 from engine.gaussians.model import FlatGaussians
+from engine.light.environment import EnvironmentMap
+from engine.light.relighting import Relighter
 from engine.render.images import write_png
 from engine.render.names import render_names
 from engine.render.renderer import background_colour, render_rays
@@ -43,7 +43,8 @@ def evaluate_held_out(
     threads: int,
     tell: Listener,
     truth: Truth | None = None,
-    environment_linear: Float32[np.ndarray, "h w 3"] | None = None,
+    environment: EnvironmentMap | None = None,
+    relighter: Relighter | None = None,
 ) -> None:
     """Measure ``gaussians`` on the held-out views of ``dataset``.
 
@@ -59,7 +60,8 @@ def evaluate_held_out(
         threads: for rendering and measuring; 0 means all cores.
         tell: hears the progress.
         truth: of the scene, whose measures then join the metrics as ``truth``.
-        environment_linear: the map that the scene was learnt with, for the report.
+        environment: the map that the scene was learnt with.
+        relighter: shows the scene in other light, for what the truth knows of that.
     """
     tracer = make_tracer(settings, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
@@ -81,7 +83,9 @@ def evaluate_held_out(
             ViewImages(view.reference, view.render, measured.flip_map, view.layers),
         )
         tell(StageProgress("evaluate", len(rows), total))
-    if measures is not None and measures.rows:
+    if measures is not None and environment is not None:
+        measures.add_light(dataset, environment, relighter, tell)
+    if measures is not None and (measures.rows or measures.light):
         run = {**run, "truth": measures.as_dict()}
     metrics = summarise(rows).as_dict(run)
     write_json(output / METRICS, metrics)
@@ -92,7 +96,7 @@ def evaluate_held_out(
         events=_read_events(output / "events.jsonl"),
         config=config,
         images=images,
-        environment_linear=environment_linear,
+        environment_linear=None if environment is None else environment.radiance_linear,
     )
 
 

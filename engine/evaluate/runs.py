@@ -3,13 +3,17 @@
 import json
 from pathlib import Path
 
+import numpy as np
+
 from engine.config import ReconstructionConfig, read_config
 from engine.errors import OutputError
 from engine.evaluate.held_out import evaluate_held_out
 from engine.evaluate.truth import find_truth
 from engine.events import Listener, StageProgress, Warned
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
-from engine.light.environment import read_environment
+from engine.gaussians.materials import has_materials
+from engine.light.environment import EnvironmentMap, environment_frame, read_environment
+from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.poses.find import read_record
 from engine.run_folder import (
     CACHE,
@@ -97,13 +101,20 @@ def measure_run(
     """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
     truth = find_truth(dataset.root)
     gaussians, _ = read_gaussian_ply(output / SCENE)
+    extent = read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
+    environment = _environment(output, config.train)
+    relighter = None
+    if truth is not None and truth.relit and environment is not None and has_materials(gaussians):
+        relighter = SplitSumRelighter(
+            gaussians, config.train.trace, config.train.materials, extent_world=extent, threads=threads
+        )
     training = json.loads((output / TRAINING).read_text(encoding="utf-8"))
     evaluate_held_out(
         dataset,
         gaussians,
         into or output,
         settings=config.train.trace,
-        shading=finished_shading(output, config.train, dataset),
+        shading=finished_shading(output, config.train, dataset, extent),
         background=config.evaluate_background,
         run={
             "gaussians": len(gaussians),
@@ -119,20 +130,31 @@ def measure_run(
         threads=threads,
         tell=tell,
         truth=truth,
+        environment=environment,
+        relighter=relighter,
     )
 
 
-def finished_shading(output: Path, config: TrainConfig, dataset: Dataset) -> ShadingModel:
+def finished_shading(
+    output: Path, config: TrainConfig, dataset: Dataset, extent_world: float
+) -> ShadingModel:
     """The shading model of a finished run, with the environment that it left.
 
     Raises:
         ConfigError: the run learnt materials and its environment is missing or damaged.
     """
-    extent = read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
-    shading = make_shading(config, len(dataset.views), extent)
+    shading = make_shading(config, len(dataset.views), extent_world)
     if (deferred := deferred_of(shading)) is not None:
         deferred.light.put(read_environment(output / ENVIRONMENT))
     return shading
+
+
+def _environment(output: Path, config: TrainConfig) -> EnvironmentMap | None:
+    """The map that a run with materials has learnt."""
+    if not (output / ENVIRONMENT).exists():
+        return None
+    up = np.array(config.materials.up_world, np.float64)
+    return EnvironmentMap(read_environment(output / ENVIRONMENT), environment_frame(up))
 
 
 def _evaluate_on(

@@ -100,6 +100,19 @@ class GlbFile:
             values = np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1.0)
         return values.astype(dtype)
 
+    def view_bytes(self, number: int) -> bytes:
+        """The bytes of a buffer view.
+
+        Raises:
+            KeyError, IndexError, TypeError, ValueError: the document does not describe it, or it is cut.
+        """
+        view = self.document["bufferViews"][number]
+        start, length = int(view.get("byteOffset", 0)), int(view["byteLength"])
+        content = self._binary[start : start + length].tobytes()
+        if len(content) < length or start < 0 or length <= 0:
+            raise ValueError("a buffer view reaches beyond the data")
+        return content
+
     def primitives(self) -> Iterator[tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]]:
         """Every primitive of the default scene with the matrix of its node."""
         nodes = self.document.get("nodes", [])

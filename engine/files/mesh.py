@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
+
+from engine.files.mesh_looks import MeshMaterial
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,12 @@ class Mesh:
         radius: radius of the octagon in standard deviations likewise.
         q: chi-square quantile of the octagons, where the file still names it.
         rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
+        corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
+            upper left, NaN where there are none; None without any.
+        normals: likewise, of the vertices, NaN where there are none; None without any.
+        rgb_linear: likewise, colours of the vertices.
+        material_numbers: likewise, row of each triangle in ``materials``, -1 for none.
+        materials: likewise, those that the file gives.
     """
 
     vertices: Float64[np.ndarray, "v 3"]
@@ -31,9 +39,19 @@ class Mesh:
     radius: Float32[np.ndarray, " v"] | None = None
     q: float | None = None
     rounding: float = 0.0
+    corner_uv: Float32[np.ndarray, "t 3 2"] | None = None
+    normals: Float32[np.ndarray, "v 3"] | None = None
+    rgb_linear: Float32[np.ndarray, "v 3"] | None = None
+    material_numbers: Int32[np.ndarray, " t"] | None = None
+    materials: tuple[MeshMaterial, ...] = ()
 
     def __len__(self) -> int:
         return len(self.vertices)
+
+
+def upright(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:
+    """Texture coordinates counted from the upper left, where a file counts them from the lower left."""
+    return uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
 
 
 def stated_q(comments: tuple[str, ...]) -> float | None:

@@ -13,14 +13,16 @@ shrinks to the ellipse that is left of it.
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Int, Int32
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
 from engine.files import gltf
+from engine.files.glb_materials import glb_materials, texture_frame
 from engine.files.gltf import GlbFile, channel_attributes, padded, write_glb
 from engine.files.mesh import Mesh
 from engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout
@@ -35,6 +37,7 @@ from engine.surface.mesh import TriangleMesh
 
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
+ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "colour": 3}
 UNLIT = "KHR_materials_unlit"
 
 Chunks = list[Int[np.ndarray, "_"]]
@@ -48,6 +51,19 @@ def read(path: Path) -> Mesh:
     Raises:
         SceneFileError: the file is no GLB, is damaged, or its meshes are compressed.
     """
+    return _read(path, looks=False)
+
+
+def read_looks(path: Path) -> Mesh:
+    """The same with materials, normals and colours.
+
+    Raises:
+        SceneFileError: likewise, or an image is missing.
+    """
+    return _read(path, looks=True)
+
+
+def _read(path: Path, *, looks: bool) -> Mesh:
     file = GlbFile(path)
     try:
         packed = [name for name in COMPRESSIONS if name in file.document.get("extensionsUsed", [])]
@@ -56,15 +72,22 @@ def read(path: Path) -> Mesh:
                 f"{path}: its meshes are compressed ({packed[0]}), which changes the order of vertices; "
                 "export it without compression."
             )
-        return _mesh(file)
+        mesh, numbers = _mesh(file, looks=looks)
+        if not looks:
+            return mesh
+        uv = None if mesh.uv is None else mesh.uv[mesh.triangles]
+        return replace(mesh, corner_uv=uv, material_numbers=numbers, materials=glb_materials(file, path))
     except gltf.DAMAGE as error:
         raise SceneFileError(f"{path}: its glTF is damaged or not understood ({error}).") from error
 
 
-def _mesh(file: GlbFile) -> Mesh:
+def _mesh(file: GlbFile, *, looks: bool) -> tuple[Mesh, Int32[np.ndarray, " t"]]:
+    """All triangles, and the number of the material of each."""
     vertices: list[np.ndarray] = []
     triangles: list[np.ndarray] = []
-    extras: dict[str, list[np.ndarray]] = {key: [] for key in ATTRIBUTES}
+    numbers: list[np.ndarray] = []
+    names = ATTRIBUTES | ({"normal": "NORMAL", "colour": "COLOR_0"} if looks else {})
+    extras: dict[str, list[np.ndarray]] = {key: [] for key in names}
     count = 0
     for matrix, primitive in file.primitives():
         if primitive.get("mode", gltf.TRIANGLES) != gltf.TRIANGLES:
@@ -77,16 +100,28 @@ def _mesh(file: GlbFile) -> Mesh:
             indices = file.array(primitive["indices"], np.int64).reshape(-1, 3)
         else:
             indices = np.arange(size - size % 3).reshape(-1, 3)
-        triangles.append(indices + count)
-        for key, name in ATTRIBUTES.items():
+        mirrored = looks and np.linalg.det(matrix[:3, :3]) < 0
+        triangles.append((indices[:, ::-1] if mirrored else indices) + count)
+        number = int(primitive.get("material", -1))
+        numbers.append(np.full(len(indices), number, np.int32))
+        names["uv"], turn = ATTRIBUTES["uv"], np.eye(2, 3)
+        if looks and number >= 0:
+            place, turn = texture_frame(file.document["materials"][number])
+            names["uv"] = f"TEXCOORD_{place}"
+        for key, name in names.items():
             if name in attributes:
-                extras[key].append(file.array(attributes[name], np.float32))
+                values = file.array(attributes[name], np.float32)
+                if key == "normal":
+                    values = values @ np.linalg.inv(matrix[:3, :3])
+                elif key == "uv" and looks:
+                    values = values @ turn[:, :2].T + turn[:, 2]
+                extras[key].append(values[:, : ATTRIBUTE_WIDTHS.get(key, 1)].astype(np.float32))
             else:
-                extras[key].append(np.full((size, 2 if key == "uv" else 1), np.nan, np.float32))
+                extras[key].append(np.full((size, ATTRIBUTE_WIDTHS.get(key, 1)), np.nan, np.float32))
         count += size
     whole = {key: _joined(parts) for key, parts in extras.items()}
     q = file.document.get("asset", {}).get("extras", {}).get("octasplat_q")
-    return Mesh(
+    mesh = Mesh(
         np.concatenate([*vertices, np.zeros((0, 3))]),
         np.concatenate([*triangles, np.zeros((0, 3), np.int64)]),
         uv=whole["uv"],
@@ -94,7 +129,10 @@ def _mesh(file: GlbFile) -> Mesh:
         corner=_flat(whole["corner"]),
         radius=_flat(whole["radius"]),
         q=float(q) if isinstance(q, int | float) else None,
+        normals=whole.get("normal"),
+        rgb_linear=whole.get("colour"),
     )
+    return mesh, np.concatenate([*numbers, np.zeros(0, np.int32)])
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray | None:
@@ -279,5 +317,5 @@ register(
         holds_channels=True,
     )
 )
-register(MeshReader("glb", ("*.glb",), read))
+register(MeshReader("glb", ("*.glb",), read, read_looks))
 register(SurfaceWriter("glb", ("*.glb",), write_surface, textured=True))

@@ -6,17 +6,21 @@ has no opacity per vertex, so the Gaussians' own opacities are lost; the texture
 Reading is fast: whole blocks of the file are sorted by kind of line and parsed at once.
 """
 
+import re
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
+from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
-from engine.files.mesh import Mesh, stated_q
+from engine.files.mesh import Mesh, stated_q, upright
+from engine.files.mesh_looks import MeshMaterial
+from engine.files.obj_materials import read_mtl
 from engine.files.octagon_soup import BATCH, OctagonBatch, OctagonSoup
 from engine.files.options import ExportOptions
 from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
@@ -48,6 +52,10 @@ class _Parts:
     decimals: int = 0
     vertex_count: int = 0
     uv_count: int = 0
+    looks: bool = False
+    colours: list[np.ndarray] = field(default_factory=list)
+    libraries: list[str] = field(default_factory=list)
+    uses: list[tuple[int, str]] = field(default_factory=list)
 
 
 def read(path: Path) -> Mesh:
@@ -56,7 +64,19 @@ def read(path: Path) -> Mesh:
     Raises:
         SceneFileError: the file cannot be read, or a line is not understood.
     """
-    parts = _Parts()
+    return _read(path, _Parts())
+
+
+def read_looks(path: Path) -> Mesh:
+    """The same with the texture coordinates of every corner, the colours of vertices, and materials.
+
+    Raises:
+        SceneFileError: likewise, or an image that its MTL names is missing.
+    """
+    return _read(path, _Parts(looks=True))
+
+
+def _read(path: Path, parts: _Parts) -> Mesh:
     try:
         with path.open("rb") as handle:
             for block in _blocks(handle):
@@ -68,6 +88,7 @@ def read(path: Path) -> Mesh:
     positions = np.concatenate(parts.positions)
     parts.positions.clear()
     uv = _uv_of_vertices(path, parts, len(positions))
+    looks = _looks(path, parts, len(positions)) if parts.looks else {}
     parts.uv.clear()
     parts.triangle_uv.clear()
     triangles = np.concatenate([*parts.triangles, np.zeros((0, 3), np.int32)], dtype=np.int64)
@@ -78,7 +99,29 @@ def read(path: Path) -> Mesh:
         uv=uv,
         q=stated_q(tuple(parts.comments)),
         rounding=rounding,
+        **looks,
     )
+
+
+def _looks(path: Path, parts: _Parts, count: int) -> dict[str, Any]:
+    """Texture coordinates of corners, colours of vertices and materials."""
+    places = np.concatenate([*parts.triangle_uv, np.zeros((0, 3), np.int32)])
+    looks: dict[str, Any] = {}
+    if parts.uv and (places >= 0).any():
+        table = np.concatenate([upright(np.concatenate(parts.uv)), np.full((1, 2), np.nan, np.float32)])
+        looks["corner_uv"] = table[places]  # -1 is the last row
+    if sum(map(len, parts.colours)) == count:
+        looks["rgb_linear"] = srgb_to_linear(np.clip(np.concatenate(parts.colours), 0, 1)).astype(np.float32)
+    if parts.uses:
+        known = {name: k for k, name in enumerate(dict.fromkeys(name for _, name in parts.uses))}
+        materials = read_mtl(path, parts.libraries)
+        numbers = np.full(len(places), -1, np.int32)
+        for start, name in parts.uses:
+            numbers[start:] = known[name]
+        missing = MeshMaterial("", passed_over=("no entry in an MTL file",))
+        looks["material_numbers"] = numbers
+        looks["materials"] = tuple(materials.get(name, replace(missing, name=name)) for name in known)
+    return looks
 
 
 def _blocks(handle: IO[bytes]) -> Iterator[bytes]:
@@ -118,6 +161,8 @@ def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
         if values.shape[1] < 3:
             raise SceneFileError(f"{path}: a line 'v' has fewer than three numbers.")
         parts.positions.append(values[:, :3].copy())  # without the colours behind them
+        if parts.looks and values.shape[1] >= 6:
+            parts.colours.append(values[:, 3:6].astype(np.float32))
         parts.vertex_count += len(values)
         for line in text.split(b"\n", DIGIT_LINES)[:DIGIT_LINES]:
             words = line.split()[1:4]
@@ -126,8 +171,36 @@ def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
         text = _lines(data, is_uv, lengths).translate(None, b"vt")
         parts.uv.append(_numbers(path, text, int(is_uv.sum()), "vt")[:, :2].astype(np.float32))
         parts.uv_count += int(is_uv.sum())
-    if is_face.any():
-        _take_faces(path, _lines(data, is_face, lengths), int(is_face.sum()), parts)
+    spans = [(0, len(starts), "")]
+    if parts.looks:
+        _take_libraries(block, parts)
+        spans = _uses(block, starts, first == ord("u"))
+    for begin, end, material in spans:
+        if material:
+            parts.uses.append((sum(map(len, parts.triangles)), material))
+        chosen = is_face.copy()
+        chosen[:begin] = chosen[end:] = False
+        if chosen.any():
+            _take_faces(path, _lines(data, chosen, lengths), int(chosen.sum()), parts)
+
+
+def _take_libraries(block: bytes, parts: _Parts) -> None:
+    for line in re.findall(rb"^mtllib[ \t]+(.+)$", block, re.MULTILINE):
+        parts.libraries.append(line.decode("utf-8", "replace").strip())
+
+
+def _uses(block: bytes, starts: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int, str]]:
+    """The lines of a block from one ``usemtl`` to the next, with the name of the material."""
+    spans = [(0, len(starts), "")]
+    for row in np.flatnonzero(candidates):
+        line = block[starts[row] : block.index(b"\n", starts[row])].split(maxsplit=1)
+        if len(line) == 2 and line[0] == b"usemtl":
+            begin, _, before = spans.pop()
+            spans += [
+                (begin, int(row), before),
+                (int(row), len(starts), line[1].decode("utf-8", "replace").strip()),
+            ]
+    return spans
 
 
 def _lines(data: np.ndarray, chosen: np.ndarray, lengths: np.ndarray) -> bytes:
@@ -311,5 +384,5 @@ def _write_lines(write: Callable[[str], object], line: str, rows: np.ndarray) ->
 register(
     Exporter("obj", ("*.obj",), "octagon mesh as OBJ with vertex colours, without opacity", write_octagons)
 )
-register(MeshReader("obj", ("*.obj",), read))
+register(MeshReader("obj", ("*.obj",), read, read_looks))
 register(SurfaceWriter("obj", ("*.obj",), write_surface, textured=True))

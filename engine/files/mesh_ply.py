@@ -4,15 +4,16 @@ Octagons: the format to edit in, as mesh editors keep vertex attributes both way
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int, Int64
 
-from engine.colour import to_bytes
+from engine.colour import srgb_to_linear, to_bytes
 from engine.errors import SceneFileError
 from engine.files.gaussian_ply import channel_comments
-from engine.files.mesh import Mesh, stated_q
+from engine.files.mesh import Mesh, stated_q, upright
 from engine.files.octagon_soup import BATCH, OctagonSoup
 from engine.files.options import ExportOptions
 from engine.files.ply_container import (
@@ -75,6 +76,32 @@ def read(path: Path) -> Mesh:
         corner=_attribute(table, "corner"),
         radius=_attribute(table, "radius"),
         q=stated_q(header.comments),
+    )
+
+
+def read_looks(path: Path) -> Mesh:
+    """The same with normals and colours; a PLY has no materials.
+
+    Raises:
+        SceneFileError: likewise.
+    """
+    mesh = read(path)
+    table = read_ply(path, ["vertex"])[1]["vertex"]
+    names = set(table.dtype.names or ())
+    uv = mesh.uv
+    if uv is None and {"u", "v"} <= names:
+        uv = columns(table, ("u", "v"))
+    colours = None
+    if set(COLOURS) <= names:
+        colours = columns(table, COLOURS)
+        if table.dtype["red"].kind in "iu":
+            colours = colours / np.float32(np.iinfo(table.dtype["red"]).max)
+        colours = srgb_to_linear(np.clip(colours, 0.0, 1.0)).astype(np.float32)
+    return replace(
+        mesh,
+        corner_uv=None if uv is None else upright(uv)[mesh.triangles],
+        normals=columns(table, _NORMAL) if set(_NORMAL) <= names else None,
+        rgb_linear=colours,
     )
 
 
@@ -182,5 +209,5 @@ register(
         holds_channels=True,
     )
 )
-register(MeshReader("mesh-ply", ("*.ply",), read))
+register(MeshReader("mesh-ply", ("*.ply",), read, read_looks))
 register(SurfaceWriter("mesh-ply", ("*.ply",), write_surface, textured=False))

@@ -56,14 +56,15 @@ def read_scene(
     return scene
 
 
-def read_mesh(path: Path) -> Mesh:
-    """Read a PLY, OBJ or GLB mesh.
+def read_mesh(path: Path, *, looks: bool = False) -> Mesh:
+    """Read a PLY, OBJ or GLB mesh; ``looks`` asks for materials, normals and colours too.
 
     Raises:
         SceneFileError: another suffix, a file that cannot be read, is damaged or compressed, or has vertices
             that are not finite.
     """
-    mesh = mesh_reader_for(path).read(path)
+    reader = mesh_reader_for(path)
+    mesh = reader.read_looks(path) if looks else reader.read(path)
     if len(mesh) == 0:
         raise SceneFileError(f"{path}: holds no vertices.")
     bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())

@@ -74,10 +74,12 @@ class MeshReader(Entry):
         name: of the format.
         patterns: file names that it takes.
         read: reads all triangles.
+        read_looks: reads them with materials, normals and colours too.
     """
 
     noun: ClassVar[str] = "mesh"
     read: Callable[[Path], Mesh]
+    read_looks: Callable[[Path], Mesh]
 
 
 @dataclass(frozen=True)

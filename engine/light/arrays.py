@@ -22,12 +22,14 @@ class Surfaces(NamedTuple):
         corner_normals: shading normals at the corners, unit vectors.
         corner_uv: texture coordinates at the corners, (0, 0) at the upper left.
         materials: row of each face in :class:`Materials`.
+        corner_rgb_linear: colours of the corners; no rows at all where no mesh has any.
     """
 
     corners_world: Float32[np.ndarray, "f 3 3"]
     corner_normals: Float32[np.ndarray, "f 3 3"]
     corner_uv: Float32[np.ndarray, "f 3 2"]
     materials: Int32[np.ndarray, " f"]
+    corner_rgb_linear: Float32[np.ndarray, "g 3 3"]
 
 
 class Materials(NamedTuple):
@@ -42,10 +44,13 @@ class Materials(NamedTuple):
         absorption: per world unit.
         grounds: how the ground shares light with the coat.
         kept: whether light that facets throw at each other is kept.
-        coats: which of the tables the coat has.
+        coats: which of the tables the coat has; of rough glass that of entering, leaving has the next.
         colour_textures: number of a texture, -1 for none.
         metallic_roughness_textures: likewise.
-        lights: number of the light that a shining surface is.
+        normal_textures: likewise.
+        normal_scales: factor of their slopes.
+        tinted: whether the corners' colours count.
+        lights: number of the light that a shining surface is, -1 for none.
         mirror: table of facets that reflect everything.
         coat: tables of dielectrics' surfaces.
         coat_means: their means.
@@ -64,6 +69,9 @@ class Materials(NamedTuple):
     coats: Int32[np.ndarray, " m"]
     colour_textures: Int32[np.ndarray, " m"]
     metallic_roughness_textures: Int32[np.ndarray, " m"]
+    normal_textures: Int32[np.ndarray, " m"]
+    normal_scales: Float64[np.ndarray, " m"]
+    tinted: Int32[np.ndarray, " m"]
     lights: Int32[np.ndarray, " m"]
     mirror: Float64[np.ndarray, "a c"]
     coat: Float64[np.ndarray, "t a c"]
@@ -86,6 +94,9 @@ class Paths(NamedTuple):
         transmittance: what the first layer lets through.
         shade: sum over the first layer of coverage times the factor that the stage's lights give to it.
         coverage: 1 less what is seen of the background behind everything.
+        things: what the Gaussians let through of the first mesh that the camera's ray meets; 0 without one.
+        albedo_linear: colour of that mesh, white where it mirrors or lets through, times the same share.
+        normals_world: its shading normal times the same share.
         densities: of the last direction over solid angle; 0 for the camera, mirrors and glass.
         inside: material that the path is in, -1 for air.
         marks: bits of :mod:`engine.light.kernels_path`.
@@ -102,6 +113,9 @@ class Paths(NamedTuple):
     transmittance: Float32[np.ndarray, " p"]
     shade: Float32[np.ndarray, "p 3"]
     coverage: Float32[np.ndarray, " p"]
+    things: Float32[np.ndarray, " p"]
+    albedo_linear: Float32[np.ndarray, "p 3"]
+    normals_world: Float32[np.ndarray, "p 3"]
     densities: Float32[np.ndarray, " p"]
     inside: Int32[np.ndarray, " p"]
     marks: Int32[np.ndarray, " p"]
@@ -230,6 +244,7 @@ def new_paths(count: int) -> Paths:
         np.empty(count, np.uint32), np.empty(count, np.int32),
         vectors(), vectors(), vectors(), vectors(), vectors(),
         np.empty(count, np.float32), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
+        vectors(), vectors(), np.empty(count, np.float32),
         np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.bool_),
     )  # fmt: skip
 

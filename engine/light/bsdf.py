@@ -13,6 +13,7 @@ from jaxtyping import Float64
 
 from engine.light.kernels_bsdf import BURLEY, COUPLED
 from engine.light.kernels_bsdf_arrays import fresnel_values, integrate_albedo, opaque_samples, opaque_values
+from engine.light.kernels_frosted import frosted_samples, frosted_values, integrate_frosted
 
 TABLE_ROUGHNESSES = 32
 TABLE_COSINES = 64
@@ -46,6 +47,47 @@ def albedo_table(ior: float | None) -> AlbedoTable:
         2.0 * (weighted[:, :-1] + 4.0 * between + weighted[:, 1:]).sum(axis=1) / (6.0 * (TABLE_COSINES - 1))
     )
     return AlbedoTable(table, np.repeat(mean[:, None], 2, axis=1))
+
+
+@lru_cache(maxsize=64)
+def frosted_table(eta: float) -> AlbedoTable:
+    """The table of the share that one bounce off or through rough glass keeps; it has no mean.
+
+    Args:
+        eta: index of refraction on the far side over that on the near side.
+    """
+    table = np.empty((TABLE_ROUGHNESSES, TABLE_COSINES))
+    integrate_frosted(eta, TABLE_SAMPLES, table)
+    return AlbedoTable(table, np.ones((TABLE_ROUGHNESSES, 2)))
+
+
+@dataclass(frozen=True)
+class RoughGlass:
+    """A surface of rough glass; ``to_light`` lies on either side of it.
+
+    Attributes:
+        eta: index of refraction on the far side over that on the viewer's.
+        roughness: perceptual; GGX's alpha is its square.
+    """
+
+    eta: float
+    roughness: float
+
+    def evaluate(
+        self, to_viewer: Float64[np.ndarray, "n 3"], to_light: Float64[np.ndarray, "n 3"]
+    ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+        """Values of basic radiance times the cosine to the light, and the density of :meth:`sample`."""
+        values, pdf = np.empty((2, len(to_viewer)))
+        frosted_values(to_viewer, to_light, self.eta, self.roughness**2, values, pdf)
+        return values, pdf
+
+    def sample(
+        self, to_viewer: Float64[np.ndarray, "n 3"], uniform: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, "n 3"]:
+        """Directions to the light from three numbers in [0, 1) each."""
+        to_light = np.empty((len(to_viewer), 3))
+        frosted_samples(to_viewer, self.eta, self.roughness**2, uniform, to_light)
+        return to_light
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,17 @@
 
 A pixel has a front layer of Gaussians (premultiplied display colour, transmittance, and the factor that the
 stage's lights give to it) and linear light behind it; see :mod:`engine.light.kernels_layer` for the reason.
+
 Gaussians with materials that the camera sees are a part of the pixel of their own, encoded by itself, so that
 their edges blend in display values as photographs with alpha do.
+
+A compositor's layers are so made that ``background * shadow`` under ``things`` is the picture again. Things
+and scene meet in display values in the picture, but in linear ones in a compositor: where a pixel is covered
+in part, the alpha of the things is the larger one that this takes, so that nothing becomes negative.
 """
 
+import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,8 +25,14 @@ from engine.light.kernels_film import add_up
 from engine.light.kernels_scatter import FRONT
 
 Tone = Literal["none", "reinhard", "filmic"]
+Filter = Callable[
+    [Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"] | None, Float32[np.ndarray, "h w 3"] | None],
+    Float32[np.ndarray, "h w 3"],
+]
+"""Takes noise from a linear image, guided by the colours and normals of surfaces where they are given."""
 _ONE = np.empty(0, np.float32)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_DARK = 1e-6
 
 
 @dataclass(frozen=True)
@@ -30,11 +43,14 @@ class StageImage:
         rgb_srgb: display values after exposure and tone curve, clipped to [0, 1].
         rgb_linear: linear values before both, not clipped.
         alpha: 1 less what is seen of the background behind everything.
+        layers: what a compositor needs, linear channels by name: ``background``, ``shadow`` and ``things``,
+            each with R, G, B, A; nothing unless they were asked for.
     """
 
     rgb_srgb: Float32[np.ndarray, "h w 3"]
     rgb_linear: Float32[np.ndarray, "h w 3"]
     alpha: Float32[np.ndarray, "h w"]
+    layers: dict[str, Float32[np.ndarray, "h w"]]
 
 
 class Film:
@@ -43,36 +59,58 @@ class Film:
     Args:
         height: of the picture, pixels.
         width: of the picture, pixels.
+        layered: also keep what the layers of a compositor need.
+
+    Attributes:
+        plate: the scene alone, to be filled alongside; None unless ``layered``.
     """
 
-    def __init__(self, height: int, width: int) -> None:
+    def __init__(self, height: int, width: int, *, layered: bool = False) -> None:
         self._shape = (height, width)
         count = height * width
-        self._layer, self._light, self._shade = np.zeros((3, count, 3))
-        self._through, self._coverage, self._samples, self._front = np.zeros((4, count))
+        self._layer, self._light, self._shade, self._albedo, self._normals = np.zeros((5, count, 3))
+        self._through, self._coverage, self._things, self._samples, self._front = np.zeros((5, count))
         self._front_light = np.zeros((count, 3))
+        self.plate = Film(height, width) if layered else None
+        self._free = Film(height, width) if layered else None
 
-    def add(self, paths: Paths, pixels: Int64[np.ndarray, " n"]) -> None:
-        """Add finished paths, equally many to each of ``pixels``, those of one pixel beside each other."""
+    def add(
+        self, paths: Paths, pixels: Int64[np.ndarray, " n"], counted: Float32[np.ndarray, " p"] | None = None
+    ) -> None:
+        """Add finished paths, equally many to each of ``pixels``, those of one pixel beside each other.
+
+        Args:
+            paths: to add.
+            pixels: where they begin.
+            counted: 1 for those that count, 0 for the others; None for all.
+        """
         each = len(paths.keys) // len(pixels)
 
         def add(
             sums: Float64[np.ndarray, "..."],
             values: Float32[np.ndarray, "..."],
-            factors: Float32[np.ndarray, " f"] = _ONE,
+            factors: Float32[np.ndarray, " f"] = _ONE if counted is None else counted,
         ) -> None:
             add_up(values.reshape(len(values), -1), factors, each, pixels, sums.reshape(len(sums), -1))
 
         front = (paths.marks & FRONT != 0).astype(np.float32)
         through = paths.transmittance * (1 - front)
         add(self._layer, paths.layer_srgb)
-        add(self._light, paths.radiance_linear, through)
+        add(self._light, paths.radiance_linear, through if counted is None else through * counted)
         add(self._shade, paths.shade)
         add(self._through, through)
         add(self._coverage, paths.coverage)
         add(self._front, front)
-        add(self._front_light, paths.radiance_linear, front)
+        add(self._front_light, paths.radiance_linear, front if counted is None else front * counted)
+        if counted is not None:
+            add(self._samples, counted)
+            return
         self._samples[pixels] += each
+        add(self._albedo, paths.albedo_linear)
+        add(self._normals, paths.normals_world)
+        add(self._things, paths.things)
+        if self._free is not None:
+            self._free.add(paths, pixels, (paths.things == 0.0).astype(np.float32))
 
     def surface(self) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
         """Mean linear radiance of the Gaussians with materials that the camera sees, and their coverage."""
@@ -84,23 +122,77 @@ class Film:
 
     def image(self, *, exposure: float = 0.0, tone: Tone = "none") -> StageImage:
         """The picture of all paths so far; ``exposure`` is in stops."""
-        count = np.maximum(self._samples, 1)[:, None]
-        through = self._through[:, None] / count
-        front = self._front[:, None] / count
-        covered = np.maximum(1.0 - through - front, 0.0)
-        layer = self._layer / count
-        light = _divided(self._light, self._through[:, None])
-        shade = _divided(self._shade, (self._samples - self._through - self._front)[:, None], 1.0)
-        surface = _divided(self._front_light, self._front[:, None])
-        colour = srgb_to_linear(_divided(layer, covered)) * np.maximum(shade, 0.0)
-        lit = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(colour))
-        linear = srgb_to_linear(lit + front * linear_to_srgb(surface) + through * linear_to_srgb(light))
+        linear = self._linear()
         shown = linear_to_srgb(toned(linear * 2.0**exposure, tone))
         return StageImage(
             np.clip(shown, 0.0, 1.0).astype(np.float32).reshape(*self._shape, 3),
-            linear.astype(np.float32).reshape(*self._shape, 3),
-            (self._coverage / count[:, 0]).astype(np.float32).reshape(self._shape),
+            self._picture(linear),
+            self._picture(self._coverage / np.maximum(self._samples, 1)),
+            self._layers(linear),
         )
+
+    def denoised(self, clean: Filter) -> "Film":
+        """The film with less noise in what light brings; the Gaussians' own colours stay as they are."""
+        film = copy.copy(self)
+        count = np.maximum(self._samples, 1)[:, None]
+        if self._things.any():
+            guides = (self._picture(self._albedo / count), self._picture(self._normals / count))
+            light = clean(self._picture(self._light / count), *guides)
+            smooth = light.reshape(-1, 3).astype(np.float64) * count
+            film._light = np.where(self._things[:, None] > 0.0, smooth, self._light)
+        covered = self._covered()
+        shade = _divided(self._shade, covered, 1.0)
+        if (np.abs(shade - 1.0) > _DARK).any():
+            even = clean(self._picture(np.maximum(shade, 0.0)), None, None)
+            film._shade = even.reshape(-1, 3).astype(np.float64) * covered
+        if self._free is not None:
+            film._free = self._free.denoised(clean)
+        return film
+
+    def _linear(self, *, lit: bool = True) -> Float64[np.ndarray, "n 3"]:
+        """Linear values; not ``lit`` shows the Gaussians as trained."""
+        count = np.maximum(self._samples, 1)[:, None]
+        through, front = self._through[:, None] / count, self._front[:, None] / count
+        covered = np.maximum(1.0 - through - front, 0.0)
+        layer = self._layer / count
+        light = _divided(self._light, self._through[:, None])
+        surface = _divided(self._front_light, self._front[:, None])
+        if lit:
+            shade = _divided(self._shade, self._covered(), 1.0)
+            colour = srgb_to_linear(_divided(layer, covered)) * np.maximum(shade, 0.0)
+            layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(colour))
+        shown = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
+        return np.asarray(srgb_to_linear(shown))
+
+    def _covered(self) -> Float64[np.ndarray, "n 1"]:
+        return (self._samples - self._through - self._front)[:, None]
+
+    def _layers(self, picture: Float64[np.ndarray, "n 3"]) -> dict[str, Float32[np.ndarray, "h w"]]:
+        if self._free is None or self.plate is None:
+            return {}
+        plain = self._free._linear(lit=False)
+        seen = (self._free._samples > 0)[:, None] & (plain > _DARK)
+        shadow = np.where(seen, self._free._linear() / np.where(seen, plain, 1.0), 1.0)
+        background = self.plate._linear(lit=False)
+        behind = background * shadow
+        alpha = self._things / np.maximum(self._samples, 1)
+        needed = np.where(behind > _DARK, 1.0 - picture / np.maximum(behind, _DARK), 0.0).max(axis=1)
+        alpha = np.where(alpha > 0.0, np.clip(np.maximum(alpha, needed), 0.0, 1.0), 0.0)[:, None]
+        things = np.where(alpha > 0.0, np.maximum(picture - (1.0 - alpha) * behind, 0.0), 0.0)
+        beyond = self.plate._coverage / np.maximum(self.plate._samples, 1)
+        parts = {
+            "background": (background, beyond),
+            "shadow": (shadow, np.clip(1.0 - shadow.mean(axis=1), 0.0, 1.0)),
+            "things": (things, alpha[:, 0]),
+        }
+        channels: dict[str, Float32[np.ndarray, "h w"]] = {}
+        for name, (rgb, a) in parts.items():
+            channels |= {f"{name}.{c}": self._picture(rgb[:, k]) for k, c in enumerate("RGB")}
+            channels[f"{name}.A"] = self._picture(a)
+        return channels
+
+    def _picture(self, values: Float64[np.ndarray, "n *c"]) -> Float32[np.ndarray, "h w *c"]:
+        return values.astype(np.float32).reshape(*self._shape, *values.shape[1:])
 
 
 def toned(linear: Float64[np.ndarray, "n 3"], tone: Tone) -> Float64[np.ndarray, "n 3"]:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from queue import Queue
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from engine.light.arrays import (
     new_scratches,
     new_shadow_rays,
 )
+from engine.light.denoising import denoiser
 from engine.light.film import Film
 from engine.light.kernels_follow import follow_paths
 from engine.light.kernels_layer import add_layer_light, meet_layers
@@ -29,8 +31,8 @@ from engine.light.kernels_material_layer import meet_materials, start_at_points
 from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
 from engine.light.kernels_shadows import let_through
 from engine.light.layers import GaussianLayers
-from engine.light.stage import Integrator
-from engine.light.staging import LitMeshes
+from engine.light.stage import Integrator, Stage
+from engine.light.staging import LitMeshes, stage_meshes
 from engine.rays import ImageRays, RayBatch
 from engine.render.renderer import tile_order
 from engine.threads import use_threads
@@ -55,11 +57,13 @@ class LitScene:
         meshes: with materials, lights and surroundings.
         layers: the Gaussians; None without any.
         background_linear: radiance from where there is neither a mesh, nor Gaussians, nor an environment.
+        surroundings: the environment without meshes and lights, for the plate of layered pictures.
     """
 
     meshes: LitMeshes
     layers: GaussianLayers | None = None
     background_linear: Float64[np.ndarray, "3"] | None = None
+    surroundings: LitMeshes | None = None
 
 
 class PathTracer:
@@ -72,6 +76,9 @@ class PathTracer:
         scene: what there is.
         settings: how to trace.
         threads: for the kernels; 0 takes all.
+
+    Raises:
+        ConfigError: noise is to be taken away, and what can do so is not installed.
     """
 
     def __init__(self, scene: LitScene, settings: Integrator, *, threads: int = 0) -> None:
@@ -90,6 +97,13 @@ class PathTracer:
             scene.meshes.environment_visible,
             background.astype(np.float64),
         )
+        self._clean = denoiser() if settings.denoise else None
+        self._plate: PathTracer | None = None
+        if settings.layers:
+            plain = settings.model_copy(update={"layers": False, "denoise": False})
+            empty = scene.surroundings or stage_meshes(Stage(), Path(), threads=threads)
+            alone = LitScene(empty, scene.layers, scene.background_linear)
+            self._plate = PathTracer(alone, plain, threads=threads)
 
     def render(
         self,
@@ -102,19 +116,25 @@ class PathTracer:
             image: rays through the centres of its pixels.
             progress: told (batches done, batches in all).
         """
-        film = Film(image.height_px, image.width_px)
+        film = self._new_film(image)
         self.add_samples(film, image, 0, self._settings.samples, progress)
-        return film
+        return self._finished(film)
 
     def refine(self, image: ImageRays) -> Iterator[Film]:
         """The same film again and again, each time with about twice as many samples, until it has all."""
-        film = Film(image.height_px, image.width_px)
+        film = self._new_film(image)
         done = 0
         while done < self._settings.samples:
             more = min(max(1, done), self._settings.samples - done)
             self.add_samples(film, image, done, more)
             done += more
-            yield film
+            yield self._finished(film)
+
+    def _new_film(self, image: ImageRays) -> Film:
+        return Film(image.height_px, image.width_px, layered=self._plate is not None)
+
+    def _finished(self, film: Film) -> Film:
+        return film if self._clean is None else film.denoised(self._clean)
 
     def add_samples(
         self,
@@ -125,6 +145,8 @@ class PathTracer:
         progress: Progress = lambda _done, _total: None,
     ) -> None:
         """Add the samples ``first`` to ``first + count`` of every pixel to a film."""
+        if self._plate is not None and film.plate is not None:
+            self._plate.add_samples(film.plate, image, first, count)
         use_threads(self._threads)
         view = View(
             image.origin_world.astype(np.float64),
@@ -283,11 +305,12 @@ class PathTracer:
             if len(active) == 0:
                 return
 
-    def _let_through(self, shadows: ShadowRays) -> Float32[np.ndarray, "n 3"]:
+    def _let_through(self, shadows: ShadowRays, *, through_frost: bool = False) -> Float32[np.ndarray, "n 3"]:
         """The share of light that meshes let through on each ray."""
         meshes, share = self._scene.meshes, np.empty_like(shadows.lit)
         self._share(
-            let_through, len(share), meshes.queries, meshes.surfaces, meshes.materials, shadows, share
+            let_through, len(share), meshes.queries, meshes.surfaces, meshes.materials, shadows,
+            through_frost, share,
         )  # fmt: skip
         return share
 
@@ -309,7 +332,7 @@ class PathTracer:
         asked = np.flatnonzero(shadows.lit.any(axis=1) | shadows.lost.any(axis=1))
         if len(asked) == 0:
             return
-        share = self._let_through(shadows)[asked]
+        share = self._let_through(shadows, through_frost=True)[asked]
         free, whole = share.any(axis=1), (share == 1.0).all(axis=1)
         through = np.ones((2, len(asked)), np.float32)
         for row, tracer in enumerate((layers.on_gaussians, layers.not_on_gaussians)):

@@ -37,7 +37,7 @@ def follow_paths(
                 0, left, scratch, paths, active, depth, distances, faces, barycentrics, surfaces, materials,
                 lights, environment, rules, shadows,
             )  # fmt: skip
-            let_through(0, left, scratch, queries, surfaces, materials, shadows, share)
+            let_through(0, left, scratch, queries, surfaces, materials, shadows, False, share)
             add_lit(0, left, scratch, paths, active, shadows.lit, share)
             going = 0
             for k in range(left):

@@ -15,7 +15,7 @@ composited as such, into one layer of premultiplied colour g and transmittance T
 import math
 
 from engine.light.arrays import PAIRS_OF_SURFACE
-from engine.light.kernels_lights import FAR, pick_light, sample_light
+from engine.light.kernels_lights import FAR, adding_share, pick_light, sample_light
 from engine.light.kernels_path import ENDED, PAIRS_OF_CAMERA, add_radiance, beyond
 from engine.light.kernels_random import uniform_pair
 from engine.light.kernels_scatter import CLEAR, LAYER_PLACE, PICK, SHORT_OF_LIGHT
@@ -96,13 +96,17 @@ def meet_layers(
                 w_x, w_y, w_z, reach, l_r, l_g, l_b, pdf = sample_light(lights, l, x, y, z, u, v)
                 n_x, n_y, n_z = unit(normals[k, 0], normals[k, 1], normals[k, 2])
                 cosine = max(n_x * w_x + n_y * w_y + n_z * w_z, 0.0)
-                factor = relit * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
+                taking = relit + (shadowed if lights.adds[l] else 0.0)
+                factor = taking * cosine / (math.pi * chance * (pdf if pdf > 0.0 else 1.0))
                 shadows.lit[k, 0] = g_r * l_r * factor
                 shadows.lit[k, 1] = g_g * l_g * factor
                 shadows.lit[k, 2] = g_b * l_b * factor
-                shadows.lost[k, 0] = -g_r * shadowed
-                shadows.lost[k, 1] = -g_g * shadowed
-                shadows.lost[k, 2] = -g_b * shadowed
+                if shadowed > NOTHING and not lights.adds[l]:
+                    # Only among the lights that take something is the shadow a mean.
+                    losing = shadowed / max(1.0 - adding_share(lights, x, y, z), 1e-6)
+                    shadows.lost[k, 0] = -g_r * losing
+                    shadows.lost[k, 1] = -g_g * losing
+                    shadows.lost[k, 2] = -g_b * losing
                 shadows.origins_world[k, 0], shadows.origins_world[k, 1], shadows.origins_world[k, 2] = (
                     x,
                     y,

@@ -9,9 +9,11 @@ import math
 
 from numba import njit
 
+from engine.light.kernels_bsdf import around
+from engine.light.kernels_texture import texture_value
 from engine.trace.kernels_native import lean
 
-POINT, SPOT, DIRECTIONAL, RECTANGLE, ENVIRONMENT = 0, 1, 2, 3, 4
+POINT, SPOT, DIRECTIONAL, RECTANGLE, ENVIRONMENT, BALL, MESH = 0, 1, 2, 3, 4, 5, 6
 FAR = 1e30
 
 
@@ -47,6 +49,10 @@ def light_weight(lights, l, p_x, p_y, p_z):
         if axis[0] * way_x + axis[1] * way_y + axis[2] * way_z <= 0.0:
             return 0.0
         return power * lights.areas[l] / (squared + lights.areas[l] / math.pi)
+    if kind == BALL:
+        return power * lights.areas[l] / squared
+    if kind == MESH:
+        return 0.25 * power * lights.areas[l] / (squared + lights.areas[l] / math.pi)
     if kind == SPOT:
         distance = math.sqrt(squared)
         power *= _cone(lights, l, way_x / distance, way_y / distance, way_z / distance)
@@ -87,6 +93,122 @@ def light_share(lights, wanted, p_x, p_y, p_z):
     return own / total if total > 0.0 else 0.0
 
 
+@lean()
+def adding_share(lights, p_x, p_y, p_z):
+    """The probability with which :func:`pick_light` asks at p one of the lights that add theirs."""
+    if not lights.some_add:
+        return 0.0
+    total, adding = 0.0, 0.0
+    for l in range(len(lights.kinds)):
+        weight = light_weight(lights, l, p_x, p_y, p_z)
+        total += weight
+        if lights.adds[l]:
+            adding += weight
+    return adding / total if total > 0.0 else 0.0
+
+
+@lean()
+def emitted(lights, l, u, v):
+    """Linear radiance of a shining surface at texture coordinates."""
+    rgb = lights.rgb_linear[l]
+    if lights.textures[l] < 0:
+        return rgb[0], rgb[1], rgb[2]
+    red, green, blue = texture_value(lights, lights.textures[l], u, v)
+    return rgb[0] * red, rgb[1] * green, rgb[2] * blue
+
+
+@lean()
+def seen_density(lights, l, o, distance, facing):
+    """Density over solid angle with which :func:`sample_light` gives from o the place that a ray met.
+
+    ``distance`` is that of the place and ``facing`` the cosine there.
+    """
+    if lights.kinds[l] == BALL:
+        x, y, z = (
+            lights.positions_world[l, 0] - o[0],
+            lights.positions_world[l, 1] - o[1],
+            lights.positions_world[l, 2] - o[2],
+        )
+        return 1.0 / (2.0 * math.pi * _cap(lights.areas[l] / math.pi / max(x * x + y * y + z * z, 1e-20)))
+    return distance * distance / (max(facing, 1e-9) * lights.areas[l])
+
+
+@lean()
+def _cap(squared_sine):
+    """1 less the cosine of an angle below 90 degrees, without losing digits where it is small."""
+    squared_sine = min(squared_sine, 1.0)
+    return max(squared_sine / (1.0 + math.sqrt(1.0 - squared_sine)), 1e-12)
+
+
+@lean()
+def _sample_ball(lights, l, p_x, p_y, p_z, u, v):
+    """A way from p to a ball of light, evenly over the solid angle that it fills."""
+    way_x = lights.positions_world[l, 0] - p_x
+    way_y = lights.positions_world[l, 1] - p_y
+    way_z = lights.positions_world[l, 2] - p_z
+    squared, of_ball = way_x * way_x + way_y * way_y + way_z * way_z, lights.areas[l] / math.pi
+    if squared <= of_ball:
+        return 0.0, 0.0, 1.0, FAR, 0.0, 0.0, 0.0, 1.0
+    distance = math.sqrt(squared)
+    way_x, way_y, way_z = way_x / distance, way_y / distance, way_z / distance
+    cap = _cap(of_ball / squared)
+    cosine = 1.0 - u * cap
+    sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    a_x, a_y, a_z, b_x, b_y, b_z = around(way_x, way_y, way_z)
+    a, b = sine * math.cos(2.0 * math.pi * v), sine * math.sin(2.0 * math.pi * v)
+    reach = distance * cosine - math.sqrt(max(of_ball - squared * sine * sine, 0.0))
+    rgb = lights.rgb_linear[l]
+    return (
+        a * a_x + b * b_x + cosine * way_x,
+        a * a_y + b * b_y + cosine * way_y,
+        a * a_z + b * b_z + cosine * way_z,
+        reach,
+        rgb[0],
+        rgb[1],
+        rgb[2],
+        1.0 / (2.0 * math.pi * cap),
+    )
+
+
+@lean()
+def _sample_mesh(lights, l, p_x, p_y, p_z, u, v):
+    """A way from p to a shining mesh, evenly over its area."""
+    first, last = lights.mesh_rows[l, 0], lights.mesh_rows[l, 1]
+    row, u = _step(lights.mesh_sums[first : last + 1], u)
+    face = lights.mesh_rows[l, 2] + row
+    corners, uv = lights.mesh_corners_world[face], lights.mesh_uv[face]
+    root = math.sqrt(u)
+    a, b, c = 1.0 - root, root * (1.0 - v), root * v
+    way_x = a * corners[0, 0] + b * corners[1, 0] + c * corners[2, 0] - p_x
+    way_y = a * corners[0, 1] + b * corners[1, 1] + c * corners[2, 1] - p_y
+    way_z = a * corners[0, 2] + b * corners[1, 2] + c * corners[2, 2] - p_z
+    squared = max(way_x * way_x + way_y * way_y + way_z * way_z, 1e-20)
+    distance = math.sqrt(squared)
+    way_x, way_y, way_z = way_x / distance, way_y / distance, way_z / distance
+    s_x, s_y, s_z = (
+        corners[1, 0] - corners[0, 0],
+        corners[1, 1] - corners[0, 1],
+        corners[1, 2] - corners[0, 2],
+    )
+    t_x, t_y, t_z = (
+        corners[2, 0] - corners[0, 0],
+        corners[2, 1] - corners[0, 1],
+        corners[2, 2] - corners[0, 2],
+    )
+    n_x, n_y, n_z = s_y * t_z - s_z * t_y, s_z * t_x - s_x * t_z, s_x * t_y - s_y * t_x
+    length = max(math.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
+    cosine = abs(n_x * way_x + n_y * way_y + n_z * way_z) / length
+    if cosine <= 1e-9:
+        return way_x, way_y, way_z, distance, 0.0, 0.0, 0.0, 1.0
+    red, green, blue = emitted(
+        lights,
+        l,
+        a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0],
+        a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1],
+    )
+    return way_x, way_y, way_z, distance, red, green, blue, squared / (cosine * lights.areas[l])
+
+
 @lean(forceinline=True)
 def sample_light(lights, l, p_x, p_y, p_z, u, v):
     """A way from p to a light: unit direction, distance, linear radiance, density over solid angle.
@@ -99,6 +221,10 @@ def sample_light(lights, l, p_x, p_y, p_z, u, v):
         d_x, d_y, d_z, pdf = sample_environment(lights, u, v)
         red, green, blue = environment_radiance(lights, d_x, d_y, d_z)
         return d_x, d_y, d_z, FAR, red, green, blue, pdf
+    if kind == BALL:
+        return _sample_ball(lights, l, p_x, p_y, p_z, u, v)
+    if kind == MESH:
+        return _sample_mesh(lights, l, p_x, p_y, p_z, u, v)
     axis = lights.axes[l]
     if kind == DIRECTIONAL:
         return -axis[0], -axis[1], -axis[2], FAR, rgb[0], rgb[1], rgb[2], 0.0

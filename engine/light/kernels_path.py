@@ -9,14 +9,35 @@ import math
 
 from engine.light.arrays import BLOCK, PAIRS_OF_SURFACE
 from engine.light.kernels_bsdf import around, fresnel_dielectric
-from engine.light.kernels_lights import environment_density, environment_radiance, light_share
+from engine.light.kernels_frosted import LEAST_FROST, frosted_sample, frosted_value
+from engine.light.kernels_lights import (
+    emitted,
+    environment_density,
+    environment_radiance,
+    light_share,
+    pick_light,
+    sample_light,
+    seen_density,
+)
 from engine.light.kernels_random import fill_pairs, pixel_key
-from engine.light.kernels_scatter import CHOICE, CLEAR, SCATTERED, STRAIGHT, leave, scatter
+from engine.light.kernels_scatter import (
+    CHOICE,
+    CLEAR,
+    DIRECTION,
+    PICK,
+    PLACE,
+    SCATTERED,
+    STRAIGHT,
+    ask,
+    leave,
+    scatter,
+)
 from engine.light.kernels_surface import (
     DIFFUSE,
     GLASS,
     LIGHT,
     MIRROR,
+    bumped_normal,
     face_normal,
     hit_point,
     lifted,
@@ -24,7 +45,9 @@ from engine.light.kernels_surface import (
     reflected,
     shading_normal,
     unit,
+    vertex_colour,
 )
+from engine.shading.kernels_microfacets import table_value
 from engine.trace.kernels_native import lean
 
 ENDED = -2
@@ -105,7 +128,8 @@ def start_paths(first, last, scratch, view, rules, first_pixel, per_pixel, first
         for channel in range(3):
             paths.weights[k, channel], paths.radiance_linear[k, channel] = 1.0, 0.0
             paths.layer_srgb[k, channel], paths.shade[k, channel] = 0.0, 0.0
-        paths.transmittance[k], paths.coverage[k] = 1.0, 1.0
+            paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
+        paths.transmittance[k], paths.coverage[k], paths.things[k] = 1.0, 1.0, 0.0
         paths.densities[k], paths.inside[k] = 0.0, -1
         paths.marks[k], paths.alive[k] = CLEAR | STRAIGHT, True
 
@@ -150,17 +174,18 @@ def _miss(paths, p, lights, environment, rules):
 
 
 @lean(forceinline=True)
-def _light_seen(paths, p, lights, l, distance, facing, rules):
-    """A path ends on a shining surface; ``facing`` is the cosine to its front."""
+def _light_seen(paths, p, lights, l, distance, facing, u, v, rules):
+    """A path meets a shining surface; ``facing`` is the cosine to its front, (u, v) the place on a mesh."""
     if facing <= 0.0:
         return
     share = 1.0
     if paths.densities[p] > 0.0:
         o = paths.origins_world[p]
-        pdf = light_share(lights, l, o[0], o[1], o[2]) * distance * distance / (facing * lights.areas[l])
+        pdf = light_share(lights, l, o[0], o[1], o[2]) * seen_density(lights, l, o, distance, facing)
         share = paths.densities[p] / (paths.densities[p] + pdf)
-    w, rgb = paths.weights[p], lights.rgb_linear[l]
-    add_radiance(paths, p, share * w[0] * rgb[0], share * w[1] * rgb[1], share * w[2] * rgb[2], rules.clamp)
+    w = paths.weights[p]
+    red, green, blue = emitted(lights, l, u, v)
+    add_radiance(paths, p, share * w[0] * red, share * w[1] * green, share * w[2] * blue, rules.clamp)
 
 
 @lean(forceinline=True)
@@ -221,6 +246,86 @@ def _fill_numbers(scratch, paths, active, faces, first, last, first_pair):
     fill_pairs(scratch.keys, scratch.samples, count, first_pair, scratch.numbers)
 
 
+@lean(forceinline=True)
+def _guide(paths, p, red, green, blue, n_x, n_y, n_z):
+    """Note colour and normal of the first mesh that the camera's ray meets, as far as it is seen."""
+    share = paths.things[p]
+    paths.albedo_linear[p, 0] = share * red
+    paths.albedo_linear[p, 1] = share * green
+    paths.albedo_linear[p, 2] = share * blue
+    paths.normals_world[p, 0] = share * n_x
+    paths.normals_world[p, 1] = share * n_y
+    paths.normals_world[p, 2] = share * n_z
+
+
+@lean()
+def _frosted_glass(
+    paths, p, k, materials, m, entering, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice,
+    lights, rules, shadows, numbers, n,
+):  # fmt: skip
+    """What lights send to rough glass, and a way on that its facets reflect or refract."""
+    d = paths.directions_world[p]
+    eta = materials.iors[m] if entering else 1.0 / materials.iors[m]
+    tint, roughness = materials.colours_linear[m], materials.roughness[m]
+    alpha = roughness * roughness
+    a_x, a_y, a_z, b_x, b_y, b_z = around(s_x, s_y, s_z)
+    o_x = -(d[0] * a_x + d[1] * a_y + d[2] * a_z)
+    o_y = -(d[0] * b_x + d[1] * b_y + d[2] * b_z)
+    o_z = -(d[0] * s_x + d[1] * s_y + d[2] * s_z)
+    gain = 1.0
+    if materials.kept[m]:
+        gain = 1.0 / table_value(materials.coat[materials.coats[m] + (0 if entering else 1)], o_z, roughness)
+    front_x, front_y, front_z = lifted(x, y, z, n_x, n_y, n_z)
+    back_x, back_y, back_z = lifted(x, y, z, -n_x, -n_y, -n_z)
+    w = paths.weights[p]
+    clamp = rules.clamp if paths.marks[p] & SCATTERED else math.inf
+    if len(lights.kinds):
+        l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
+        if l >= 0:
+            u, v = numbers[PLACE, 0, n], numbers[PLACE, 1, n]
+            w_x, w_y, w_z, distance, l_r, l_g, l_b, l_pdf = sample_light(lights, l, x, y, z, u, v)
+            i_z = w_x * s_x + w_y * s_y + w_z * s_z
+            if i_z * (w_x * n_x + w_y * n_y + w_z * n_z) > 0.0 and l_r + l_g + l_b > 0.0:
+                value, pdf = frosted_value(
+                    o_x, o_y, o_z,
+                    w_x * a_x + w_y * a_y + w_z * a_z, w_x * b_x + w_y * b_y + w_z * b_z, i_z, eta, alpha,
+                )  # fmt: skip
+                factor = gain * value / share
+                shadows.straight[k] = l_pdf == 0.0
+                if l_pdf > 0.0:
+                    l_pdf *= share
+                    factor = gain * value / (l_pdf + pdf if lights.seen[l] else l_pdf)
+                if value > 0.0:
+                    through = i_z < 0.0
+                    ask(
+                        shadows, k,
+                        back_x if through else front_x, back_y if through else front_y,
+                        back_z if through else front_z, w_x, w_y, w_z, distance,
+                        w[0] * l_r * factor * (tint[0] if through else 1.0),
+                        w[1] * l_g * factor * (tint[1] if through else 1.0),
+                        w[2] * l_b * factor * (tint[2] if through else 1.0), clamp,
+                    )  # fmt: skip
+    u, v = numbers[DIRECTION, 0, n], numbers[DIRECTION, 1, n]
+    i_x, i_y, i_z = frosted_sample(o_x, o_y, o_z, eta, alpha, choice, u, v)
+    value, pdf = frosted_value(o_x, o_y, o_z, i_x, i_y, i_z, eta, alpha)
+    w_x = i_x * a_x + i_y * b_x + i_z * s_x
+    w_y = i_x * a_y + i_y * b_y + i_z * s_y
+    w_z = i_x * a_z + i_y * b_z + i_z * s_z
+    if not pdf > 0.0 or i_z * (w_x * n_x + w_y * n_y + w_z * n_z) <= 0.0:
+        paths.alive[p] = False
+        return
+    through = i_z < 0.0
+    for channel in range(3):
+        paths.weights[p, channel] *= gain * value / pdf * (tint[channel] if through else 1.0)
+    paths.marks[p] = (paths.marks[p] | SCATTERED) & ~(CLEAR | STRAIGHT)
+    w_x, w_y, w_z = unit(w_x, w_y, w_z)
+    if through:
+        paths.inside[p] = m if entering else -1
+        leave(paths, p, back_x, back_y, back_z, w_x, w_y, w_z, pdf)
+    else:
+        leave(paths, p, front_x, front_y, front_z, w_x, w_y, w_z, pdf)
+
+
 @lean(cache=True, nogil=True)
 def meet_surfaces(
     first,
@@ -272,8 +377,17 @@ def meet_surfaces(
             medium = materials.absorption[paths.inside[p]]
             for channel in range(3):
                 paths.weights[p, channel] *= math.exp(-medium[channel] * distances[k])
+        first_thing = paths.marks[p] & STRAIGHT != 0 and paths.things[p] == 0.0
+        if first_thing:
+            paths.things[p] = paths.transmittance[p]
+            _guide(paths, p, 1.0, 1.0, 1.0, n_x, n_y, n_z)
+        uv = surfaces.corner_uv[face]
+        u_t = a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0]
+        v_t = a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1]
         if kind == LIGHT:
-            _light_seen(paths, p, lights, materials.lights[m], distances[k], facing, rules)
+            _light_seen(paths, p, lights, materials.lights[m], distances[k], facing, 0.0, 0.0, rules)
+        elif materials.lights[m] >= 0:
+            _light_seen(paths, p, lights, materials.lights[m], distances[k], abs(facing), u_t, v_t, rules)
         if kind == LIGHT or depth >= rules.max_depth:
             paths.alive[p] = False
             continue
@@ -283,6 +397,8 @@ def meet_surfaces(
         s_x, s_y, s_z = shading_normal(
             surfaces.corner_normals[face], a, b, c, n_x, n_y, n_z, d[0], d[1], d[2]
         )
+        if first_thing:
+            _guide(paths, p, 1.0, 1.0, 1.0, s_x, s_y, s_z)
         choice, roulette = numbers[CHOICE, 0, n], numbers[CHOICE, 1, n]
         if depth >= rules.roulette_depth:
             w = paths.weights[p]
@@ -292,17 +408,29 @@ def meet_surfaces(
                 continue
             for channel in range(3):
                 paths.weights[p, channel] /= stay
+        if kind == GLASS and materials.roughness[m] >= LEAST_FROST and materials.iors[m] != 1.0:
+            _frosted_glass(
+                paths, p, k, materials, m, facing >= 0.0, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice,
+                lights, rules, shadows, numbers, n,
+            )  # fmt: skip
+            continue
         if kind == GLASS:
             _glass(paths, p, materials, m, facing >= 0.0, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, choice)
             continue
-        uv = surfaces.corner_uv[face]
-        u_t = a * uv[0, 0] + b * uv[1, 0] + c * uv[2, 0]
-        v_t = a * uv[0, 1] + b * uv[1, 1] + c * uv[2, 1]
         red, green, blue, metallic, roughness = material_at(materials, m, u_t, v_t)
+        if materials.tinted[m]:
+            t_r, t_g, t_b = vertex_colour(surfaces, face, a, b, c)
+            red, green, blue = red * t_r, green * t_g, blue * t_b
         if kind == MIRROR:
             _mirror(paths, p, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue)
             continue
         x, y, z = lifted(x, y, z, n_x, n_y, n_z)
+        s_x, s_y, s_z = bumped_normal(
+            materials, m, surfaces.corners_world[face], uv, u_t, v_t,
+            n_x, n_y, n_z, s_x, s_y, s_z, d[0], d[1], d[2],
+        )  # fmt: skip
+        if first_thing:
+            _guide(paths, p, red, green, blue, s_x, s_y, s_z)
         scatter(
             k, p, n, numbers, paths, kind == DIFFUSE, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z,
             red, green, blue, metallic, roughness,

@@ -35,6 +35,20 @@ def leave(paths, p, x, y, z, d_x, d_y, d_z, density):
     paths.densities[p] = density
 
 
+@lean()
+def ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, blue, clamp):
+    """Ask a light: what it brings if nothing is in its way, no more than ``clamp``."""
+    most = max(red, green, blue)
+    if most > clamp:
+        red, green, blue = red * clamp / most, green * clamp / most, blue * clamp / most
+    shadows.lit[k, 0], shadows.lit[k, 1], shadows.lit[k, 2] = red, green, blue
+    shadows.origins_world[k, 0], shadows.origins_world[k, 1], shadows.origins_world[k, 2] = x, y, z
+    shadows.directions_world[k, 0] = w_x
+    shadows.directions_world[k, 1] = w_y
+    shadows.directions_world[k, 2] = w_z
+    shadows.t_max[k] = distance * SHORT_OF_LIGHT if distance < FAR else np.inf
+
+
 @lean(forceinline=True)
 def scatter(
     k, p, n, numbers, paths, matt, x, y, z, n_x, n_y, n_z, s_x, s_y, s_z, red, green, blue, metallic,
@@ -78,21 +92,8 @@ def scatter(
                     w[1] * f_g * l_g * factor,
                     w[2] * f_b * l_b * factor,
                 )
-                most = max(l_r, l_g, l_b)
-                if paths.marks[p] & SCATTERED and most > rules.clamp:
-                    l_r, l_g, l_b = (
-                        l_r * rules.clamp / most,
-                        l_g * rules.clamp / most,
-                        l_b * rules.clamp / most,
-                    )
-                shadows.lit[k, 0], shadows.lit[k, 1], shadows.lit[k, 2] = l_r, l_g, l_b
-                shadows.origins_world[k, 0] = x
-                shadows.origins_world[k, 1] = y
-                shadows.origins_world[k, 2] = z
-                shadows.directions_world[k, 0] = w_x
-                shadows.directions_world[k, 1] = w_y
-                shadows.directions_world[k, 2] = w_z
-                shadows.t_max[k] = distance * SHORT_OF_LIGHT if distance < FAR else np.inf
+                clamp = rules.clamp if paths.marks[p] & SCATTERED else np.inf
+                ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, l_r, l_g, l_b, clamp)
     u, v = numbers[DIRECTION, 0, n], numbers[DIRECTION, 1, n]
     if matt:
         i_x, i_y, i_z = sample_cosine(u, v)

@@ -6,6 +6,7 @@ import numpy as np
 
 from engine.light.arrays import BLOCK
 from engine.light.kernels_bsdf import fresnel_dielectric
+from engine.light.kernels_frosted import LEAST_FROST
 from engine.light.kernels_surface import face_normal
 from engine.trace.kernels_native import lean
 from engine.trace.kernels_triangles import any_hits, closest_hits
@@ -48,7 +49,7 @@ def _block(query, shadows, scratch, count, share):
 
 
 @lean(forceinline=True)
-def _through_glass(queries, surfaces, materials, shadows, first, scratch, count, share):
+def _through_glass(queries, surfaces, materials, shadows, first, scratch, count, through_frost, share):
     """Take what Fresnel, tint and Beer take from ``count`` rows on their way straight through glass."""
     for k in range(BLOCK):
         scratch.starts[k] = 0.0
@@ -72,6 +73,8 @@ def _through_glass(queries, surfaces, materials, shadows, first, scratch, count,
             cosine = n_x * d[0] + n_y * d[1] + n_z * d[2]
             kept, _ = fresnel_dielectric(min(abs(cosine), 1.0), materials.iors[m])
             kept = 1.0 - kept
+            if not through_frost and materials.roughness[m] >= LEAST_FROST and materials.iors[m] != 1.0:
+                kept = 0.0
             t = scratch.distances[i]
             # Out of the glass: what it absorbed on the way.
             length = float(t - scratch.starts[place]) if cosine > 0.0 else 0.0
@@ -87,12 +90,14 @@ def _through_glass(queries, surfaces, materials, shadows, first, scratch, count,
 
 
 @lean(cache=True, nogil=True)
-def let_through(first, last, scratch, queries, surfaces, materials, shadows, share):
+def let_through(first, last, scratch, queries, surfaces, materials, shadows, through_frost, share):
     """The share of light that meshes let through on each ray, in each channel: 0 or 1, but for glass.
 
     It is 0, too, for rays that bring nothing. Where a ray is marked so, light goes straight through glass,
     less what Fresnel, tint and Beer take. Paths find light that glass bends only where a lamp has an extent
-    and the lit point sends paths on; everywhere else glass would cast the shadow of a stone.
+    and the lit point sends paths on; everywhere else glass would cast the shadow of a stone. Rough glass
+    sends paths on from its own surface, which find such light; only where none are sent (``through_frost``)
+    does it let light through as if it were smooth.
     """
     for start in range(first, last, BLOCK):
         end = min(start + BLOCK, last)
@@ -105,4 +110,4 @@ def let_through(first, last, scratch, queries, surfaces, materials, shadows, sha
         if queries.closest_glass.scene != 0:
             for i in range(count):
                 scratch.rows[i] -= start
-            _through_glass(queries, surfaces, materials, shadows, start, scratch, count, share)
+            _through_glass(queries, surfaces, materials, shadows, start, scratch, count, through_frost, share)

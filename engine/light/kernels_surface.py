@@ -2,6 +2,7 @@
 
 import math
 
+from engine.light.kernels_texture import texture_value
 from engine.trace.kernels_native import lean
 
 DIFFUSE, MIRROR, GLASS, OPAQUE, LIGHT = 0, 1, 2, 3, 4
@@ -49,30 +50,6 @@ def lifted(p_x, p_y, p_z, n_x, n_y, n_z):
 
 
 @lean(forceinline=True)
-def texture_value(materials, texture, u, v):
-    """Bilinear linear value of a texture that repeats."""
-    first, height, width = (
-        materials.texture_sizes[texture, 0],
-        materials.texture_sizes[texture, 1],
-        materials.texture_sizes[texture, 2],
-    )
-    texels = materials.texels_linear
-    x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
-    i, j = math.floor(x), math.floor(y)
-    x, y = x - i, y - j
-    left, right = int(i) % width, (int(i) + 1) % width
-    high, low = int(j) % height, (int(j) + 1) % height
-    a, b = first + high * width + left, first + high * width + right
-    c, d = first + low * width + left, first + low * width + right
-    w_a, w_b, w_c, w_d = (1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y
-    return (
-        w_a * texels[a, 0] + w_b * texels[b, 0] + w_c * texels[c, 0] + w_d * texels[d, 0],
-        w_a * texels[a, 1] + w_b * texels[b, 1] + w_c * texels[c, 1] + w_d * texels[d, 1],
-        w_a * texels[a, 2] + w_b * texels[b, 2] + w_c * texels[c, 2] + w_d * texels[d, 2],
-    )
-
-
-@lean(forceinline=True)
 def material_at(materials, m, u, v):
     """Base colour, metallic and roughness of material ``m`` at texture coordinates."""
     red, green, blue = (
@@ -90,6 +67,64 @@ def material_at(materials, m, u, v):
         _, t_g, t_b = texture_value(materials, texture, u, v)
         roughness, metallic = roughness * t_g, metallic * t_b
     return red, green, blue, metallic, roughness
+
+
+@lean()
+def vertex_colour(surfaces, face, a, b, c):
+    """The colour of the corners of a face at a place, white where no mesh has colours of its own."""
+    if len(surfaces.corner_rgb_linear) == 0:
+        return 1.0, 1.0, 1.0
+    return hit_point(surfaces.corner_rgb_linear[face], a, b, c)
+
+
+@lean()
+def bumped_normal(materials, m, corners, uv, u, v, n_x, n_y, n_z, s_x, s_y, s_z, d_x, d_y, d_z):
+    """The shading normal s turned as the normal texture says; n is the face's, on the viewer's side.
+
+    The frame follows the texture coordinates of the face: x where u grows, y where v shrinks, as v counts
+    downwards. s stays where the face has none, or where the viewer would see the new one from behind.
+    """
+    texture = materials.normal_textures[m]
+    if texture < 0:
+        return s_x, s_y, s_z
+    a_u, a_v = float(uv[1, 0]) - uv[0, 0], float(uv[1, 1]) - uv[0, 1]
+    b_u, b_v = float(uv[2, 0]) - uv[0, 0], float(uv[2, 1]) - uv[0, 1]
+    area = a_u * b_v - a_v * b_u
+    if abs(area) < 1e-20:
+        return s_x, s_y, s_z
+    a_x, a_y, a_z = (
+        float(corners[1, 0]) - corners[0, 0],
+        float(corners[1, 1]) - corners[0, 1],
+        float(corners[1, 2]) - corners[0, 2],
+    )
+    b_x, b_y, b_z = (
+        float(corners[2, 0]) - corners[0, 0],
+        float(corners[2, 1]) - corners[0, 1],
+        float(corners[2, 2]) - corners[0, 2],
+    )
+    t_x, t_y, t_z = (
+        (b_v * a_x - a_v * b_x) / area,
+        (b_v * a_y - a_v * b_y) / area,
+        (b_v * a_z - a_v * b_z) / area,
+    )
+    w_x, w_y, w_z = (
+        (b_u * a_x - a_u * b_x) / area,
+        (b_u * a_y - a_u * b_y) / area,
+        (b_u * a_z - a_u * b_z) / area,
+    )
+    along = t_x * s_x + t_y * s_y + t_z * s_z
+    t_x, t_y, t_z = unit(t_x - along * s_x, t_y - along * s_y, t_z - along * s_z)
+    along, beside = w_x * s_x + w_y * s_y + w_z * s_z, w_x * t_x + w_y * t_y + w_z * t_z
+    w_x, w_y, w_z = unit(
+        w_x - along * s_x - beside * t_x, w_y - along * s_y - beside * t_y, w_z - along * s_z - beside * t_z
+    )
+    x, y, z = texture_value(materials, texture, u, v)
+    scale = materials.normal_scales[m]
+    x, y, z = scale * (2.0 * x - 1.0), scale * (2.0 * y - 1.0), max(2.0 * z - 1.0, 1e-3)
+    x, y, z = unit(x * t_x + y * w_x + z * s_x, x * t_y + y * w_y + z * s_y, x * t_z + y * w_z + z * s_z)
+    if x * d_x + y * d_y + z * d_z > -1e-4 or x * n_x + y * n_y + z * n_z <= 0.0:
+        return s_x, s_y, s_z
+    return x, y, z
 
 
 @lean(forceinline=True)

@@ -1,6 +1,6 @@
 """The Gaussians of a stage as the path tracer sees them: layers on rays, and what they keep off."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from engine.edit.affine import scaling, transform, translation
+from engine.edit.selection import merge
 from engine.errors import ConfigError
 from engine.gaussians.channels import stacked
 from engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
-from engine.gaussians.model import SH_C0, FlatGaussians, concatenate
+from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.light.kernels_layer import AMBIENT, RELIT, SHADOWED
 from engine.light.kernels_material_layer import ALBEDO, COLUMNS, LIFT, MATERIAL
 from engine.light.meshes import rotation_matrix
@@ -95,7 +96,8 @@ def stage_layers(
         biases.append(BIAS_OF_SIZE * size if scene.shadow_bias is None else scene.shadow_bias)
     if not parts:
         return None
-    whole = concatenate(same_degree(parts))
+    # Channels say nothing of light, and two scenes may mean different things by one name.
+    whole = merge([part.without_channels(tuple(part.channels)) for part in parts])
     tracer = make_tracer(settings, threads=threads, build_quality=2)
     columns = COLUMNS if any(surfaces) else FEATURES
     tracer.build(whole, np.ascontiguousarray(np.concatenate(features)[:, :columns]))
@@ -128,17 +130,6 @@ def moved(gaussians: FlatGaussians, place: StageGaussians) -> FlatGaussians:
     matrix[:3, :3] = rotation_matrix(place.rotation_degrees)
     matrix = translation(np.array(place.position)) @ matrix @ scaling(np.full(3, place.scale))
     return transform(gaussians, matrix)
-
-
-def same_degree(parts: Sequence[FlatGaussians]) -> list[FlatGaussians]:
-    """The parts with harmonics of the highest degree among them, the missing ones 0."""
-    most = max(part.sh.shape[1] for part in parts)
-    return [
-        part
-        if part.sh.shape[1] == most
-        else replace(part, sh=np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0))))
-        for part in parts
-    ]
 
 
 def _features(gaussians: FlatGaussians, scene: StageGaussians) -> Float32[np.ndarray, "n f"]:

@@ -1,15 +1,19 @@
 """Lights of a stage as arrays that the kernels read."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 
 from engine.colour import srgb_to_linear
 from engine.light.environment import EnvironmentMap, environment_sampler, irradiance_mean
 from engine.light.kernels_lights import (
+    BALL,
     DIRECTIONAL,
     ENVIRONMENT,
+    MESH,
     POINT,
     RECTANGLE,
     SPOT,
@@ -19,19 +23,45 @@ from engine.light.kernels_lights import (
 from engine.light.stage import DirectionalLight, Light, PointLight, RectangleLight, SpotLight
 
 
+@dataclass(frozen=True)
+class ShiningMesh:
+    """Triangles that shine alike.
+
+    Attributes:
+        corners_world: of each.
+        corner_uv: texture coordinates.
+        rgb_linear: radiance.
+        texture: number of a texture that is multiplied by it, -1 for none.
+    """
+
+    corners_world: Float32[np.ndarray, "f 3 3"]
+    corner_uv: Float32[np.ndarray, "f 3 2"]
+    rgb_linear: Float64[np.ndarray, "3"]
+    texture: int = -1
+
+
 class LightArrays(NamedTuple):
-    """``l`` lights, the environment last among them where there is one.
+    """``l`` lights: those of the stage, shining meshes, and the environment where there is one.
 
     Attributes:
         kinds: which of the kinds of :mod:`engine.light.kernels_lights`.
-        positions_world: of points and spots; centres of rectangles.
+        positions_world: of points and spots; centres of rectangles, balls and meshes.
         axes: unit vectors: the way that the light goes, or a rectangle faces.
         rgb_linear: intensity, irradiance or radiance; of the environment pi times its mean radiance.
         sides_u: one side of a rectangle.
         sides_v: the other side.
-        areas: of rectangles.
+        areas: of rectangles and meshes; of balls that of their disc.
         cosines: of a spot's outer and inner angle.
         seen: whether rays meet the light, so that it counts for those too.
+        adds: whether the light is added to shadowed Gaussians.
+        some_add: whether any is.
+        textures: of meshes, -1 for none.
+        mesh_rows: of meshes: first and last row of their sums, and first triangle.
+        mesh_sums: cumulative shares of the triangles' areas, from 0 to 1 for each mesh.
+        mesh_corners_world: of the triangles of all meshes.
+        mesh_uv: likewise.
+        texels_linear: see :class:`engine.light.arrays.Materials`, as the next one.
+        texture_sizes: first texel, height and width of each.
         environment_linear: the map, one black pixel without one.
         environment_rows: see :class:`engine.light.environment.EnvironmentSampler`, as the next two.
         environment_columns: cumulative shares within each row.
@@ -48,6 +78,15 @@ class LightArrays(NamedTuple):
     areas: Float64[np.ndarray, " l"]
     cosines: Float64[np.ndarray, "l 2"]
     seen: Int32[np.ndarray, " l"]
+    adds: Int32[np.ndarray, " l"]
+    some_add: bool
+    textures: Int32[np.ndarray, " l"]
+    mesh_rows: Int64[np.ndarray, "l 3"]
+    mesh_sums: Float64[np.ndarray, " s"]
+    mesh_corners_world: Float32[np.ndarray, "f 3 3"]
+    mesh_uv: Float32[np.ndarray, "f 3 2"]
+    texels_linear: Float32[np.ndarray, "x 3"]
+    texture_sizes: Int64[np.ndarray, "k 3"]
     environment_linear: Float32[np.ndarray, "h w 3"]
     environment_rows: Float64[np.ndarray, " h1"]
     environment_columns: Float64[np.ndarray, "h w1"]
@@ -62,15 +101,31 @@ class LightArrays(NamedTuple):
 
 
 def light_arrays(
-    lights: tuple[Light, ...], up_world: Float64[np.ndarray, "3"], environment: EnvironmentMap | None = None
+    lights: tuple[Light, ...],
+    up_world: Float64[np.ndarray, "3"],
+    environment: EnvironmentMap | None = None,
+    meshes: Sequence[ShiningMesh] = (),
+    texels_linear: Float32[np.ndarray, "x 3"] | None = None,
+    texture_sizes: Int64[np.ndarray, "k 3"] | None = None,
 ) -> LightArrays:
-    """Arrays of lights and the environment that shines together with them."""
-    count = len(lights) + (environment is not None)
-    kinds, seen = np.zeros(count, np.int32), np.zeros(count, np.int32)
+    """Arrays of lights, meshes that shine, and the environment, in this order.
+
+    Args:
+        lights: of the stage.
+        up_world: the stage's up.
+        environment: light from all around.
+        meshes: that shine.
+        texels_linear: of the textures of the meshes' light.
+        texture_sizes: likewise.
+    """
+    count = len(lights) + len(meshes) + (environment is not None)
+    kinds, seen, adds = np.zeros((3, count), np.int32)
     positions, axes, rgb, sides_u, sides_v = np.zeros((5, count, 3))
     areas, cosines = np.zeros(count), np.tile([0.0, 1.0], (count, 1))
+    textures, rows = np.full(count, -1, np.int32), np.zeros((count, 3), np.int64)
     for l, light in enumerate(lights):
         colour = srgb_to_linear(np.array(light.colour_srgb))
+        adds[l] = light.adds_light
         if not isinstance(light, DirectionalLight):
             positions[l] = light.position
         if not isinstance(light, PointLight):
@@ -80,12 +135,26 @@ def light_arrays(
             if isinstance(light, SpotLight):
                 kinds[l] = SPOT
                 cosines[l] = np.cos(np.radians([light.outer_degrees, light.inner_degrees]))
+            elif light.radius > 0.0:
+                areas[l] = np.pi * light.radius**2
+                kinds[l], rgb[l], seen[l] = BALL, rgb[l] / areas[l], light.visible
         elif isinstance(light, DirectionalLight):
             kinds[l], rgb[l] = DIRECTIONAL, colour * light.irradiance
         else:
             kinds[l], rgb[l], seen[l] = RECTANGLE, colour * light.radiance, light.visible
             sides_u[l], sides_v[l] = rectangle_sides(light, up_world)
             areas[l] = light.width * light.height
+    sums, corners, uv = [], [np.zeros((0, 3, 3), np.float32)], [np.zeros((0, 3, 2), np.float32)]
+    face, row = 0, 0
+    for l, mesh in enumerate(meshes, len(lights)):
+        own = triangle_areas(mesh.corners_world)
+        kinds[l], rgb[l], areas[l], seen[l], adds[l] = MESH, mesh.rgb_linear, own.sum(), 1, 1
+        positions[l] = own @ mesh.corners_world.mean(axis=1, dtype=np.float64) / own.sum()
+        textures[l], rows[l] = mesh.texture, (row, row + len(own), face)
+        sums.append(np.concatenate([[0.0], np.cumsum(own) / own.sum()]))
+        corners.append(mesh.corners_world)
+        uv.append(mesh.corner_uv)
+        face, row = face + len(own), row + len(own) + 1
     radiance, frame = np.zeros((1, 1, 3), np.float32), np.eye(3)
     if environment is not None:
         radiance, frame = environment.radiance_linear, environment.frame
@@ -93,8 +162,19 @@ def light_arrays(
     sampler = environment_sampler(radiance)
     return LightArrays(
         kinds, positions, axes, rgb, sides_u, sides_v, areas, cosines, seen,
+        adds, bool(adds.any()), textures, rows, np.concatenate([np.zeros(0), *sums]), np.concatenate(corners),
+        np.concatenate(uv),
+        np.zeros((0, 3), np.float32) if texels_linear is None else texels_linear,
+        np.zeros((0, 3), np.int64) if texture_sizes is None else texture_sizes,
         radiance, sampler.rows, sampler.columns, sampler.shares, frame,
     )  # fmt: skip
+
+
+def triangle_areas(corners: Float32[np.ndarray, "f 3 3"]) -> Float64[np.ndarray, " f"]:
+    """Areas of triangles."""
+    sides = (corners[:, 1:] - corners[:, :1]).astype(np.float64)
+    areas: np.ndarray = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return areas
 
 
 def rectangle_sides(

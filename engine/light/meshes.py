@@ -4,10 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from scipy.spatial.transform import Rotation
 
 from engine.errors import ConfigError
 from engine.files import read_mesh
+from engine.files.mesh_looks import MeshMaterial
 from engine.light.kernels_normals import smooth_normals
 from engine.light.stage import Placed
 from engine.surface.mesh import edge_report
@@ -24,14 +26,21 @@ class Shape:
     Attributes:
         vertices: positions.
         faces: three vertices each, anticlockwise from outside.
-        corner_uv: texture coordinates of the faces' corners, (0, 0) at the upper left; None without.
-        normals: of the vertices where they are known exactly.
+        corner_uv: texture coordinates of the faces' corners, (0, 0) at the upper left, NaN where there are
+            none; None without any.
+        normals: of the vertices, NaN where they are not known; None without any.
+        corner_rgb_linear: colours of the faces' corners; None without any.
+        material_numbers: row of each face in ``materials``, -1 for none; None without any.
+        materials: of the file.
     """
 
     vertices: Float64[np.ndarray, "v 3"]
     faces: Int64[np.ndarray, "f 3"]
     corner_uv: Float32[np.ndarray, "f 3 2"] | None = None
     normals: Float64[np.ndarray, "v 3"] | None = None
+    corner_rgb_linear: Float32[np.ndarray, "f 3 3"] | None = None
+    material_numbers: Int32[np.ndarray, " f"] | None = None
+    materials: tuple[MeshMaterial, ...] = ()
 
 
 def simple_shape(name: str) -> Shape:
@@ -40,30 +49,24 @@ def simple_shape(name: str) -> Shape:
 
 
 def read_shape(path: Path) -> Shape:
-    """The triangles of a mesh file.
+    """The triangles of a mesh file with what it says of their looks.
 
     Raises:
         SceneFileError: the file cannot be read.
         ConfigError: it holds no triangles.
     """
-    mesh = read_mesh(path)
+    mesh = read_mesh(path, looks=True)
     if len(mesh.triangles) == 0:
         raise ConfigError(f"{path}: holds no triangles, so that light has nothing to fall on.")
-    uv = None
-    if mesh.uv is not None and not _has_seams(path):
-        uv = np.nan_to_num(mesh.uv)
-        if path.suffix.lower() != ".glb":
-            uv = uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)  # from the lower left
-        uv = uv[mesh.triangles].astype(np.float32)
-    return Shape(mesh.vertices, mesh.triangles, uv)
-
-
-def _has_seams(path: Path) -> bool:
-    """Whether an OBJ gives some vertices several texture coordinates, of which the reader keeps one."""
-    if path.suffix.lower() != ".obj":
-        return False
-    content = path.read_bytes()
-    return content.count(b"\nvt ") > content.count(b"\nv ") + content.startswith(b"v ")
+    return Shape(
+        mesh.vertices,
+        mesh.triangles,
+        mesh.corner_uv,
+        None if mesh.normals is None else mesh.normals.astype(np.float64),
+        None if mesh.rgb_linear is None else mesh.rgb_linear[mesh.triangles],
+        mesh.material_numbers,
+        mesh.materials,
+    )
 
 
 def rotation_matrix(degrees: tuple[float, float, float]) -> Float64[np.ndarray, "3 3"]:
@@ -97,11 +100,27 @@ def turn_to(axis: str, up_world: Float64[np.ndarray, "3"]) -> Float64[np.ndarray
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
-def placed(points: Float64[np.ndarray, "n 3"], place: Placed) -> Float64[np.ndarray, "n 3"]:
-    """Points scaled, turned and moved."""
-    return points * np.array(place.scale) @ rotation_matrix(place.rotation_degrees).T + np.array(
-        place.position
-    )
+def upright_turn(axis: str, degrees: float, up_world: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The turn of :func:`turn_to`, and then one about up, anticlockwise seen from above."""
+    up = up_world / np.linalg.norm(up_world)
+    return np.asarray(Rotation.from_rotvec(np.radians(degrees) * up).as_matrix() @ turn_to(axis, up_world))
+
+
+def placed(
+    points: Float64[np.ndarray, "n 3"], place: Placed, turn: Float64[np.ndarray, "3 3"] | None = None
+) -> Float64[np.ndarray, "n 3"]:
+    """Points scaled along their own axes, turned by a matrix to the world's, turned as stated, and moved."""
+    whole = rotation_matrix(place.rotation_degrees) @ (np.eye(3) if turn is None else turn)
+    return points * np.array(place.scale) @ whole.T + np.array(place.position)
+
+
+def placed_normals(
+    normals: Float64[np.ndarray, "n 3"], place: Placed, turn: Float64[np.ndarray, "3 3"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Normals of points that are :func:`placed`, unit vectors; NaN where one has no length."""
+    turned = normals / np.array(place.scale) @ (rotation_matrix(place.rotation_degrees) @ turn).T
+    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.asarray((turned / np.where(lengths > 1e-12, lengths, np.nan)).astype(np.float32))
 
 
 def corner_normals(
@@ -120,8 +139,8 @@ def corner_normals(
     return normals
 
 
-def open_edges(shape: Shape) -> int:
-    """Edges that are not shared by two faces that wind alike; a closed mesh has none.
+def open_edges(shape: Shape, chosen: Bool[np.ndarray, " f"] | None = None) -> int:
+    """Edges that are not shared by two faces that wind alike, of all faces or of some; closed means none.
 
     Vertices that lie in one place count as one, as in files that repeat them for normals and textures.
     """
@@ -129,7 +148,7 @@ def open_edges(shape: Shape) -> int:
     _, owner = np.unique(
         np.round(shape.vertices / (WELD * size)).astype(np.int64), axis=0, return_inverse=True
     )
-    faces = owner.reshape(-1)[shape.faces].astype(np.int32)
+    faces = owner.reshape(-1)[shape.faces if chosen is None else shape.faces[chosen]].astype(np.int32)
     sound = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     report = edge_report(faces[sound])
     return report.open_edges + report.crowded_edges + report.twisted_edges

@@ -1,6 +1,7 @@
 """Where things go in a scene: where one can stand, what a pixel shows, where the light comes from."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from engine.errors import ConfigError
 from engine.gaussians.model import FlatGaussians
-from engine.light.meshes import placed, turn_to
+from engine.light.meshes import placed, upright_turn
 from engine.light.stage import Rest, Stage
-from engine.light.stage_file import StageFacts
+from engine.light.stage_file import BALL_OF_SIZE, StageFacts
 from engine.light.staging import stage_shape, up_axis
 from engine.rays import RayBatch
 from engine.trace.protocol import Tracer
@@ -22,6 +23,11 @@ RayOfPixel = Callable[[str, tuple[float, float]], Ray]
 LEVEL_COSINE = 0.9
 SPOTS = 256
 LEAST_OPACITY = 0.3
+LEAST_LEVEL = 0.08
+"""Share of the surface at the floor's height that looks up; of a scene without a floor it is some 0.05, as if
+surfaces looked anywhere, of a crumpled blanket 0.11, of a table with things on it one half."""
+BEFORE = (0.2, 0.3, 0.4, 0.5, 0.6)
+"""Where a ball hangs free, on the way from what the cameras look at to the middle of them."""
 
 
 def rested(stage: Stage, tracer: Tracer | None, ray_of_pixel: RayOfPixel, folder: Path) -> Stage:
@@ -40,7 +46,9 @@ def rested(stage: Stage, tracer: Tracer | None, ray_of_pixel: RayOfPixel, folder
             raise ConfigError(f"{key}: there are no Gaussians on which it could stand.")
         spot = _met(mesh.on, tracer, ray_of_pixel, key)
         shape = stage_shape(mesh, number, folder)
-        points = placed(shape.vertices @ turn_to(up_axis(mesh), up).T, mesh) - np.array(mesh.position)
+        points = placed(shape.vertices, mesh, upright_turn(up_axis(mesh), mesh.turn_degrees, up)) - np.array(
+            mesh.position
+        )
         heights = points @ up
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         foot = middle - (middle @ up - heights.min()) * up
@@ -100,7 +108,25 @@ def scene_facts(
         free = np.minimum(cKDTree(standing).query(spots)[0], free)
     away = np.linalg.norm(spots - centre_world, axis=1)
     floor = spots[np.argmax(size * seen + free - 0.7 * away)]
-    return _facts(up, floor, size, -_light_from(some.base_rgb_srgb, normals, area, up))
+    light = -_light_from(some.base_rgb_srgb, normals, area, up)
+    if level_share(some.means_world @ up, normals @ up, area, float(spots[0] @ up), size) >= LEAST_LEVEL:
+        return _facts(up, floor, size, light)
+    places = centre_world + np.array(BEFORE)[:, None] * (cameras_world.mean(axis=0) - centre_world)
+    seen = np.mean([tracer.transmittance(RayBatch.between(c[None], places)) for c in cameras_world], axis=0)
+    hanging = places[np.argmax(seen > 0.9 * seen.max())]
+    return replace(_facts(up, hanging - BALL_OF_SIZE * size * up, size, light), has_floor=False)
+
+
+def level_share(
+    heights: Float64[np.ndarray, " n"],
+    cosines: Float64[np.ndarray, " n"],
+    area: Float64[np.ndarray, " n"],
+    height: float,
+    size: float,
+) -> float:
+    """Share of the surface about a height that looks up."""
+    near = np.abs(heights - height) < 0.05 * size
+    return float(area[near & (cosines > LEVEL_COSINE)].sum() / max(area[near].sum(), 1e-30))
 
 
 def _floor(

@@ -22,8 +22,8 @@ from engine.trace.protocol import TraceSettings
 Part = Callable[[float], None]
 
 
-def _silent(_share: float) -> None:
-    pass
+def silent(_share: float) -> None:
+    """Tell nobody."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Relighter(Protocol):
         """Take this environment from now on."""
         ...
 
-    def render(self, image: ImageRays, part: Part = _silent) -> RelitImage:
+    def render(self, image: ImageRays, part: Part = silent) -> RelitImage:
         """What a camera sees; ``part`` is told the share that is done."""
         ...
 
@@ -85,7 +85,7 @@ class PathRelighter:
         meshes = self._meshes.lit_by(lights)
         self._tracer = PathTracer(LitScene(meshes, self._layers), self._integrator, threads=self._threads)
 
-    def render(self, image: ImageRays, part: Part = _silent) -> RelitImage:
+    def render(self, image: ImageRays, part: Part = silent) -> RelitImage:
         """What a camera sees; ``part`` is told the share that is done."""
         assert self._tracer is not None, "an environment must be put first"
         film = self._tracer.render(image, lambda done, of: part(done / of))

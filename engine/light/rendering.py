@@ -63,13 +63,13 @@ def render_preview(
 
 
 def write_stage_image(path: Path, image: StageImage) -> None:
-    """Write a picture: linear channels and alpha for ``.exr``, display values otherwise.
+    """Write a picture: linear channels, alpha and a compositor's layers for ``.exr``, else display values.
 
     Raises:
         OutputError: the file cannot be written.
     """
     if path.suffix.lower() == ".exr":
         layers = {name: image.rgb_linear[..., k] for k, name in enumerate("RGB")}
-        write_exr(path, {**layers, "A": image.alpha})
+        write_exr(path, {**layers, "A": image.alpha, **image.layers})
     else:
         write_png(path, image.rgb_srgb)

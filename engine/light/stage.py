@@ -29,7 +29,34 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Diffuse(Part):
+class Bumped(Part):
+    """A surface whose normals an image may change.
+
+    Attributes:
+        normal_texture: image file of normals in the frame of the texture coordinates: x to the right of the
+            image, y up in it, z off the surface, each from -1 to 1 as 0 to 1.
+        normal_scale: factor of x and y.
+    """
+
+    normal_texture: str | None = None
+    normal_scale: NotNegative = 1.0
+
+
+class Shining(Part):
+    """A surface that may shine by itself, on both sides.
+
+    Attributes:
+        emission: linear radiance of its own light, the same in all directions; 0 for none.
+        emission_srgb: colour of that light.
+        emission_texture: image file of display colours, multiplied by it.
+    """
+
+    emission: NotNegative = 0.0
+    emission_srgb: Colour = WHITE
+    emission_texture: str | None = None
+
+
+class Diffuse(Bumped, Shining):
     """A matt surface that sends light evenly everywhere.
 
     Attributes:
@@ -50,21 +77,25 @@ class Mirror(Part):
 
 
 class Glass(Part):
-    """Smooth clear glass, for closed meshes.
+    """Clear or frosted glass, for closed meshes.
 
     Attributes:
         ior: index of refraction; that of the surroundings is 1.
         tint_srgb: colour that light takes at each surface that it passes.
         absorption: what is absorbed inside in each linear channel, per world unit (Beer's law).
+        roughness: of its surface; perceptual, GGX's alpha is its square; below 0.03 it is smooth.
+        multiple_scattering: light that facets throw at each other is kept, not lost.
     """
 
     kind: Literal["glass"] = "glass"
     ior: Annotated[float, Field(ge=1, le=4)] = 1.5
     tint_srgb: Colour = WHITE
     absorption: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
+    roughness: Share = 0.0
+    multiple_scattering: bool = True
 
 
-class Metal(Part):
+class Metal(Bumped):
     """Metal with a microfacet surface (GGX).
 
     Attributes:
@@ -79,7 +110,7 @@ class Metal(Part):
     multiple_scattering: bool = True
 
 
-class Dielectric(Part):
+class Dielectric(Bumped, Shining):
     """A coloured ground under a clear coat with a microfacet surface, such as plastic or glaze.
 
     Attributes:
@@ -96,7 +127,7 @@ class Dielectric(Part):
     ior: Annotated[float, Field(gt=1, le=4)] = 1.5
 
 
-class MetallicRoughness(Part):
+class MetallicRoughness(Bumped, Shining):
     """glTF's material: a mixture of a dielectric and a metal.
 
     Attributes:
@@ -135,7 +166,7 @@ class Placed(Part):
     Attributes:
         position: where its origin comes to lie.
         rotation_degrees: about the world's x, then y, then z axis.
-        scale: one factor, or one for each axis.
+        scale: one factor, or one for each axis of its own.
     """
 
     position: Vector = (0.0, 0.0, 0.0)
@@ -181,15 +212,19 @@ class StageMesh(Placed):
             stage's up.
         up_axis: which of the file's axes is turned to the stage's up; ``world`` leaves the file as it is.
             By default y for GLB (glTF says so) and world for the others.
-        smooth_degrees: edges up to this angle are shaded as if they were round; 0 shows every facet.
-        material: what it is made of; a matt grey by default. A GLB needs one, as its own are not read.
+        turn_degrees: about the stage's up, anticlockwise seen from above, before ``rotation_degrees``.
+        smooth_degrees: edges up to this angle are shaded as if they were round; 0 shows every facet. By
+            default the normals of the file are taken, or 30 where it has none.
+        material: what it is made of; by default what the file says of its materials and colours, or else a
+            matt grey.
         on: a place in the scene on which it stands; its position counts from there.
     """
 
     file: str | None = None
     shape: Literal["sphere", "cube", "plane"] | None = None
     up_axis: Literal["world", "x", "-x", "y", "-y", "z", "-z"] | None = None
-    smooth_degrees: Annotated[float, Field(ge=0, le=180)] = 30.0
+    turn_degrees: Finite = 0.0
+    smooth_degrees: Annotated[float, Field(ge=0, le=180)] | None = None
     material: Material | None = None
     on: Rest | None = None
 
@@ -197,25 +232,40 @@ class StageMesh(Placed):
     def _one_source(self) -> "StageMesh":
         if (self.file is None) == (self.shape is None):
             raise ValueError("give either a file or a shape")
-        if self.material is None and (self.file or "").lower().endswith(".glb"):
-            raise ValueError("the materials of a GLB are not read; give one here")
         return self
 
 
-class PointLight(Part):
-    """Light from one point to everywhere.
+class Lamp(Part):
+    """What all lights have.
+
+    Attributes:
+        colour_srgb: of the light.
+        adds_light: whether it adds its light to shadowed Gaussians. Otherwise their colours hold it already,
+            and they only lose it where something new is in its way.
+    """
+
+    colour_srgb: Colour = WHITE
+    adds_light: bool = False
+
+
+class PointLight(Lamp):
+    """Light from one point, or from a ball, to everywhere.
 
     Attributes:
         intensity: linear radiant intensity; at distance d it gives the irradiance intensity / d squared.
+        radius: of the ball, whose radiance is the intensity over its disc; 0 is a point, which casts hard
+            shadows.
+        visible: whether cameras, mirrors and glass see the ball, and other lights its shadow.
     """
 
     kind: Literal["point"] = "point"
     position: Vector
-    colour_srgb: Colour = WHITE
     intensity: NotNegative
+    radius: NotNegative = 0.0
+    visible: bool = True
 
 
-class SpotLight(Part):
+class SpotLight(Lamp):
     """Light from one point into a cone.
 
     Attributes:
@@ -228,7 +278,6 @@ class SpotLight(Part):
     kind: Literal["spot"] = "spot"
     position: Vector
     direction: Vector
-    colour_srgb: Colour = WHITE
     intensity: NotNegative
     outer_degrees: Annotated[float, Field(gt=0, lt=90)] = 30.0
     inner_degrees: Annotated[float, Field(ge=0, lt=90)] = 20.0
@@ -242,7 +291,7 @@ class SpotLight(Part):
         return self
 
 
-class DirectionalLight(Part):
+class DirectionalLight(Lamp):
     """Parallel light from infinitely far away.
 
     Attributes:
@@ -252,7 +301,6 @@ class DirectionalLight(Part):
 
     kind: Literal["directional"] = "directional"
     direction: Vector
-    colour_srgb: Colour = WHITE
     irradiance: NotNegative
 
     @model_validator(mode="after")
@@ -262,7 +310,7 @@ class DirectionalLight(Part):
         return self
 
 
-class RectangleLight(Part):
+class RectangleLight(Lamp):
     """A shining rectangle; its back is black.
 
     Attributes:
@@ -279,7 +327,6 @@ class RectangleLight(Part):
     direction: Vector
     width: Positive
     height: Positive
-    colour_srgb: Colour = WHITE
     radiance: NotNegative
     visible: bool = True
 
@@ -315,7 +362,8 @@ class StageGaussians(Placed):
     Attributes:
         file: splat file of any format; None for the scene that is rendered. Its scale is one number.
         light: ``emissive`` shows the trained colours as they are; ``shadowed`` takes from them what the
-            meshes keep off of the stage's lights; ``relit`` takes them as the albedo of a matt surface with
+            meshes keep off of the stage's lights, and adds the light of those that add theirs, and of meshes
+            that shine; ``relit`` takes them as the albedo of a matt surface with
             the octagons' normals that the stage's lights shine on.
         ambient: share of the trained colour that is there without the stage's lights (shadowed, relit).
         shadows_on_meshes: whether they keep light off the meshes.
@@ -354,6 +402,9 @@ class Integrator(Part):
         tone: curve from linear values to what is shown: ``none`` clips at 1.
         aperture: diameter of the lens in world units; 0 shows everything sharp.
         focus_distance: along the camera's axis, world units; what is there is sharp.
+        layers: pictures are EXR files with what a compositor needs: the scene, the shadows and the things.
+        denoise: noise is taken from what light brings, guided by colours and normals; the Gaussians' own
+            colours stay as they are. Needs the extra ``denoise``.
     """
 
     samples: Annotated[int, Field(ge=1, le=65536)] = 16
@@ -366,6 +417,8 @@ class Integrator(Part):
     tone: Literal["none", "reinhard", "filmic"] = "none"
     aperture: NotNegative = 0.0
     focus_distance: Positive | None = None
+    layers: bool = False
+    denoise: bool = False
 
     @model_validator(mode="after")
     def _focus(self) -> "Integrator":

@@ -9,10 +9,12 @@ from typing import Any
 from pydantic import ValidationError
 
 from engine.errors import ConfigError
-from engine.light.stage import Dielectric, Diffuse, MetallicRoughness, Stage
+from engine.light.stage import Stage
 from engine.writing import write_text
 
 MAX_STAGE_BYTES = 16 << 20
+TEXTURES = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")
+"""Keys of materials that name images."""
 
 
 def read_stage(path: Path) -> Stage:
@@ -59,12 +61,10 @@ def named_files(stage: Stage) -> Iterator[tuple[str, str]]:
     for number, mesh in enumerate(stage.meshes):
         if mesh.file is not None:
             yield f"meshes[{number}].file", mesh.file
-        material = mesh.material
-        if isinstance(material, Diffuse | Dielectric | MetallicRoughness) and material.texture is not None:
-            yield f"meshes[{number}].material.texture", material.texture
-        if isinstance(material, MetallicRoughness) and material.metallic_roughness_texture is not None:
-            key = f"meshes[{number}].material.metallic_roughness_texture"
-            yield key, material.metallic_roughness_texture
+        for key in TEXTURES:
+            texture = getattr(mesh.material, key, None)
+            if texture is not None:
+                yield f"meshes[{number}].material.{key}", texture
 
 
 def with_files(stage: Stage, names: Mapping[str, str]) -> Stage:
@@ -79,21 +79,27 @@ def with_files(stage: Stage, names: Mapping[str, str]) -> Stage:
     return Stage.model_validate(content)
 
 
+BALL_OF_SIZE = 0.12
+"""Radius of the first stage's ball."""
+
+
 @dataclass(frozen=True)
 class StageFacts:
     """What a first stage of a scene is fitted to.
 
     Attributes:
         up: the direction that is up, a unit vector.
-        floor: a point on what the scene stands on.
+        floor: a point on what the scene stands on, or on which a ball would stand that hangs free.
         size: about as large as what the cameras look at, world units.
         light_direction: the way that the scene's light seems to go.
+        has_floor: whether the scene shows anything level to stand on.
     """
 
     up: tuple[float, float, float]
     floor: tuple[float, float, float]
     size: float
     light_direction: tuple[float, float, float]
+    has_floor: bool = True
 
 
 def write_first_stage(path: Path, facts: StageFacts) -> None:
@@ -102,7 +108,7 @@ def write_first_stage(path: Path, facts: StageFacts) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    radius = 0.12 * facts.size
+    radius = BALL_OF_SIZE * facts.size
     centre = tuple(p + radius * u for p, u in zip(facts.floor, facts.up, strict=True))
     lamp = tuple(p - 2.0 * facts.size * d for p, d in zip(facts.floor, facts.light_direction, strict=True))
     write_text(
@@ -111,6 +117,7 @@ def write_first_stage(path: Path, facts: StageFacts) -> None:
             up=_vector(facts.up),
             centre=_vector(centre),
             floor=_vector(facts.floor),
+            where=ON_FLOOR if facts.has_floor else FREE,
             light=_vector(facts.light_direction),
             lamp=_vector(lamp),
             radius=f"{radius:.4g}",
@@ -118,6 +125,10 @@ def write_first_stage(path: Path, facts: StageFacts) -> None:
             intensity=f"{4.0 * facts.size**2:.4g}",
         ),
     )
+
+
+ON_FLOOR = "A ball on what seems to be the floor, at"
+FREE = "No floor is to be seen: a ball that hangs before what the cameras look at, above"
 
 
 def _vector(values: tuple[float, ...]) -> str:
@@ -174,7 +185,7 @@ light = "shadowed"
 ambient = 0.4                    # what is left of the colour in full shadow
 shadows_on_meshes = true
 
-# A ball on what seems to be the floor, at {floor}.
+# {where} {floor}.
 [[meshes]]
 shape = "sphere"                 # or: file = "thing.obj"
 position = {centre}
@@ -214,6 +225,8 @@ irradiance = 2.0
 # kind = "point"
 # position = {lamp}
 # intensity = {intensity}
+# radius = 0.0                    # larger makes its shadows soft
+# adds_light = true               # it is new: not yet in the colours of the photographs
 
 # [environment]
 # file = "studio.hdr"

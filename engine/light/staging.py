@@ -1,37 +1,36 @@
 """From a stage to the arrays that paths are traced through."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from engine.colour import srgb_to_linear
-from engine.errors import ConfigError, DatasetError
+from engine.errors import ConfigError
 from engine.light.arrays import Materials, MeshQueries, Surfaces
-from engine.light.bsdf import albedo_table
 from engine.light.environment import EnvironmentMap, environment_frame, read_environment
-from engine.light.kernels_bsdf import BURLEY, COUPLED
-from engine.light.kernels_surface import DIFFUSE, GLASS, LIGHT, MIRROR, OPAQUE
-from engine.light.lights import LightArrays, light_arrays, rectangle_sides
-from engine.light.meshes import Shape, corner_normals, open_edges, placed, read_shape, simple_shape, turn_to
-from engine.light.stage import (
-    Dielectric,
-    Diffuse,
-    Glass,
-    Material,
-    Metal,
-    MetallicRoughness,
-    Mirror,
-    RectangleLight,
-    Stage,
-    StageMesh,
+from engine.light.file_materials import FileMaterial, file_material
+from engine.light.kernels_surface import GLASS
+from engine.light.lights import LightArrays, ShiningMesh, light_arrays, rectangle_sides, triangle_areas
+from engine.light.material_table import MaterialTable
+from engine.light.meshes import (
+    Shape,
+    corner_normals,
+    open_edges,
+    placed,
+    placed_normals,
+    read_shape,
+    simple_shape,
+    upright_turn,
 )
+from engine.light.stage import Diffuse, Glass, Light, PointLight, RectangleLight, Shining, Stage, StageMesh
 from engine.rays import RayBatch
-from engine.render.images import read_image
 from engine.trace.meshes import TriangleScene
 
-MAX_TEXELS = 1 << 27
+SMOOTH_DEGREES = 30.0
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -39,13 +38,13 @@ class LitMeshes:
     """The meshes, lights and surroundings of a stage, ready to be traced.
 
     Attributes:
-        surfaces: all triangles, those of visible rectangle lights included.
+        surfaces: all triangles, those of visible lights included.
         triangles: what rays are sent through.
         obstacles: the same without glass; None where there is no glass.
         glass: glass alone, its faces in the order of ``glass_faces``.
         glass_faces: rows in the surfaces.
         materials: of the triangles.
-        lights: of the stage; the environment is the last of them.
+        lights: of the stage, with the meshes that shine; the environment is the last of them.
         environment_visible: whether the camera sees the environment.
     """
 
@@ -75,36 +74,30 @@ class LitMeshes:
         return replace(self, lights=lights, environment_visible=False)
 
 
-def stage_meshes(stage: Stage, folder: Path, *, threads: int = 0) -> LitMeshes:
+def stage_meshes(
+    stage: Stage, folder: Path, *, threads: int = 0, say: Say = lambda _sentence: None
+) -> LitMeshes:
     """Read and place everything of a stage but its Gaussians.
 
     Args:
         stage: whose meshes have no place in the scene left to be found (``on``).
         folder: where the stage's files are relative to.
         threads: for building and tracing; 0 takes all.
+        say: told in a sentence what of a mesh file's materials is not understood.
 
     Raises:
-        ConfigError: a mesh of glass is not closed, or an image is none.
+        ConfigError: a mesh of glass is not closed, one that shines has no area, or an image is none.
         SceneFileError: a mesh cannot be read.
     """
     up = np.array(stage.up)
-    table = _MaterialTable(folder)
-    corners, normals, uvs, rows = [], [], [], []
+    gathered = _Gathered(MaterialTable(folder), len(stage.lights))
     for number, mesh in enumerate(stage.meshes):
-        shape = stage_shape(mesh, number, folder)
-        points = placed(shape.vertices @ turn_to(up_axis(mesh), up).T, mesh)
-        at = points[shape.faces].astype(np.float32)
-        corners.append(at)
-        normals.append(corner_normals(at, mesh.smooth_degrees))
-        uvs.append(shape.corner_uv if shape.corner_uv is not None else np.zeros((len(at), 3, 2), np.float32))
-        material = mesh.material or Diffuse()
-        rows.append(np.full(len(at), table.add(material, shape.corner_uv is not None, number), np.int32))
+        _add_mesh(gathered, mesh, number, stage_shape(mesh, number, folder), up, say)
     for number, light in enumerate(stage.lights):
-        if isinstance(light, RectangleLight) and light.visible:
-            corners.append(_rectangle(light, up))
-            normals.append(corner_normals(corners[-1], 0.0))
-            uvs.append(np.zeros((2, 3, 2), np.float32))
-            rows.append(np.full(2, table.add_light(number), np.int32))
+        corners = _visible(light, up)
+        if corners is not None:
+            row = gathered.table.add_light(number)
+            gathered.add(corners, corner_normals(corners, 0.0), np.full(len(corners), row, np.int32))
     environment = None
     if stage.environment is not None:
         radiance = read_environment(folder / stage.environment.file)
@@ -112,27 +105,133 @@ def stage_meshes(stage: Stage, folder: Path, *, threads: int = 0) -> LitMeshes:
             radiance * np.float32(stage.environment.strength),
             environment_frame(up, stage.environment.rotation_degrees),
         )
-    surfaces = Surfaces(
-        np.concatenate([np.zeros((0, 3, 3), np.float32), *corners]),
-        np.concatenate([np.zeros((0, 3, 3), np.float32), *normals]),
-        np.concatenate([np.zeros((0, 3, 2), np.float32), *uvs]),
-        np.concatenate([np.zeros(0, np.int32), *rows]),
+    surfaces, materials = gathered.surfaces(), gathered.table.arrays()
+    lights = light_arrays(
+        stage.lights, up, environment, gathered.shining, materials.texels_linear, materials.texture_sizes
     )
     points = surfaces.corners_world.reshape(-1, 3)
     faces = np.arange(len(points), dtype=np.int32).reshape(-1, 3)
-    materials = table.arrays()
     is_glass = materials.kinds[surfaces.materials] == GLASS
     some = bool(is_glass.any())
     return LitMeshes(
         surfaces,
         TriangleScene(points, faces, threads=threads),
         materials,
-        light_arrays(stage.lights, up, environment),
+        lights,
         stage.environment is not None and stage.environment.visible,
         TriangleScene(points, faces[~is_glass], threads=threads) if some else None,
         TriangleScene(points, faces[is_glass], threads=threads) if some else None,
         np.flatnonzero(is_glass) if some else None,
     )
+
+
+@dataclass
+class _Gathered:
+    """Triangles of a stage as they come; ``lights`` counts the stage's own lights."""
+
+    table: MaterialTable
+    lights: int
+    corners: list[Float32[np.ndarray, "f 3 3"]] = field(default_factory=list)
+    normals: list[Float32[np.ndarray, "f 3 3"]] = field(default_factory=list)
+    uv: list[Float32[np.ndarray, "f 3 2"]] = field(default_factory=list)
+    rows: list[Int32[np.ndarray, " f"]] = field(default_factory=list)
+    rgb_linear: list[Float32[np.ndarray, "f 3 3"] | None] = field(default_factory=list)
+    shining: list[ShiningMesh] = field(default_factory=list)
+
+    def add(
+        self,
+        corners: Float32[np.ndarray, "f 3 3"],
+        normals: Float32[np.ndarray, "f 3 3"],
+        rows: Int32[np.ndarray, " f"],
+        uv: Float32[np.ndarray, "f 3 2"] | None = None,
+        rgb_linear: Float32[np.ndarray, "f 3 3"] | None = None,
+    ) -> None:
+        self.corners.append(corners)
+        self.normals.append(normals)
+        self.rows.append(rows)
+        self.uv.append(np.zeros((len(corners), 3, 2), np.float32) if uv is None else np.nan_to_num(uv))
+        self.rgb_linear.append(rgb_linear)
+
+    def surfaces(self) -> Surfaces:
+        coloured = any(rgb is not None for rgb in self.rgb_linear)
+        colours = [
+            np.ones_like(corners) if rgb is None else np.nan_to_num(rgb, nan=1.0)
+            for corners, rgb in zip(self.corners, self.rgb_linear, strict=True)
+            if coloured
+        ]
+        nothing = np.zeros((0, 3, 3), np.float32)
+        return Surfaces(
+            np.concatenate([nothing, *self.corners]),
+            np.concatenate([nothing, *self.normals]),
+            np.concatenate([np.zeros((0, 3, 2), np.float32), *self.uv]),
+            np.concatenate([np.zeros(0, np.int32), *self.rows]),
+            np.concatenate([nothing, *colours]),
+        )
+
+
+def _add_mesh(
+    gathered: _Gathered, mesh: StageMesh, number: int, shape: Shape, up: Float64[np.ndarray, "3"], say: Say
+) -> None:
+    turn = upright_turn(up_axis(mesh), mesh.turn_degrees, up)
+    corners = placed(shape.vertices, mesh, turn)[shape.faces].astype(np.float32)
+    degrees = SMOOTH_DEGREES if mesh.smooth_degrees is None else mesh.smooth_degrees
+    normals = corner_normals(corners, degrees)
+    if mesh.smooth_degrees is None and shape.normals is not None:
+        stated = placed_normals(shape.normals, mesh, turn)[shape.faces]
+        known = np.isfinite(stated).all(axis=(1, 2))
+        normals[known] = stated[known]
+    rows = np.empty(len(corners), np.int32)
+    name = f"meshes[{number}]"
+    for chosen, given in _materials(mesh, name, shape, say):
+        has_uv = shape.corner_uv is not None and bool(np.isfinite(shape.corner_uv[chosen]).all())
+        tinted = mesh.material is None and shape.corner_rgb_linear is not None
+        row = gathered.table.add(
+            given.material, f"{name}.material", has_uv=has_uv, tinted=tinted, images=given.images
+        )
+        rows[chosen] = row
+        if isinstance(given.material, Shining) and given.material.emission > 0.0:
+            area = triangle_areas(corners[chosen])
+            if not area.sum() > 0.0:
+                raise ConfigError(f"{name}: shines, but has no area; give it a surface, or no emission.")
+            own = np.flatnonzero(chosen)[area > 0.0]
+            texture = gathered.table.shine(row, gathered.lights + len(gathered.shining))
+            radiance = given.material.emission * srgb_to_linear(np.array(given.material.emission_srgb))
+            uv = np.zeros((len(own), 3, 2), np.float32)
+            if shape.corner_uv is not None:
+                uv = np.nan_to_num(shape.corner_uv[own])
+            gathered.shining.append(ShiningMesh(corners[own], uv, radiance, texture))
+    gathered.add(corners, normals, rows, shape.corner_uv, shape.corner_rgb_linear)
+
+
+def _materials(
+    mesh: StageMesh, name: str, shape: Shape, say: Say
+) -> list[tuple[Bool[np.ndarray, " f"], FileMaterial]]:
+    """Which faces of a mesh have which material: the stage's, or else the file's."""
+    if mesh.material is not None:
+        return [(np.ones(len(shape.faces), bool), FileMaterial(mesh.material, {}))]
+    numbers = shape.material_numbers
+    if numbers is None:
+        numbers = np.full(len(shape.faces), -1, np.int32)
+    scale = float(np.prod(np.broadcast_to(np.array(mesh.scale), 3))) ** (1 / 3)
+    found = []
+    for value in np.unique(numbers):
+        chosen = numbers == value
+        if value < 0:
+            plain = Diffuse(colour_srgb=(1, 1, 1)) if shape.corner_rgb_linear is not None else Diffuse()
+            found.append((chosen, FileMaterial(plain, {})))
+            continue
+
+        def is_closed(chosen: Bool[np.ndarray, " f"] = chosen) -> bool:
+            return open_edges(shape, chosen) == 0
+
+        try:
+            given = file_material(
+                shape.materials[value], is_closed, scale, lambda text: say(f"{mesh.file}: {text}")
+            )
+        except ConfigError as error:
+            raise ConfigError(f"{name}: {mesh.file}: {error}") from None
+        found.append((chosen, given))
+    return found
 
 
 def refuse_inside_glass(meshes: LitMeshes, origin_world: Float32[np.ndarray, "3"], camera: str) -> None:
@@ -169,7 +268,7 @@ def up_axis(mesh: StageMesh) -> str:
 
 
 def stage_shape(mesh: StageMesh, number: int, folder: Path) -> Shape:
-    """The triangles of mesh ``number`` before it is placed.
+    """The triangles of mesh ``number`` before it is placed, with what its file says of its looks.
 
     Raises:
         ConfigError: it is of glass and not closed.
@@ -190,124 +289,20 @@ def stage_shape(mesh: StageMesh, number: int, folder: Path) -> Shape:
     return shape
 
 
-def _rectangle(light: RectangleLight, up_world: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "2 3 3"]:
+def _visible(light: Light, up_world: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "f 3 3"] | None:
+    """The triangles of a light that is seen; None of one that is not."""
+    if isinstance(light, PointLight) and light.radius > 0.0 and light.visible:
+        ball = simple_shape("sphere")
+        corners = ball.vertices[ball.faces] * light.radius + np.array(light.position)
+        return np.asarray(corners.astype(np.float32))
+    if not (isinstance(light, RectangleLight) and light.visible):
+        return None
     u, v = rectangle_sides(light, up_world)
     centre = np.array(light.position)
-    corners = [centre - u / 2 - v / 2, centre + u / 2 - v / 2, centre + u / 2 + v / 2, centre - u / 2 + v / 2]
-    return np.array([[corners[0], corners[1], corners[2]], [corners[0], corners[2], corners[3]]], np.float32)
-
-
-_DEFAULTS: dict[str, np.ndarray] = {
-    "kinds": np.array(DIFFUSE, np.int32),
-    "colours_linear": np.ones(3),
-    "metallic": np.array(0.0),
-    "roughness": np.array(0.0),
-    "iors": np.array(1.5),
-    "absorption": np.zeros(3),
-    "grounds": np.array(COUPLED, np.int32),
-    "kept": np.array(1, np.int32),
-    "coats": np.array(0, np.int32),
-    "colour_textures": np.array(-1, np.int32),
-    "metallic_roughness_textures": np.array(-1, np.int32),
-    "lights": np.array(-1, np.int32),
-}
-"""What a material is where it says nothing else."""
-
-
-class _MaterialTable:
-    """Rows of materials as they come, with their tables and textures."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._rows: list[dict[str, object]] = []
-        self._iors: list[float] = [1.5]
-        self._textures: dict[tuple[str, bool], int] = {}
-        self._images: list[Float32[np.ndarray, "h w 3"]] = []
-
-    def add(self, material: Material, has_uv: bool, number: int) -> int:
-        """The row of a material of mesh ``number``."""
-        row: dict[str, object] = {}
-        if isinstance(material, Glass):
-            colour = material.tint_srgb
-            row |= {"kinds": GLASS, "iors": material.ior, "absorption": material.absorption}
-        else:
-            colour = material.colour_srgb
-            row["kinds"] = {Diffuse: DIFFUSE, Mirror: MIRROR}.get(type(material), OPAQUE)
-        row["colours_linear"] = srgb_to_linear(np.array(colour))
-        if isinstance(material, Metal | Dielectric | MetallicRoughness):
-            row["roughness"] = material.roughness
-        if isinstance(material, Metal):
-            row |= {"metallic": 1.0, "kept": material.multiple_scattering}
-        if isinstance(material, MetallicRoughness):
-            row |= {"metallic": material.metallic, "kept": material.multiple_scattering}
-            row["grounds"] = BURLEY if material.diffuse == "burley" else COUPLED
-            if material.metallic_roughness_texture is not None:
-                row["metallic_roughness_textures"] = self._texture(
-                    material.metallic_roughness_texture, False, has_uv, number
-                )
-        if isinstance(material, Dielectric | MetallicRoughness):
-            row |= {"iors": material.ior, "coats": self._coat(material.ior)}
-        if isinstance(material, Diffuse | Dielectric | MetallicRoughness) and material.texture is not None:
-            row["colour_textures"] = self._texture(material.texture, True, has_uv, number)
-        self._rows.append(row)
-        return len(self._rows) - 1
-
-    def add_light(self, number: int) -> int:
-        """The row of the surface of a light."""
-        self._rows.append({"kinds": LIGHT, "lights": number})
-        return len(self._rows) - 1
-
-    def arrays(self) -> Materials:
-        """All rows as arrays."""
-        count = len(self._rows)
-        columns = {
-            name: np.array([row.get(name, default) for row in self._rows], default.dtype).reshape(
-                count, *default.shape
-            )
-            for name, default in _DEFAULTS.items()
-        }
-        tables = [albedo_table(ior) for ior in self._iors]
-        sizes = np.zeros((len(self._images), 3), np.int64)
-        first = 0
-        for k, image in enumerate(self._images):
-            sizes[k] = first, image.shape[0], image.shape[1]
-            first += image.shape[0] * image.shape[1]
-        texels = np.concatenate([np.zeros((0, 3), np.float32), *(i.reshape(-1, 3) for i in self._images)])
-        return Materials(
-            **columns,
-            mirror=albedo_table(None).by_cosine,
-            coat=np.stack([table.by_cosine for table in tables]),
-            coat_means=np.stack([table.mean for table in tables]),
-            texels_linear=texels,
-            texture_sizes=sizes,
-        )
-
-    def _coat(self, ior: float) -> int:
-        if ior not in self._iors:
-            self._iors.append(ior)
-        return self._iors.index(ior)
-
-    def _texture(self, name: str, display: bool, has_uv: bool, number: int) -> int:
-        """The number of a texture; ``display`` values are made linear, unless the image holds linear ones."""
-        path = self._folder / name
-        if not has_uv:
-            raise ConfigError(
-                f"meshes[{number}].material: {path} needs texture coordinates, which the mesh lacks; of an "
-                "OBJ with seams, whose vertices have several each, none are read: save it as GLB."
-            )
-        key = (name, display)
-        if key not in self._textures:
-            try:
-                image = read_image(path)
-            except DatasetError as error:
-                raise ConfigError(f"meshes[{number}].material: {error}") from None
-            rgb = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
-            if display and path.suffix.lower() not in (".exr", ".hdr"):
-                rgb = srgb_to_linear(rgb)
-            self._textures[key] = len(self._images)
-            self._images.append(np.ascontiguousarray(np.clip(rgb, 0.0, 1.0)))
-            if sum(i.shape[0] * i.shape[1] for i in self._images) > MAX_TEXELS:
-                raise ConfigError(
-                    f"{path}: the textures have more than {MAX_TEXELS >> 20} million pixels together."
-                )
-        return self._textures[key]
+    a, b, c, d = (
+        centre - u / 2 - v / 2,
+        centre + u / 2 - v / 2,
+        centre + u / 2 + v / 2,
+        centre - u / 2 + v / 2,
+    )
+    return np.array([[a, b, c], [a, c, d]], np.float32)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 
 from engine.gaussians.channels import Channels
 from engine.gaussians.harmonics import sh_basis
@@ -142,7 +142,7 @@ def _batch(image: ImageRays) -> RayBatch:
 
 
 def _colours(
-    gaussians: FlatGaussians, directions_world: Float64[np.ndarray, "n 3"]
+    gaussians: FlatGaussians, directions_world: Float[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n 3"]:
     basis = sh_basis(np.asarray(directions_world, np.float64), gaussians.sh_degree)
     colours = 0.5 + np.einsum(

@@ -127,7 +127,8 @@ class Deferred:
             shown = linear_to_srgb(np.minimum(linear, 1.0))
         rgb[buffer.which] += (share * buffer.alpha[:, None] * shown).astype(np.float32)
         kept = _Kept(buffer, surface, linear, shown, reflection, share)
-        return Developed(rgb, seen.transmittance, kept)
+        layers = {} if sight.view is not None else self._layers(rgb, buffer, surface, linear)
+        return Developed(rgb, seen.transmittance, kept, layers)
 
     def reverse(
         self,
@@ -235,6 +236,29 @@ class Deferred:
         if not self.settings.ambient or seen.features.shape[1] <= AMBIENT_COLUMN:
             return surface
         return replace(surface, ambient=seen.features[buffer.which, AMBIENT_COLUMN] / buffer.alpha)
+
+    def _layers(
+        self,
+        rgb_srgb: Float32[np.ndarray, "r 3"],
+        buffer: Buffer,
+        surface: Surface,
+        linear: Float64[np.ndarray, "p 3"],
+    ) -> dict[str, Float32[np.ndarray, "r _"]]:
+        """What is behind a finished picture: radiance, materials, and what reflected rays said."""
+        if self.settings.recipe == "seed":
+            linear = srgb_to_linear(rgb_srgb[buffer.which] / buffer.alpha[:, None])
+        parts = {
+            "linear": linear,
+            "albedo": surface.material[:, :3],
+            "metallic": surface.material[:, 3:4],
+            "roughness": surface.material[:, 4:5],
+            "visibility": surface.visibility[:, None],
+            "indirect": surface.indirect_linear,
+        }
+        layers = {name: np.zeros((len(rgb_srgb), part.shape[1]), np.float32) for name, part in parts.items()}
+        for name, part in parts.items():
+            layers[name][buffer.which] = part
+        return layers
 
     def _reflect(
         self, sight: Sight, buffer: Buffer, surface: Surface

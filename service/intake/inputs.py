@@ -19,7 +19,8 @@ MAX_TEXT_LINE_BYTES = 1 << 16
 _BEGINNINGS = {".glb": b"glTF", ".ply": b"ply"}
 _UNKNOWN = frozenset({".splat", ".spz"})
 """Nothing in their first bytes says what they are; whoever reads them says so."""
-SUFFIXES = frozenset({".obj", ".sog", *_BEGINNINGS, *_UNKNOWN, *IMAGE_SUFFIXES})
+_TEXTS = frozenset({".obj", ".mtl"})
+SUFFIXES = frozenset({".sog", *_TEXTS, *_BEGINNINGS, *_UNKNOWN, *IMAGE_SUFFIXES})
 
 
 def check_input_name(name: str) -> None:
@@ -31,7 +32,7 @@ def check_input_name(name: str) -> None:
     FileNames().add(name)
     if is_clutter(name) or PurePosixPath(name).suffix.lower() not in SUFFIXES:
         detail = (
-            f"{shown_name(name)} is none of the files that a stage can name: meshes (.obj .ply .glb), "
+            f"{shown_name(name)} is none of the files that a stage can name: meshes (.obj .mtl .ply .glb), "
             "surroundings (.hdr .exr), textures and splats."
         )
         raise IntakeRefused(Fault("name-unexpected", detail, name))
@@ -51,7 +52,7 @@ def check_input_content(storage: Storage, name: str, sha256: str, limits: ImageL
             check_whole(file, name, header.kind)
             return header
         if not _is_what_it_says(file, suffix):
-            what = "text" if suffix == ".obj" else f"{suffix[1:].upper()} file"
+            what = "text" if suffix in _TEXTS else f"{suffix[1:].upper()} file"
             detail = f"{shown_name(name)} is no {what} by its content; send the file anew."
             raise IntakeRefused(Fault("file-kind", detail, name))
     return None
@@ -61,7 +62,7 @@ def _is_what_it_says(file: BinaryIO, suffix: str) -> bool:
     if suffix == ".sog":
         return zipfile.is_zipfile(file)
     head = file.read(4096)
-    if suffix == ".obj":
+    if suffix in _TEXTS:
         return b"\0" not in head
     return head.startswith(_BEGINNINGS.get(suffix, b""))
 

@@ -43,6 +43,8 @@ _TITLES = {
     "render": "Render a video or images",
 }
 """What to do with a result, shorter than the kinds say it; a kind that is not here keeps its own title."""
+WITHOUT_FORM = ("relight",)
+"""Kinds that need files of their own, which no form here asks for."""
 _FORMS_OF_THEIR_OWN = ("stage", "photographs")
 _SHORT = re.compile(r"\b(sh|ssim|l1|l2|fov)\b", re.IGNORECASE)
 _CHOICES = {

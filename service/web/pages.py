@@ -23,7 +23,7 @@ from service.queue_facts import unwritable_formats
 from service.schemas.jobs import JobChange, RetryRequest
 from service.state import Service, ServiceDep
 from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
-from service.web.forms import options_form
+from service.web.forms import WITHOUT_FORM, options_form
 from service.web.light import light_form
 from service.web.reading import job_counts, job_detail, job_lines, photographs_of
 from service.web.results import (
@@ -89,7 +89,11 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     figures = measured(metrics, artifacts, photographs)
     preview = detail.line.job.preview or {}
     shown = f"images/{preview.get('view')}"
-    extra = [kind for kind in job_kinds() if kind.needs == "result" and _fits(kind.source_files, by_name)]
+    extra = [
+        kind
+        for kind in job_kinds()
+        if kind.needs == "result" and kind.name not in WITHOUT_FORM and _fits(kind.source_files, by_name)
+    ]
     return page(
         request,
         "job.html",

@@ -67,21 +67,32 @@ class GaussiansBesideMirror:
 
     def trace(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Display colours of rays from one point, over black."""
-        origins = mi.Point3f(*(mi.Float(float(x)) for x in origin))
-        rays = mi.Ray3f(origins + mi.Vector3f(0), mi.Vector3f(directions.T))
+        rays = self._rays(origin, directions)
+        covered = self._follow(self._white, rays)
+        front, behind, met = self._both(rays)
+        return np.array(front + dr.select(met, (1.0 - covered) * behind, 0.0)).T
+
+    def follow(self, origin: np.ndarray, directions: np.ndarray) -> None:
+        """The work of :meth:`trace` but for what the front lets through, which an integrator would know."""
+        self._both(self._rays(origin, directions))
+        dr.sync_thread()
+
+    def _rays(self, origin: np.ndarray, directions: np.ndarray) -> Any:
+        start = mi.Point3f(*(mi.Float(float(x)) for x in origin)) + mi.Vector3f(0)
+        return mi.Ray3f(start, mi.Vector3f(directions.T))
+
+    def _both(self, rays: Any) -> tuple[Any, Any, Any]:
+        """Colours in front of the mirror and behind it, and whether there is one."""
         met = self._mirror.ray_intersect(rays)
         sample, _ = self._bsdf.sample(mi.BSDFContext(), met, 0.5, mi.Point2f(0.5))
         on = met.spawn_ray(met.to_world(sample.wo))
-        with dr.suspend_grad():
-            front = self._follow(self._coloured, rays)
-            covered = self._follow(self._white, rays)
-            behind = self._follow(self._coloured, on)
-        shown = front + dr.select(met.is_valid(), (1.0 - covered) * behind, 0.0)
-        return np.array(shown).T
+        front = self._follow(self._coloured, rays)
+        return front, self._follow(self._coloured, on, met.is_valid()), met.is_valid()
 
-    def _follow(self, scene: Any, rays: Any) -> Any:
-        out, _, _, _ = self._integrator.sample(
-            dr.ADMode.Primal, scene, self._sampler, rays, None, None, mi.Bool(True)
-        )
-        dr.eval(out)
+    def _follow(self, scene: Any, rays: Any, active: Any = True) -> Any:
+        with dr.suspend_grad():
+            out, _, _, _ = self._integrator.sample(
+                dr.ADMode.Primal, scene, self._sampler, rays, None, None, mi.Bool(active)
+            )
+            dr.eval(out)
         return out

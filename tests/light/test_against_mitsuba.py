@@ -171,18 +171,22 @@ OPAQUE = {
         {"type": "plastic", "int_ior": 1.5, "ext_ior": 1.0, "diffuse_reflectance": linear(0.7, 0.2, 0.2)},
     ),
     "glass": (Glass(ior=1.5), {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}),
+    "rough glass": (
+        Glass(ior=1.5, roughness=0.5, multiple_scattering=False),
+        {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "distribution": "ggx", "alpha": 0.25},
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", OPAQUE)
 def test_a_ball_under_a_lamp(name: str, tmp_path: Path) -> None:
     material, bsdf = OPAQUE[name]
-    if bsdf["type"] != "dielectric":
+    if "dielectric" not in bsdf["type"]:
         bsdf = {"type": "twosided", "bsdf": bsdf} if bsdf["type"] != "principled" else bsdf
     print(name, same(stage_of(FLOOR, ball(material)), tmp_path, [GROUND, bsdf, lamp()], {}))  # noqa: T201
 
 
-@pytest.mark.parametrize("name", ["mirror", "metal", "principled", "glass"])
+@pytest.mark.parametrize("name", ["mirror", "metal", "principled", "glass", "rough glass"])
 def test_a_ball_under_a_sky(name: str, tmp_path: Path) -> None:
     material, bsdf = OPAQUE[name]
     environment(tmp_path)
@@ -220,3 +224,34 @@ def test_point_and_directional_lights(tmp_path: Path) -> None:
     red = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": linear(0.8, 0.2, 0.2)}}
     stage = stage_of(FLOOR, ball(Diffuse(colour_srgb=(0.8, 0.2, 0.2))), lights=lights)
     print("points", same(stage, tmp_path, [GROUND, red], emitters))  # noqa: T201
+
+
+def test_a_ball_that_shines_and_one_of_light(tmp_path: Path) -> None:
+    glow = Diffuse(colour_srgb=(0, 0, 0), emission=4.0)
+    shining = StageMesh(
+        shape="cube", scale=0.4, position=(-1, -1.5, 0), rotation_degrees=(20, 30, 0), material=glow
+    )
+    matt = ball(Diffuse(colour_srgb=(0.8, 0.2, 0.2)), 0.6)
+    lamp_ball = PointLight(position=(1.4, -1.8, -0.5), intensity=2.0, radius=0.3)
+    red = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": linear(0.8, 0.2, 0.2)}}
+    areas = [{"type": "area", "radiance": {"type": "rgb", "value": v}} for v in (4.0, 2.0 / (np.pi * 0.09))]
+    stage = stage_of(FLOOR, matt, shining, lights=(lamp_ball,))
+    print("shining", same(stage, tmp_path, [GROUND, red, *areas], {}))  # noqa: T201
+
+
+def test_a_normal_texture(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    slopes = np.kron(rng.uniform(0.25, 0.75, (4, 4, 2)), np.ones((16, 16, 1)))
+    pixels = np.concatenate([slopes, np.full((64, 64, 1), 0.95)], axis=2).astype(np.float32)
+    write_png(tmp_path / "bumps.png", pixels)
+    texture = {"type": "bitmap", "filename": str(tmp_path / "bumps.png"), "raw": True}
+    plain = {"type": "principled", "base_color": linear(0.6, 0.4, 0.3), "roughness": 0.4}
+    material = MetallicRoughness(
+        colour_srgb=(0.6, 0.4, 0.3), normal_texture="bumps.png", roughness=0.4, diffuse="burley"
+    )
+    box = StageMesh(
+        shape="cube", scale=0.7, position=(0, -0.7, 0), rotation_degrees=(0, 35, 0), material=material
+    )
+    # Without what softens the edges of its shadows, which the texture makes.
+    bsdf = {"type": "normalmap", "normalmap": texture, "bsdf": plain, "use_shadowing_function": False}
+    print("bumps", same(stage_of(FLOOR, box), tmp_path, [GROUND, bsdf, lamp()], {}))  # noqa: T201

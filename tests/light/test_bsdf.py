@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from engine.light.bsdf import OpaqueMaterial, albedo_table, fresnel
+from engine.light.bsdf import OpaqueMaterial, RoughGlass, albedo_table, fresnel, frosted_table
+from engine.shading.kernels_microfacets import table_value
 
 
 def directions(cosines: np.ndarray, angles: np.ndarray) -> np.ndarray:
@@ -121,3 +122,54 @@ def test_a_smooth_coat_reflects_what_fresnel_says() -> None:
     table = albedo_table(1.5).by_cosine[0]
     cosines = np.linspace(0, 1, len(table))[2:]
     np.testing.assert_allclose(table[2:], fresnel(cosines, 1.5)[0], atol=2e-3)
+
+
+def golden(n: int) -> np.ndarray:
+    k = np.arange(n)
+    return np.stack([(k + 0.5) / n, (k * 0.6180339887498949) % 1, (k * 0.7548776662466927) % 1], axis=1)
+
+
+@pytest.mark.parametrize("eta", [1.5, 1 / 1.5])
+@pytest.mark.parametrize("roughness", [0.2, 0.6, 1.0])
+def test_rough_glass_keeps_what_its_table_says(eta: float, roughness: float) -> None:
+    n = 1 << 14
+    for cosine in (0.15, 0.5, 0.95):
+        glass, seen = RoughGlass(eta, roughness), towards(cosine, n)
+        values, pdf = glass.evaluate(seen, glass.sample(seen, golden(n)))
+        kept = np.where(pdf > 0, values / np.maximum(pdf, 1e-30), 0.0).mean()
+        assert abs(kept / table_value(frosted_table(eta).by_cosine, cosine, roughness) - 1) < 0.015
+
+
+@pytest.mark.parametrize("eta", [1.5, 1 / 1.5])
+def test_samples_of_rough_glass_follow_their_density_on_both_sides(eta: float) -> None:
+    n, rows, columns, fine = 100_000, 16, 12, 40
+    rng = np.random.default_rng(5)
+    glass = RoughGlass(eta, 0.7)
+    lit = glass.sample(towards(0.7, n), rng.random((n, 3)))
+    pdf = glass.evaluate(towards(0.7, n), lit)[1]
+    lit = lit[pdf > 0]
+    angle = np.arctan2(lit[:, 1], lit[:, 0]) / (2 * np.pi) % 1
+    counted = np.histogram2d(lit[:, 2], angle, bins=(rows, columns), range=((-1, 1), (0, 1)))[0]
+    cosines, angles = np.meshgrid(
+        (np.arange(rows * fine) + 0.5) / (rows * fine) * 2 - 1,
+        (np.arange(columns * fine) + 0.5) / (columns * fine), indexing="ij",
+    )  # fmt: skip
+    grid = directions(cosines.ravel(), 2 * np.pi * angles.ravel())
+    pdf = glass.evaluate(towards(0.7, len(grid)), grid)[1]
+    expected = n * 4 * np.pi / len(grid) * pdf.reshape(rows, fine, columns, fine).sum(axis=(1, 3))
+    used = expected > 10
+    statistic = ((counted - expected) ** 2 / np.maximum(expected, 1e-9))[used].sum()
+    assert statistic < chi2.ppf(0.9999, used.sum())
+
+
+def test_rough_glass_is_the_same_from_both_sides() -> None:
+    # Of basic radiance the value without the cosine is symmetric, once the sides are swapped.
+    rng = np.random.default_rng(6)
+    a = directions(rng.uniform(0.2, 1, 500), rng.uniform(0, 7, 500))
+    b = directions(-rng.uniform(0.2, 1, 500), rng.uniform(0, 7, 500))
+    there = RoughGlass(1.5, 0.6).evaluate(a, b)[0] / -b[:, 2]
+    flip = np.array([1, 1, -1])
+    back = RoughGlass(1 / 1.5, 0.6).evaluate(b * flip, a * flip)[0] / a[:, 2]
+    assert (there > 0).mean() > 0.2
+    # What is carried in is larger by the square of the index than what is carried out.
+    np.testing.assert_allclose(there, back * 1.5**2, rtol=1e-9)

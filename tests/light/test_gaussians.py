@@ -108,6 +108,23 @@ def test_a_stage_with_nothing_in_it_is_the_plain_picture() -> None:
     assert psnr(shown, plainly(some, VIEW, grey)) > 80
 
 
+def test_scenes_with_channels_of_their_own_stand_in_one_stage() -> None:
+    plain, labelled = cloud(100), cloud(100, seed=1, centre=(0.5, 0, 0))
+    channels = {"label": np.ones((100, 1), np.float32), "albedo": np.ones((100, 3), np.float32)}
+    other = plain.with_channels({"label": np.ones((100, 2), np.float32)})
+    entries = (StageGaussians(light="emissive"), StageGaussians(file="b.ply", light="emissive"))
+    stage = Stage(gaussians=entries, integrator=PLAIN)
+
+    def shown(first: FlatGaussians, second: FlatGaussians) -> np.ndarray:
+        layers = stage_layers(stage, first, lambda path: second, Path(), TraceSettings(), size=1.0)
+        scene = LitScene(stage_meshes(stage, Path()), layers)
+        return PathTracer(scene, PLAIN).render(VIEW.rays()).image().rgb_srgb
+
+    expected = shown(plain, labelled)
+    for first in (plain, other):
+        np.testing.assert_array_equal(shown(first, labelled.with_channels(channels)), expected)
+
+
 def test_a_slab_of_index_one_changes_nothing() -> None:
     some = cloud(300)
     # It cuts through the Gaussians, so that each ray has three layers of them.

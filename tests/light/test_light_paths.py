@@ -7,6 +7,7 @@ import pytest
 from light_scenes import camera, film_of, psnr
 
 from engine.errors import ConfigError
+from engine.light.integrator import LitScene, PathTracer
 from engine.light.stage import (
     Dielectric,
     Diffuse,
@@ -22,7 +23,7 @@ from engine.light.stage import (
     StageMesh,
 )
 from engine.light.staging import refuse_inside_glass, stage_meshes
-from engine.render.images import write_exr, write_png
+from engine.render.images import write_exr
 
 AHEAD = camera((0, 0, -4), (0, 0, 0), (24, 16), 30)
 WHITE = (1.0, 1.0, 1.0)
@@ -39,6 +40,7 @@ def white_sky(folder: Path, value: float = 1.0) -> Environment:
         Diffuse(colour_srgb=WHITE),
         Mirror(),
         Glass(ior=1.5),
+        Glass(ior=1.5, roughness=0.5),
         Metal(colour_srgb=WHITE, roughness=0.6),
         Metal(colour_srgb=WHITE, roughness=0.15),
         Dielectric(colour_srgb=WHITE, roughness=0.4),
@@ -51,7 +53,7 @@ def test_a_white_furnace_shows_nothing(material, tmp_path: Path) -> None:  # typ
     stage = Stage(gaussians=(), meshes=(ball,), environment=white_sky(tmp_path), integrator=numbers)
     picture = film_of(stage, AHEAD, tmp_path).image().rgb_linear
     assert abs(picture.mean() - 1.0) < 0.01
-    assert np.abs(picture.mean(axis=2) - 1).max() < 0.2
+    assert np.abs(picture.mean(axis=2) - 1).max() < 0.35
 
 
 def test_a_slab_absorbs_by_beers_law_and_reflects_by_fresnels(tmp_path: Path) -> None:
@@ -210,14 +212,19 @@ def test_glass_that_is_open_and_a_camera_inside_glass_are_refused(tmp_path: Path
         stage_meshes(Stage(meshes=(StageMesh(file="leaf.obj", material=Glass()),)), tmp_path)
 
 
-def test_a_texture_on_an_obj_with_seams_is_refused(tmp_path: Path) -> None:
-    write_png(tmp_path / "grey.png", np.full((4, 4, 3), 0.5, np.float32))
-    whole = (
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\nf 1/1 2/2 3/3\nf 2/2 4/4 3/3\n"
-    )
-    (tmp_path / "one.obj").write_text(whole)
-    (tmp_path / "two.obj").write_text(whole + "vt 0.5 0.5\nf 1/5 2/2 3/3\n")
-    material = Diffuse(texture="grey.png")
-    stage_meshes(Stage(meshes=(StageMesh(file="one.obj", material=material),)), tmp_path)
-    with pytest.raises(ConfigError, match=r"meshes\[0\].*OBJ with seams"):
-        stage_meshes(Stage(meshes=(StageMesh(file="two.obj", material=material),)), tmp_path)
+def test_neither_threads_nor_samples_added_later_change_a_picture_of_meshes() -> None:
+    balls = [
+        StageMesh(shape="sphere", scale=0.6, position=(1.4 * k - 1.4, 0, 0), smooth_degrees=180, material=m)
+        for k, m in enumerate((Glass(), Metal(roughness=0.4), Mirror()))
+    ]
+    floor = StageMesh(shape="plane", position=(0, 0.6, 0), scale=4)
+    lamp = RectangleLight(position=(1, -3, 0), direction=(0, 1, 0), width=1, height=1, radiance=5)
+    lights = (PointLight(position=(0, -3, -2), intensity=9), lamp)
+    numbers = Integrator(samples=12, max_depth=4)
+    stage = Stage(gaussians=(), meshes=(floor, *balls), lights=lights, integrator=numbers)
+    view = camera((0, -1, -4), (0, 0, 0), (64, 48), 50)  # more paths than one thread follows at a time
+    one, two = (film_of(stage, view, threads=threads).image().rgb_linear for threads in (1, 2))
+    np.testing.assert_array_equal(one, two)
+    scene = LitScene(stage_meshes(stage, Path(), threads=2))
+    *_, last = PathTracer(scene, numbers, threads=2).refine(view.rays())
+    np.testing.assert_allclose(last.image().rgb_linear, one, atol=1e-6)

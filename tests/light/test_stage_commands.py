@@ -8,6 +8,7 @@ from click.testing import CliRunner, Result
 from light_scenes import table_with_a_box
 
 from engine.files.gaussian_ply import write_gaussian_ply
+from engine.gaussians.model import FlatGaussians
 from engine.light.stage_file import read_stage
 from engine.render.images import read_channels, read_image
 from workers.cli.main import cli
@@ -26,6 +27,23 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 SMALL = ("--turntable", "--frames", 2, "--width", 48, "--height", 36, "--threads", 2)
+
+
+def test_where_there_is_no_floor_the_ball_hangs_free(tmp_path: Path) -> None:
+    x, y = np.meshgrid(*[np.linspace(-1, 1, 40, dtype=np.float32)] * 2)
+    count = x.size  # a wall: the normals look along z, up is -y
+    some = FlatGaussians(
+        np.stack([x.ravel(), y.ravel(), np.zeros(count, np.float32)], axis=1),
+        np.tile(np.float32([np.sqrt(0.5), 0, -np.sqrt(0.5), 0]), (count, 1)),
+        np.full((count, 2), -3.5, np.float32), np.full(count, 4.0, np.float32),
+        np.zeros((count, 1, 3), np.float32),
+    )  # fmt: skip
+    write_gaussian_ply(some, tmp_path / "wall.ply")
+    stage = tmp_path / "stage.toml"
+    done = octasplat("stage", "init", tmp_path / "wall.ply", "-o", stage)
+    assert done.exit_code == 0, done.output
+    assert "No floor is to be seen" in stage.read_text()
+    assert read_stage(stage).meshes[0].shape == "sphere"
 
 
 def test_the_first_stage_stands_on_the_table_and_is_rendered(scene: Path, tmp_path: Path) -> None:

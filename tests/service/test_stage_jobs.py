@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from service_bench import claimed, committed_dataset, running, stored
@@ -20,6 +21,7 @@ from test_reconstruction import ROOT
 
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.pipeline import reconstruct
+from engine.render.images import write_png
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from service.state import Service
 from workers.cli.main import cli
@@ -80,7 +82,7 @@ BAD = [
         "[[meshes]]\nshape = 'cube'\nposition = [nan, 0, 0]",
         "options", "#/options/stage/meshes/0/position/0", "finite",
     ),
-    ("[[meshes]]\nfile = 'chair.glb'", "options", "#/options/stage/meshes/0", "materials of a GLB"),
+    ("[[meshes]]\nfile = 'chair.glb'", "file-missing", "#/options/stage/meshes/0/file", "'chair.glb'"),
     (
         "[[meshes]]\nshape = 'cube'\nmaterial = { kind = 'glass', ior = 9 }",
         "options", "#/options/stage/meshes/0/material/ior", "stage.meshes[0].material.ior",
@@ -92,6 +94,7 @@ BAD = [
         "[[meshes]]\nfile = 'thing.obj'\nmaterial = { kind = 'diffuse', texture = 'wood.png' }",
         "file-missing", "#/options/stage/meshes/0/material/texture", "'wood.png'",
     ),
+    ("[integrator]\nlayers = true", "options", "#/options/", "choose the format exr"),
     ("[integrator]\nsamples = 65536", "ceiling", "#/options/stage/integrator/samples", "paths of light"),
     (
         "[[lights]]\nkind='point'\nposition=[0,0,0]\nintensity=1\n" * 1001,
@@ -193,7 +196,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     asked = resolve_reconstruction({"preset": "fast", "train": train, "exports": ["mesh.ply"]})
     reconstruct(root / "scene", root / "run", asked.config(), threads=1)
     (root / "things").mkdir()
-    (root / "things" / "thing.obj").write_bytes(TRIANGLE)
+    (root / "things" / "t").mkdir()
+    (root / "things" / "thing.obj").write_bytes(b"mtllib a.mtl\n" + TRIANGLE)
+    (root / "things" / "a.mtl").write_bytes(b"newmtl a\nKd 1 0 0\nmap_Kd t\\a.png\n")
+    write_png(root / "things" / "t" / "a.png", np.ones((2, 2, 3), np.float32))
     (root / "stages").mkdir()
     (root / "stages" / "sky.hdr").write_bytes(HDR)
     view = json.loads((root / "run" / "held_out.json").read_text())[0]
@@ -214,10 +220,9 @@ def test_a_killed_film_goes_on_at_another_worker_with_the_bytes_of_the_command(
     done = CliRunner().invoke(cli, [str(part) for part in command])
     assert done.exit_code == 0, done.output
     what = with_stage(Derivation("", "render", FRAMES), stage)
-    assert set(what.files) == {
-        "elsewhere/1/thing.obj",
-        "sky.hdr",
-    }  # a name without ..
+    # What lies elsewhere gets a name without "..", and brings what it mentions along.
+    beside = {f"elsewhere/1/{name}" for name in ("thing.obj", "a.mtl", "t/a.png")}
+    assert set(what.files) == {*beside, "sky.hdr"}
     workers: list[subprocess.Popen[bytes]] = []
 
     def worker(name: str) -> None:

@@ -173,7 +173,7 @@ def test_light_by_form(flow: Flow, watched: dict[str, Any], browse: Browse, tmp_
     assert len(job["options"]["stage"]["meshes"]) == 2
     files = flow.service.ask("GET", f"/v1/datasets/{job['files_id']}/files")["files"]
     assert [file["path"] for file in files] == ["a_thing.obj"]
-    assert found["estimate"].startswith("The held-out views take at most about ")
+    assert found["estimate"].startswith("With 100,000 Gaussians the held-out views would take at most about ")
     assert found["saved"] == {"name": "stage.toml", "same": True}
     assert found["left"] == 0 and found["nameless"] == []
     assert [

@@ -3,11 +3,12 @@
 import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from engine.errors import OctasplatError
 from engine.events import Listener, Warned, ignore
+from engine.light.companions import companions
 from engine.light.stage_file import named_files, read_stage, with_files
 from engine.stages import counted_stage
 from workers.client.api import Api
@@ -109,6 +110,9 @@ def with_stage(what: Derivation, stage: Path) -> Derivation:
         except NameRefused:
             names[name] = check_name(f"elsewhere/{len(names)}/{Path(name).name}")
     files = {sent: stage.parent / name for name, sent in names.items()}
+    for sent, path in tuple(files.items()):
+        for beside in companions(path):
+            files[(PurePosixPath(sent).parent / beside).as_posix()] = path.parent / beside
     options = {**what.options, "stage": with_files(read, names).model_dump(mode="json")}
     return replace(what, options=options, files={**what.files, **files})
 

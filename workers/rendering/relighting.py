@@ -1,5 +1,6 @@
 """Scenes with materials in other light, as the options of ``octasplat relight`` say."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,19 +10,22 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from engine.colour import linear_to_srgb, srgb_to_linear
+from engine.config import read_config
 from engine.errors import ConfigError
 from engine.events import Listener
 from engine.gaussians.materials import require_materials
 from engine.light.environment import EnvironmentMap, environment_frame, read_environment
 from engine.light.relighting import PathRelighter, Relighter, surroundings
+from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.light.stage import Integrator
 from engine.render.identity import identity_of
 from engine.render.images import write_exr, write_png
 from engine.render.jobs import Shot, camera_shots, view_shots
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
-from engine.run_folder import SCENE, is_run
+from engine.run_folder import CONFIG, SCENE, is_run
 from engine.scene import load_scene
+from engine.shading.material_settings import MaterialSettings
 from workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
 from workers.rendering.views import Keeping, Series, Source, check_one_file, read_source, run_shots
 
@@ -61,10 +65,13 @@ def relight_files(
     source = read_source(options, say)
     ply = options["source"] / SCENE if is_run(options["source"]) else options["source"]
     require_materials(source.gaussians, ply)
+    learnt = read_config(options["source"] / CONFIG).train.materials if is_run(options["source"]) else None
     up = axis_named(options["up"] or "-y")
+    if learnt is not None and options["up"] is None:
+        up = np.array(learnt.up_world, np.float64)
     shots, fps = _shots(mode, options, source)
     paint = _Paint(
-        _relighter(options, source),
+        _relighter(options, source, learnt),
         environments,
         up,
         options["background"] or source.background,
@@ -78,7 +85,7 @@ def relight_files(
         identity_of(
             mode, source.gaussians, source.settings, list(environments), list(environments.values()), up,
             len(shots), [(e.origin_world, e.directions_world) for e in ends],
-            {name: options[name] for name in _OF_THE_PICTURES},
+            {name: options.get(name) for name in _OF_THE_PICTURES},
         )
     )  # fmt: skip
     return series.render(paint, kept, listener)
@@ -115,9 +122,15 @@ def _shots(mode: str, options: dict[str, Any], source: Source) -> tuple[tuple[Sh
     return camera_shots([replace(camera, near_world=source.near_world) for camera in cameras]), fps
 
 
-def _relighter(options: dict[str, Any], source: Source) -> Relighter:
+def _relighter(options: dict[str, Any], source: Source, learnt: MaterialSettings | None) -> Relighter:
+    if options["by"] == "split-sum":
+        return SplitSumRelighter(
+            source.gaussians, source.settings, learnt, extent_world=source.extent_world,
+            side=1 if (options["samples"] or 4) < 4 else math.isqrt(options["samples"] or 4),
+            threads=options["threads"],
+        )  # fmt: skip
     integrator = Integrator(
-        samples=options["samples"], max_depth=options["depth"], roulette_depth=options["depth"]
+        samples=options["samples"] or 64, max_depth=options["depth"], roulette_depth=options["depth"]
     )
     return PathRelighter(source.gaussians, source.settings, integrator, threads=options["threads"])
 

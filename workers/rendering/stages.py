@@ -43,6 +43,7 @@ class StagePlace:
         read: reads a file of Gaussians.
         background_srgb: display colour behind everything.
         threads: to use; 0 takes all.
+        say: told in a sentence what of a mesh file is not understood.
     """
 
     gaussians: FlatGaussians
@@ -52,6 +53,7 @@ class StagePlace:
     read: Callable[[Path], FlatGaussians]
     background_srgb: Float32[np.ndarray, "3"]
     threads: int
+    say: Callable[[str], None] = lambda _sentence: None
 
     def turntable(self, up_world: Float64[np.ndarray, "3"] | None = None) -> Turntable:
         """A circle round what the scene shows."""
@@ -108,10 +110,14 @@ def painted_stage(stage: Stage, place: StagePlace, shots: Sequence[Shot]) -> Pai
         size=SIZE_OF_RADIUS * place.turntable(up).radius, threads=place.threads,
     )  # fmt: skip
     stage = rested(stage, None if layers is None else layers.tracer, place.ray_of_pixel, place.folder)
-    meshes = stage_meshes(stage, place.folder, threads=place.threads)
+    meshes = stage_meshes(stage, place.folder, threads=place.threads, say=place.say)
     refuse_cameras_in_glass(meshes, shots)
     background = srgb_to_linear(place.background_srgb.astype(np.float64))
-    tracer = PathTracer(LitScene(meshes, layers, background), stage.integrator, threads=place.threads)
+    surroundings = stage_meshes(
+        stage.model_copy(update={"meshes": (), "lights": ()}), place.folder, threads=place.threads
+    )
+    scene = LitScene(meshes, layers, background, surroundings)
+    tracer = PathTracer(scene, stage.integrator, threads=place.threads)
     return PaintedStage(stage_paint(tracer, stage.integrator), tracer, stage.integrator)
 
 

@@ -14,6 +14,7 @@ from engine.errors import ConfigError, OutputError
 from engine.events import Listener
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.model import FlatGaussians
+from engine.light.companions import companions
 from engine.light.stage import Stage
 from engine.light.stage_file import named_files
 from engine.render.identity import identity_of
@@ -65,7 +66,8 @@ class SetStage:
 
     def identity(self) -> tuple[object, ...]:
         """What of it decides how a picture looks: itself and the content of its files."""
-        return self.stage, [self.folder / name for _, name in named_files(self.stage)]
+        files = [self.folder / name for _, name in named_files(self.stage)]
+        return self.stage, files, [path.parent / name for path in files for name in companions(path)]
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,8 @@ def render_files(
             render where this one is to go on.
     """
     output: Path = options["output"]
+    if stage is not None:
+        stage = replace(stage, stage=_as_asked(stage.stage, options))
     cameras, fps = None, options["fps"] or DEFAULT_FPS
     if mode == "camera_path":
         path = read_camera_path(options["camera_path"])
@@ -124,13 +128,14 @@ def render_files(
     check_one_file(output, 1 if options.get("preview") else len(shots))
     transparent = options["background"] == "transparent"
     background = background_colour("black" if transparent else options["background"] or source.background)
-    series = Series(output, shots, fps, options["exr"], keeping)
+    exr = options["exr"] or (stage is not None and stage.stage.integrator.layers)
+    series = Series(output, shots, fps, exr, keeping)
     what = source.gaussians, source.settings, background, transparent, cameras, stage and stage.identity()
     of_views = None if cameras is not None else (source.viewpoints, source.near_world)
     if stage is not None:
         place = StagePlace(
             source.gaussians, source.settings, _full_size(options), stage.folder,
-            lambda path: open_scene(path, say), background, options["threads"],
+            lambda path: open_scene(path, say), background, options["threads"], say,
         )  # fmt: skip
         set_up = partial(painted_stage, stage.stage, place, shots)
         if options.get("preview"):
@@ -141,6 +146,19 @@ def render_files(
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
     return series.render(scene_paint(tracer, background, transparent=transparent), kept, listener)
+
+
+def _as_asked(stage: Stage, options: dict[str, Any]) -> Stage:
+    """The stage with what the options say of its integrator.
+
+    Raises:
+        ConfigError: it asks for layers in files that have none.
+    """
+    asked = {key: True for key in ("layers", "denoise") if options.get(key)}
+    integrator = stage.integrator.model_copy(update=asked)
+    if integrator.layers and options["output"].suffix.lower() in (".png", ".mp4"):
+        raise ConfigError(f"{options['output']}: holds no layers; name a folder, or .exr files.")
+    return stage.model_copy(update={"integrator": integrator})
 
 
 @dataclass(frozen=True)

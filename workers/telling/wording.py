@@ -15,6 +15,16 @@ _METRICS = (
     ("psnr_foreground", "PSNR of the foreground {:.2f} dB"),
 )
 
+_TRUTH = (
+    ("normal_mae", "normals {:.2f} degrees off"),
+    ("albedo_psnr_scaled", "albedo {:.2f} dB (one scale)"),
+    ("roughness_mae", "roughness {:.3f} off"),
+    ("metallic_mae", "metallic {:.3f} off"),
+    ("environment_psnr_scaled", "environment {:.2f} dB (one scale)"),
+    ("relight_psnr", "relit {:.2f} dB"),
+    ("relight_psnr_scaled", "{:.2f} dB with one scale"),
+)
+
 
 def clock(seconds: float) -> str:
     """A duration as ``1:23`` or ``1:02:03``."""
@@ -61,7 +71,13 @@ def mean_metrics(metrics: dict[str, Any]) -> str:
 def measured_summary(path: Path) -> list[str]:
     """What was measured on other photographs into ``path``, and where it is shown."""
     metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return [mean_metrics(metrics), f"{'Report:':8}{path.with_name('report.html')}"]
+    known = metrics.get("truth", {}).get("mean", {})
+    told = [form.format(known[key]) for key, form in _TRUTH if known.get(key) is not None]
+    return [
+        mean_metrics(metrics),
+        *([f"Against the truth: {', '.join(told)}"] if told else []),
+        f"{'Report:':8}{path.with_name('report.html')}",
+    ]
 
 
 def run_summary(output: Path, exports: Iterable[str]) -> list[str]:

@@ -3,8 +3,9 @@
 import json
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from engine.config import read_config
 from engine.errors import Cancelled, ExportFailed
@@ -20,10 +21,19 @@ from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from engine.stages import counted_stage, stopping
 from engine.writing import write_json
 from workers.store.names import check_name
-from workers.work.kinds.options import ExportJobOptions, ReconstructOptions, RenderJobOptions
+from workers.work.kinds.options import (
+    ExportJobOptions,
+    PictureOptions,
+    ReconstructOptions,
+    RelightJobOptions,
+    RenderJobOptions,
+)
 from workers.work.places import Places
 from workers.work.preview import Previews
 from workers.work.task import FRAMES, Task
+
+if TYPE_CHECKING:
+    from workers.rendering.views import Keeping
 
 REPORT = "report.html"
 KEEP_SECONDS = 5.0
@@ -114,12 +124,52 @@ def render(task: Task) -> None:
     from workers.rendering.views import Keeping, SetStage, render_files
 
     options = RenderJobOptions.model_validate(task.options)
-    frames, is_film = task.run / FRAMES, options.format == "mp4"
-    target = task.results / "turntable.mp4" if is_film else frames
-    arguments: dict[str, Any] = {
+    arguments = {**_picture_arguments(task, options), "background": options.background}
+    stage = None
+    if options.stage is not None:
+        for _, name in named_files(options.stage):
+            check_name(name)  # as the service did
+        stage = SetStage(options.stage, task.files)
+
+    def work(tell: Listener, say: Callable[[str], None], keeping: Keeping) -> tuple[Path, ...]:
+        return render_files(options.mode, arguments, tell, say, stage, keeping)
+
+    _make_pictures(task, options, work)
+
+
+def relight(task: Task) -> None:
+    """The scene of a reconstruction with materials in other light."""
+    from workers.rendering.relighting import relight_files
+    from workers.rendering.views import Keeping
+
+    options = RelightJobOptions.model_validate(task.options)
+    for name in options.environments:
+        check_name(name)  # as the service did
+    arguments = {
+        **_picture_arguments(task, options),
+        "background": options.background,
+        "environment": tuple(task.files / name for name in options.environments),
+        "on": None,
+        "by": options.by,
+        "samples": options.samples,
+        "depth": options.depth,
+        "rotate": options.rotation_degrees,
+        "spin": options.spin,
+    }
+
+    def work(tell: Listener, say: Callable[[str], None], keeping: Keeping) -> tuple[Path, ...]:
+        return relight_files(options.mode, arguments, tell, say, keeping)
+
+    _make_pictures(task, options, work)
+
+
+def _picture_arguments(task: Task, options: PictureOptions) -> dict[str, Any]:
+    """Options as the commands have them."""
+    is_film = options.format == "mp4"
+    return {
         "source": task.run,
         "scene": None,
-        "output": target,
+        "output": task.results / "turntable.mp4" if is_film else task.run / FRAMES,
         "views": options.views if options.mode == "views" else None,
         "photographs": options.photographs,
         "frames": options.frames,
@@ -130,24 +180,28 @@ def render(task: Task) -> None:
         "fov": options.fov_y_degrees,
         "up": None,
         "exr": options.format == "exr",
-        "background": options.background,
         "max_side": options.max_side,
         "threads": task.threads,
     }
+
+
+def _make_pictures(
+    task: Task,
+    options: PictureOptions,
+    work: "Callable[[Listener, Callable[[str], None], Keeping], tuple[Path, ...]]",
+) -> None:
+    """Let ``work`` make the pictures, those of an earlier attempt kept, and publish them."""
+    from workers.rendering.views import Keeping
+
     tell = stopping(task.listener, task.should_stop)
-    stage = None
-    if options.stage is not None:
-        for _, name in named_files(options.stage):
-            check_name(name)  # as the service did
-        stage = SetStage(options.stage, task.files)
-    kept = _KeptFrames(task.listener)
+    kept, frames = _KeptFrames(task.listener), task.run / FRAMES
     keeping = Keeping(resume=True, or_anew=True, frames=frames, on_kept=kept)
     try:
-        paths = render_files(options.mode, arguments, tell, lambda line: tell(Warned(line)), stage, keeping)
+        paths = work(tell, lambda line: tell(Warned(line)), keeping)
     except Cancelled:
         kept.tell()
         raise
-    if not is_film:
+    if options.format != "mp4":
         for path in paths:
             _publish(task, path, f"views/{path.relative_to(frames).as_posix()}")
 

@@ -28,8 +28,8 @@ from workers.cli.options import quiet_option, threads_option
 )
 @click.option(
     "--by",
-    type=click.Choice(["path"]),
-    default="path",
+    type=click.Choice(["split-sum", "path"]),
+    default="split-sum",
     show_default=True,
     help="Fast, as in training, with traced visibility; or right, by paths of light.",
 )

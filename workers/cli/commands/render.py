@@ -49,6 +49,10 @@ PREVIEW_SIDE_PX = 480
 )
 @click.option("--resume", is_flag=True, help="Go on with a render that was stopped, if there is one.")
 @click.option("--preview", is_flag=True, help="Stage: the first image only, -o one file, finer and finer.")
+@click.option(
+    "--layers", is_flag=True, help="Stage: EXR files with background, shadow and things, for a compositor."
+)
+@click.option("--denoise", is_flag=True, help="Stage: take the noise from what light brings.")
 @threads_option
 @quiet_option
 def render(**options: Any) -> None:
@@ -76,6 +80,8 @@ def render(**options: Any) -> None:
             raise click.UsageError("A video has no alpha; name a folder, or another --background.")
     if mode == "views" and options["output"].suffix.lower() == ".mp4":
         raise click.UsageError("--views gives images; name a folder.")
+    if options["stage"] is None and (options["layers"] or options["denoise"]):
+        raise click.UsageError("--layers and --denoise go with --stage.")
     if options["preview"]:
         if options["stage"] is None or options["output"].suffix.lower() not in (".png", ".exr"):
             raise click.UsageError(

@@ -11,6 +11,7 @@ from workers.records.sizes import Sizes
 from workers.work.kinds.demands import Demand
 from workers.work.kinds.estimates import (
     estimate_reconstruction,
+    estimate_relight,
     estimate_render,
     rendered_pixels,
     training_pixels,
@@ -19,6 +20,7 @@ from workers.work.kinds.options import (
     EvaluateOptions,
     ExportJobOptions,
     ReconstructOptions,
+    RelightJobOptions,
     RenderJobOptions,
     resolve_reconstruction,
     revise_reconstruction,
@@ -98,6 +100,26 @@ def register_all() -> None:
             source_files=_RUN_FILES[:4],
         )
     )
+    register(
+        JobKind(
+            name="relight",
+            title="The scene of a reconstruction with materials in other light",
+            needs="result",
+            options=RelightJobOptions,
+            program="workers.work.programs:relight",
+            stages=lambda _options: ("render",),
+            resolve=validated(RelightJobOptions),
+            demands=_relight_demands,
+            estimate=lambda options, sizes, cores: estimate_relight(
+                cast(RelightJobOptions, options), sizes, cores
+            ),
+            names_files=lambda options: (
+                (f"environments.{place}", name)
+                for place, name in enumerate(cast(RelightJobOptions, options).environments)
+            ),
+            source_files=(*_RUN_FILES[:4], "environment.hdr"),
+        )
+    )
 
 
 def _reconstruction_stages(options: BaseModel) -> tuple[str, ...]:
@@ -140,6 +162,16 @@ def _render_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand,
     return (
         Demand(path, "render_pixels", pixels),
         Demand("stage.integrator.samples", "render_paths", paths),
+    )
+
+
+def _relight_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+    asked = cast(RelightJobOptions, options)
+    path = "frames" if asked.mode == "turntable" else "max_side"
+    pixels = rendered_pixels(asked, sizes)
+    return (
+        Demand(path, "render_pixels", pixels * len(asked.environments)),
+        Demand("samples", "render_paths", pixels * asked.rays),
     )
 
 

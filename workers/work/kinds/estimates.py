@@ -12,7 +12,12 @@ from pydantic import BaseModel, computed_field
 from engine.train.config import TrainConfig, iteration_count, most_gaussians
 from workers.records.sizes import Sizes
 from workers.telling.wording import duration
-from workers.work.kinds.options import ReconstructOptions, RenderJobOptions
+from workers.work.kinds.options import (
+    PictureOptions,
+    ReconstructOptions,
+    RelightJobOptions,
+    RenderJobOptions,
+)
 
 _START_CPU_SECONDS = 16.0
 _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
@@ -117,7 +122,15 @@ def estimate_render(options: RenderJobOptions, photographs: Sequence[Sizes], cor
     return _estimate(cpu_seconds, memory, cores)
 
 
-def rendered_pixels(options: RenderJobOptions, photographs: Sequence[Sizes]) -> int:
+def estimate_relight(options: RelightJobOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
+    """The estimate of a scene in other light; each ray of the split sum counts as a path of two."""
+    each = _PATH_CPU_SECONDS * options.rays * (1 if options.by == "path" else 0.5)
+    cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
+    memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
+    return _estimate(cpu_seconds, memory, cores)
+
+
+def rendered_pixels(options: PictureOptions, photographs: Sequence[Sizes]) -> int:
     """Pixels of all images together that a render makes at most."""
     if options.mode == "turntable":
         return options.frames * options.width_px * options.height_px

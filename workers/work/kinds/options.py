@@ -84,8 +84,8 @@ class ExportJobOptions(BaseModel):
     sh_pad_degree: int | None = Field(None, ge=0, le=3)
 
 
-class RenderJobOptions(BaseModel):
-    """Options of ``render``.
+class PictureOptions(BaseModel):
+    """What pictures of a scene are made.
 
     Attributes:
         mode: a turntable, or the views of the photographs.
@@ -96,12 +96,8 @@ class RenderJobOptions(BaseModel):
         width_px: width of a turntable's images.
         height_px: height of a turntable's images.
         fov_y_degrees: angle of a turntable's images from top to bottom; None takes that of the photographs.
-        background: behind the scene; None takes that of the reconstruction's evaluation.
         max_side: longer side of the images of views, px.
         photographs: with ``mode`` views: those of the photographs with these names, not ``views``.
-        stage: things, lights and mirrors that the scene is rendered with, as ``docs/light.md`` describes:
-            an object, or the text of a stage file. The files that it names are those of the job's
-            ``files_id``.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -114,20 +110,67 @@ class RenderJobOptions(BaseModel):
     width_px: int = Field(640, ge=16, le=4096)
     height_px: int = Field(480, ge=16, le=4096)
     fov_y_degrees: float | None = Field(None, ge=1, le=170)
-    background: Literal["black", "white"] | None = None
     max_side: int | None = Field(None, ge=16)
     photographs: tuple[PhotographName, ...] | None = Field(None, min_length=1, max_length=1000)
-    stage: Annotated[Stage | None, BeforeValidator(read_toml, json_schema_input_type=Stage | str | None)] = (
-        None
-    )
 
     @model_validator(mode="after")
-    def _fits(self) -> "RenderJobOptions":
+    def _fits(self) -> "PictureOptions":
         if self.mode == "views" and self.format == "mp4":
             raise ValueError("views are images; choose the format png or exr")
         if self.mode == "turntable" and self.photographs is not None:
             raise ValueError("photographs are views; choose the mode views")
         return self
+
+
+class RenderJobOptions(PictureOptions):
+    """Options of ``render``.
+
+    Attributes:
+        background: behind the scene; None takes that of the reconstruction's evaluation.
+        stage: things, lights and mirrors that the scene is rendered with, as ``docs/light.md`` describes:
+            an object, or the text of a stage file. The files that it names are those of the job's
+            ``files_id``.
+    """
+
+    background: Literal["black", "white"] | None = None
+    stage: Annotated[Stage | None, BeforeValidator(read_toml, json_schema_input_type=Stage | str | None)] = (
+        None
+    )
+
+    @model_validator(mode="after")
+    def _layers_fit(self) -> "RenderJobOptions":
+        if self.stage is not None and self.stage.integrator.layers and self.format != "exr":
+            raise ValueError("layers are kept by EXR only; choose the format exr")
+        return self
+
+
+class RelightJobOptions(PictureOptions):
+    """Options of ``relight``: a scene with materials in other light.
+
+    Attributes:
+        environments: equirectangular HDR or EXR images, files of the job's ``files_id``; each has its turn.
+        by: ``split-sum`` is fast, as in training; ``path`` is right, by paths of light.
+        samples: rays or paths a pixel; None takes 4 rays or 64 paths.
+        depth: most surfaces on a path.
+        rotation_degrees: turns the light about the vertical.
+        spin: turn the light once round from the first image to the last.
+        background: behind the scene; None takes that of the reconstruction's evaluation.
+    """
+
+    environments: tuple[Annotated[str, Field(min_length=1, max_length=1000)], ...] = Field(
+        min_length=1, max_length=20
+    )
+    by: Literal["split-sum", "path"] = "split-sum"
+    samples: int | None = Field(None, ge=1, le=4096)
+    depth: int = Field(6, ge=1, le=64)
+    rotation_degrees: float = Field(0.0, ge=-360, le=360)
+    spin: bool = False
+    background: Literal["black", "white", "environment"] | None = None
+
+    @property
+    def rays(self) -> int:
+        """Rays or paths a pixel, under all environments together."""
+        return len(self.environments) * (self.samples or (64 if self.by == "path" else 4))
 
 
 def _learns_materials(train: object) -> bool:

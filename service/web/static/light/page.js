@@ -86,7 +86,7 @@ async function showEstimates() {
         const told = await response?.json().catch(() => null);
         return told?.estimate?.text ?? told?.errors?.[0]?.detail ?? "";
     }));
-    if (number === latest && views) find(".light-estimate").textContent = `The held-out views take at most ${views}; a turntable of ${TURN.frames} frames ${turntable}; both within a factor of two.`;
+    if (number === latest && views) find(".light-estimate").textContent = `With 100,000 Gaussians the held-out views would take at most ${views}, a turntable of ${TURN.frames} frames ${turntable}; fewer are faster.`;
 }
 
 /** The files of the stage as a dataset, sent once; null where it names none. */

@@ -1,0 +1,154 @@
+"""The materials of a GLB, as far as they are understood.
+
+glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) and its extensions
+``KHR_materials_emissive_strength``, ``_ior``, ``_transmission``, ``_unlit``, ``_volume`` and
+``KHR_texture_transform``.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from engine.errors import SceneFileError
+from engine.files.gltf import GlbFile
+from engine.files.mesh_looks import FileImage, MeshMaterial
+
+UNDERSTOOD = ("emissive_strength", "ior", "transmission", "unlit", "volume")
+SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/webp": ".webp"}
+KINDS = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"RIFF": ".webp"}
+LESS = {"thicknessTexture", "transmissionTexture"}
+
+
+def glb_materials(file: GlbFile, path: Path) -> tuple[MeshMaterial, ...]:
+    """All materials of a file, in its order.
+
+    Raises:
+        SceneFileError: an image is missing or stored in a way that is not read.
+        KeyError, IndexError, TypeError, ValueError, AttributeError: the document is damaged.
+    """
+    return tuple(
+        _Reader(file, path, material).read(number)
+        for number, material in enumerate(file.document.get("materials", []))
+    )
+
+
+def texture_frame(material: Mapping[str, Any]) -> tuple[int, Float64[np.ndarray, "2 3"]]:
+    """Which texture coordinates a material uses, and the matrix that brings them to those of its images."""
+    for info in _infos(material).values():
+        transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+        turn = float(transform.get("rotation", 0.0))
+        (x, y), (u, v) = transform.get("scale", (1.0, 1.0)), transform.get("offset", (0.0, 0.0))
+        matrix = np.array(
+            [
+                [math.cos(turn) * x, math.sin(turn) * y, u],
+                [-math.sin(turn) * x, math.cos(turn) * y, v],
+            ],
+            np.float64,
+        )
+        return int(transform.get("texCoord", info.get("texCoord", 0))), matrix
+    return 0, np.eye(2, 3)
+
+
+def _infos(material: Mapping[str, Any]) -> dict[str, Any]:
+    """How a material uses its textures, the one of its colour first."""
+    shading = material.get("pbrMetallicRoughness", {})
+    found = {
+        "texture": shading.get("baseColorTexture"),
+        "metallic_roughness_texture": shading.get("metallicRoughnessTexture"),
+        "normal_texture": material.get("normalTexture"),
+        "emission_texture": material.get("emissiveTexture"),
+    }
+    return {name: info for name, info in found.items() if info is not None}
+
+
+class _Reader:
+    """One material on its way."""
+
+    def __init__(self, file: GlbFile, path: Path, material: dict[str, Any]) -> None:
+        self._file, self._path, self._material = file, path, material
+        self._name = str(material.get("name") or "")
+        self._extensions = {
+            name.removeprefix("KHR_materials_"): values
+            for name, values in material.get("extensions", {}).items()
+        }
+
+    def read(self, number: int) -> MeshMaterial:
+        material, extensions = self._material, self._extensions
+        shading = material.get("pbrMetallicRoughness", {})
+        unlit = "unlit" in extensions
+        strength = float(extensions.get("emissive_strength", {}).get("emissiveStrength", 1.0))
+        red, green, blue = (
+            strength * float(share) for share in material.get("emissiveFactor", (0.0, 0.0, 0.0))
+        )
+        base = [float(value) for value in shading.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))]
+        images = {name: self._image(info) for name, info in _infos(material).items()}
+        return MeshMaterial(
+            self._name or f"material {number}",
+            (base[0], base[1], base[2]),
+            metallic=0.0 if unlit else float(shading.get("metallicFactor", 1.0)),
+            roughness=1.0 if unlit else float(shading.get("roughnessFactor", 1.0)),
+            emission_linear=(red, green, blue),
+            normal_scale=float(material.get("normalTexture", {}).get("scale", 1.0)),
+            transmission=float(extensions.get("transmission", {}).get("transmissionFactor", 0.0)),
+            ior=float(extensions.get("ior", {}).get("ior", 1.5)),
+            absorption=self._absorption(),
+            passed_over=self._passed_over(),
+            **images,  # type: ignore[arg-type]
+        )
+
+    def _absorption(self) -> tuple[float, float, float]:
+        """Of the volume: after the stated distance the stated share of light is left."""
+        volume = self._extensions.get("volume", {})
+        distance = float(volume.get("attenuationDistance", math.inf))
+        left = [float(share) for share in volume.get("attenuationColor", (1.0, 1.0, 1.0))]
+        if not (volume.get("thicknessFactor", 0.0) > 0.0 and 0.0 < distance < math.inf):
+            return 0.0, 0.0, 0.0
+        red, green, blue = (-math.log(min(max(share, 1e-6), 1.0)) / distance for share in left)
+        return red, green, blue
+
+    def _passed_over(self) -> tuple[str, ...]:
+        """What is not understood, in words."""
+        material = self._material
+        found = [
+            name if "_" in name and name[:3].isupper() else f"KHR_materials_{name}"
+            for name in self._extensions
+            if name not in UNDERSTOOD
+        ]
+        mode = material.get("alphaMode", "OPAQUE")
+        if mode != "OPAQUE":
+            found.append(f"alphaMode {mode}")
+        if "occlusionTexture" in material:
+            found.append("occlusionTexture")
+        for values in self._extensions.values():
+            found += sorted(LESS & set(values))
+        infos = list(_infos(material).values())
+        if len({(i.get("texCoord", 0), str(i.get("extensions"))) for i in infos}) > 1:
+            found.append("other texture coordinates than those of its first texture")
+        return tuple(found)
+
+    def _image(self, info: dict[str, Any]) -> FileImage:
+        document = self._file.document
+        texture = document["textures"][info["index"]]
+        source = texture.get("source")
+        webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
+        if source is None and webp is None:
+            packed = ", ".join(texture.get("extensions", {})) or "no source"
+            raise SceneFileError(
+                f"{self._path}: a texture of {self._name or 'a material'} is stored in a way that is not "
+                f"read ({packed}); export it with PNG or JPEG images."
+            )
+        image = document["images"][source if source is not None else webp]
+        if "bufferView" not in image:
+            raise SceneFileError(
+                f"{self._path}: the image {str(image.get('uri'))[:60]} lies outside of the file; export the "
+                "GLB with its images inside."
+            )
+        content = self._file.view_bytes(image["bufferView"])
+        kind = next((suffix for start, suffix in KINDS.items() if content.startswith(start)), "")
+        suffix = kind or SUFFIXES.get(image.get("mimeType", ""), ".png")
+        name = f"{self._path} (image {image.get('name') or info['index']})"
+        return FileImage(name, suffix, content=content)

@@ -1,0 +1,121 @@
+"""The materials of an OBJ: its MTL files, as far as they are understood.
+
+The keys of http://paulbourke.net/dataformats/mtl/ with the extension for physically based rendering (``Pr``,
+``Pm``, ``norm``) that modelling programs write today. Colours are taken as linear, as Blender writes them.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from engine.errors import SceneFileError
+from engine.files.mesh_looks import MeshMaterial, image_beside
+
+MAX_BYTES = 64 << 20
+NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "illum"}
+COLOURS = {"Kd", "Ke"}
+IMAGES = {"map_Kd": "texture", "map_Ke": "emission_texture", "norm": "normal_texture"}
+WITHOUT_SAYING = {"Ka", "Ks", "Tf", "Ns", "newmtl", "map_Ka", "map_Ks"}
+"""What older programs write into every file, and what has no counterpart."""
+GLASS = (4, 6, 7, 9)
+"""Illumination models with refraction or with transparency by ray tracing."""
+
+
+def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
+    """The materials by name of the MTL files that an OBJ names; files that are not there have none.
+
+    Raises:
+        SceneFileError: a file cannot be read, a number is none, or an image is missing.
+    """
+    materials: dict[str, MeshMaterial] = {}
+    folder = obj.parent.resolve()
+    for name in names:
+        path = (folder / name.replace("\\", "/")).resolve()
+        if not (path.is_relative_to(folder) and path.is_file()):
+            continue
+        try:
+            if path.stat().st_size > MAX_BYTES:
+                raise SceneFileError(f"{path}: is larger than {MAX_BYTES >> 20} MB, which no MTL needs.")
+            text = path.read_text(encoding="utf-8", errors="replace")
+        except OSError as error:
+            raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
+        for entry in _entries(text):
+            materials[entry["newmtl"]] = _material(path, entry)
+    return materials
+
+
+def _entries(text: str) -> list[dict[str, str]]:
+    entries: list[dict[str, str]] = []
+    for line in text.splitlines():
+        words = line.split("#", 1)[0].strip().split(maxsplit=1)
+        if len(words) == 2 and words[0] == "newmtl":
+            entries.append({"newmtl": words[1].strip()})
+        elif len(words) == 2 and entries:
+            entries[-1][words[0]] = words[1].strip()
+    return entries
+
+
+def _material(path: Path, entry: dict[str, str]) -> MeshMaterial:
+    numbers = {key: _numbers(path, key, entry[key], 1)[0] for key in sorted(NUMBERS & set(entry))}
+    colours: dict[str, tuple[float, float, float]] = {}
+    for key in sorted(COLOURS & set(entry)):
+        red, green, blue = _numbers(path, key, entry[key], 3)
+        colours[key] = (red, green, blue)
+    found: dict[str, Any] = {}
+    for key, field in IMAGES.items():
+        if key in entry:
+            found[field] = image_beside(path, _file_name(entry[key]))
+    if "texture" in found:
+        colours["Kd"] = (1.0, 1.0, 1.0)  # programs leave a grey here that the image is not meant to have
+    if "emission_texture" in found and not any(colours.get("Ke", ())):
+        colours["Ke"] = (1.0, 1.0, 1.0)
+    opacity = numbers.get("d", 1.0 - numbers.get("Tr", 0.0))
+    clear = int(numbers.get("illum", 0)) in GLASS and ("Ni" in numbers or opacity < 1.0)
+    known = NUMBERS | COLOURS | set(IMAGES) | WITHOUT_SAYING
+    passed_over = [key for key in entry if key not in known]
+    if opacity < 1.0 and not clear:
+        passed_over.append(f"opacity {opacity:g}")
+    return MeshMaterial(
+        entry["newmtl"],
+        colours.get("Kd", (0.6, 0.6, 0.6)),
+        metallic=min(max(numbers.get("Pm", 0.0), 0.0), 1.0),
+        roughness=min(max(numbers.get("Pr", 1.0), 0.0), 1.0),
+        emission_linear=colours.get("Ke", (0.0, 0.0, 0.0)),
+        transmission=float(clear),
+        ior=numbers.get("Ni", 1.5) if numbers.get("Ni", 1.5) >= 1.0 else 1.5,
+        passed_over=tuple(passed_over),
+        **found,
+    )
+
+
+def _numbers(path: Path, key: str, text: str, count: int) -> tuple[float, ...]:
+    words = text.split()
+    if count == 3 and len(words) == 1:
+        words *= 3
+    try:
+        values = tuple(float(word) for word in words[:count])
+    except ValueError:
+        values = ()
+    if len(values) < count or not all(math.isfinite(value) for value in values):
+        raise SceneFileError(f"{path}: {key} holds something that is no number ({text[:40]}).")
+    return values
+
+
+def _file_name(text: str) -> str:
+    """The name of an image behind its options, such as ``-bm 0.3 wood bark.png``."""
+    words = text.split()
+    k = 0
+    while k < len(words) and words[k].startswith("-") and len(words[k]) > 1:
+        k += 1
+        while k < len(words) - 1 and (_is_number(words[k]) or words[k] in ("on", "off")):
+            k += 1
+    return " ".join(words[k:])
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,137 @@
+"""A run with materials, measured against a truth: by views, its environment, and in other light."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from pydantic import ValidationError
+
+from engine.config import resolve_config
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.light.environment import write_environment
+from engine.render.images import read_image
+from workers.records.sizes import Sizes
+from workers.work.kinds import kind_named
+from workers.work.programs import relight
+from workers.work.task import Task
+
+SIDE = (48, 64)
+
+
+def save(path: Path, values: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = np.ascontiguousarray(values if values.ndim == 3 else values[..., None], np.uint8)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), oiio.ImageSpec(image.shape[1], image.shape[0], image.shape[2], "uint8"))
+    assert output.write_image(image)
+    output.close()
+
+
+@pytest.fixture(scope="module")
+def shiny_run(run, tmp_path_factory) -> Path:
+    """The run of the other tests, with materials given to its Gaussians by hand."""
+    root = tmp_path_factory.mktemp("shiny")
+    shutil.copytree(run.output, root / "run")
+    gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
+    count = len(gaussians)
+    channels = {
+        "albedo": np.full((count, 3), 0.25, np.float32),
+        "metallic": np.full((count, 1), 1.0, np.float32),
+        "roughness": np.full((count, 1), 0.5, np.float32),
+    }
+    write_gaussian_ply(gaussians.with_channels(channels), root / "run" / "scene.ply")
+    write_environment(root / "run" / "environment.hdr", np.full((16, 32, 3), 0.5, np.float32))
+    content = json.loads((root / "run" / "config.json").read_text())
+    given = resolve_config("fast", settings={"test_every": 4}, assignments=["materials.learn=true"])
+    content["reconstruction"] = given.model_dump(mode="json")
+    (root / "run" / "config.json").write_text(json.dumps(content))
+    return root / "run"
+
+
+@pytest.fixture(scope="module")
+def scene_with_truth(run, tmp_path_factory) -> Path:
+    """A folder with a third of the photographs as its test, and what is said to be true of one of them."""
+    root = tmp_path_factory.mktemp("known")
+    shutil.copytree(run.scene, root / "test")
+    view = "view_000.png"
+    text = {
+        "name": "still life",
+        "environment": {"train": "day", "relight": ["dim"]},
+        "test": {"truth_views": [view], "albedo": "sRGB", "roughness": "v/255", "metallic": "v/255"},
+        "relight": {"folders": ["relight/dim"], "views": [view]},
+    }
+    (root / "truth.json").write_text(json.dumps(text))
+    write_environment(root / "env" / "day.hdr", np.full((16, 32, 3), 1.0, np.float32))
+    write_environment(root / "env" / "dim.hdr", np.full((16, 32, 3), 0.25, np.float32))
+    mask = np.zeros(SIDE)
+    mask[20:28, 28:36] = 255
+    save(root / "test" / "mask" / view, mask)
+    save(root / "test" / "albedo" / view, np.full((*SIDE, 3), 188))  # 0.5 in linear light
+    save(root / "test" / "roughness" / view, np.full(SIDE, 0.4 * 255))
+    save(root / "test" / "metallic" / view, np.full(SIDE, 255))
+    save(root / "relight" / "dim" / view, np.full((*SIDE, 4), [60, 60, 60, 255]))
+    return root
+
+
+def test_materials_light_and_relit_pictures_are_measured(shiny_run, scene_with_truth, octasplat):
+    done = octasplat("evaluate", shiny_run, "--on", scene_with_truth / "test")
+    assert done.exit_code == 0, done.output
+    metrics = json.loads((shiny_run / "on" / "test" / "metrics.json").read_text())
+    mean = metrics["truth"]["mean"]
+    assert mean["roughness_mae"] == pytest.approx(0.1, abs=0.005)
+    assert mean["metallic_mae"] == pytest.approx(0.0, abs=1e-3)
+    assert mean["albedo_scales"] == pytest.approx([2.0] * 3, rel=0.02)
+    assert mean["albedo_psnr_scaled"] > 40 > 20 > mean["albedo_psnr"]
+    assert mean["environment_scales"] == pytest.approx([2.0] * 3, rel=0.02)
+    assert mean["environment_psnr_scaled"] > 40
+    assert set(mean["relight"]) == {"dim"} and mean["relight"]["dim"]["views"] == 1
+    assert mean["relight_psnr_scaled"] >= mean["relight_psnr"] - 1e-6
+    assert "Against the truth" in done.output
+    report = (shiny_run / "on" / "test" / "report.html").read_text()
+    for tab in ("normal", "depth", "albedo", "metallic", "roughness", "visibility", "indirect"):
+        assert f'data-pair="photograph {tab}"' in report
+    assert 'id="environment"' in report
+
+
+def test_the_run_is_relit_at_its_own_and_at_other_views(shiny_run, scene_with_truth, octasplat, tmp_path):
+    dim = scene_with_truth / "env" / "dim.hdr"
+    done = octasplat("relight", shiny_run, "--environment", dim, "-o", tmp_path / "own", "--samples", 1)
+    assert done.exit_code == 0, done.output
+    own = json.loads((shiny_run / "metrics.json").read_text())["views"]
+    assert {path.stem for path in (tmp_path / "own").iterdir()} == {Path(name).stem for name in own}
+    done = octasplat(
+        "relight", shiny_run, "--environment", dim, "-o", tmp_path / "on", "--samples", 1, "--on",
+        scene_with_truth / "test",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert len(list((tmp_path / "on").iterdir())) == 8
+    picture = read_image(tmp_path / "on" / "view_000.png")
+    assert (picture == read_image(tmp_path / "own" / "view_000.png")).all()
+    assert (
+        picture.max() < 0.5
+    )  # 0.25 is 0.54 in display values, and rough metal of albedo 0.25 sends back less
+
+
+def test_a_job_relights_with_files_of_its_own(shiny_run, scene_with_truth, tmp_path):
+    shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
+    shutil.copytree(scene_with_truth / "env", tmp_path / "attempt" / "files" / "maps")
+    kind = kind_named("relight")
+    asked = {"environments": ["maps/day.hdr", "maps/dim.hdr"], "mode": "views", "format": "png", "samples": 1}
+    options = kind.resolve(asked)
+    assert [name for _, name in kind.names_files(options)] == asked["environments"]
+    size = Sizes(64, 48, 8)
+    assert {demand.of: demand.amount for demand in kind.demands(options, [size])} == {
+        "render_pixels": 2 * 8 * 64 * 48, "render_paths": 2 * 8 * 64 * 48,
+    }  # fmt: skip
+    relight(Task(tmp_path / "attempt", options.model_dump(mode="json"), threads=1))
+    views = tmp_path / "attempt" / "results" / "views"
+    names = {path.relative_to(views).as_posix() for path in views.rglob("*.png")}
+    assert names == {f"{light}/view_00{k}.png" for light in ("day", "dim") for k in (0, 4)}
+    bright, dark = (read_image(views / light / "view_000.png").mean() for light in ("day", "dim"))
+    assert bright > 1.5 * dark > 0
+
+    with pytest.raises(ValidationError):
+        kind.resolve({"environments": []})
