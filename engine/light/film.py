@@ -2,6 +2,7 @@
 
 A pixel has a front layer of Gaussians (premultiplied display colour, transmittance, and the factor that the
 stage's lights give to it) and linear light behind it; see :mod:`engine.light.kernels_layer` for the reason.
+
 Gaussians with materials that the camera sees are a part of the pixel of their own, encoded by itself, so that
 their edges blend in display values as photographs with alpha do.
 
@@ -139,7 +140,7 @@ class Film:
             light = clean(self._picture(self._light / count), *guides)
             smooth = light.reshape(-1, 3).astype(np.float64) * count
             film._light = np.where(self._things[:, None] > 0.0, smooth, self._light)
-        covered = (self._samples - self._through - self._front)[:, None]
+        covered = self._covered()
         shade = _divided(self._shade, covered, 1.0)
         if (np.abs(shade - 1.0) > _DARK).any():
             even = clean(self._picture(np.maximum(shade, 0.0)), None, None)
@@ -157,11 +158,14 @@ class Film:
         light = _divided(self._light, self._through[:, None])
         surface = _divided(self._front_light, self._front[:, None])
         if lit:
-            shade = _divided(self._shade, (self._samples - self._through - self._front)[:, None], 1.0)
+            shade = _divided(self._shade, self._covered(), 1.0)
             colour = srgb_to_linear(_divided(layer, covered)) * np.maximum(shade, 0.0)
-            layer = np.where(np.abs(shade - 1.0) < _DARK, layer, covered * linear_to_srgb(colour))
+            layer = np.where(np.abs(shade - 1.0) < 1e-6, layer, covered * linear_to_srgb(colour))
         shown = layer + front * linear_to_srgb(surface) + through * linear_to_srgb(light)
         return np.asarray(srgb_to_linear(shown))
+
+    def _covered(self) -> Float64[np.ndarray, "n 1"]:
+        return (self._samples - self._through - self._front)[:, None]
 
     def _layers(self, picture: Float64[np.ndarray, "n 3"]) -> dict[str, Float32[np.ndarray, "h w"]]:
         if self._free is None or self.plate is None:

@@ -116,8 +116,9 @@ def start_at_points(first, last, scratch, at, pixels, samples, rules, materials,
             paths.radiance_linear[k, channel] = 0.0
             paths.layer_srgb[k, channel] = 0.0
             paths.shade[k, channel] = 0.0
+            paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
             shadows.lit[k, channel] = 0.0
-        paths.transmittance[k], paths.coverage[k] = 1.0, 1.0
+        paths.transmittance[k], paths.coverage[k], paths.things[k] = 1.0, 1.0, 0.0
         paths.densities[k], paths.inside[k] = 0.0, -1
         paths.marks[k], paths.alive[k] = FRONT, True
         _draw(paths, k, FIRST_PAIR + 1, numbers)

@@ -7,8 +7,6 @@ several threads can share the work.
 
 import math
 
-import numpy as np
-
 from engine.light.arrays import BLOCK, PAIRS_OF_SURFACE
 from engine.light.kernels_bsdf import around, fresnel_dielectric
 from engine.light.kernels_frosted import LEAST_FROST, frosted_sample, frosted_value
@@ -280,7 +278,7 @@ def _frosted_glass(
     front_x, front_y, front_z = lifted(x, y, z, n_x, n_y, n_z)
     back_x, back_y, back_z = lifted(x, y, z, -n_x, -n_y, -n_z)
     w = paths.weights[p]
-    clamp = rules.clamp if paths.marks[p] & SCATTERED else np.inf
+    clamp = rules.clamp if paths.marks[p] & SCATTERED else math.inf
     if len(lights.kinds):
         l, share = pick_light(lights, x, y, z, numbers[PICK, 0, n])
         if l >= 0:

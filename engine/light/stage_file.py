@@ -225,6 +225,8 @@ irradiance = 2.0
 # kind = "point"
 # position = {lamp}
 # intensity = {intensity}
+# radius = 0.0                    # larger makes its shadows soft
+# adds_light = true               # it is new: not yet in the colours of the photographs
 
 # [environment]
 # file = "studio.hdr"

@@ -156,6 +156,9 @@ class TrainConfig(_Frozen):
     box_padding: float = Field(0.1, ge=0)
     checkpoint_every: int = Field(500, ge=1, description="rounded up to a multiple of rebuild_every")
     probe_rays: int = Field(16_384, ge=256, description="fixed training rays that choose the best checkpoint")
+    step_back_db: float = Field(
+        3.0, gt=0, description="the best state is exported where the last one's probe is so much worse"
+    )
     seed: int = Field(0, ge=0)
 
     @field_validator("window_rays")
@@ -207,7 +210,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
     Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
     show reflections lie behind the surface, so there are none.
     """
-    rates = {"quat": 1e-3, "mean": 0.008, "mean_final": 1e-3, "log_scale": 0.004, "opacity": 0.03}
+    rates = {"quat": 2e-3, "mean": 0.008, "mean_final": 1e-3, "log_scale": 0.004, "opacity": 0.03}
     return config.model_copy(
         update={
             "materials": config.materials.model_copy(update={"learn": True}),
@@ -216,6 +219,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "plane_points": 10,
             "sh_degree": min(config.sh_degree, 1),
             "rays": 8192,
+            "step_back_db": 0.3,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
             "max_gaussians_auto": min(config.max_gaussians_auto, 40_000),

@@ -18,8 +18,6 @@ from engine.train.checkpoint import load_best, save_best
 from engine.train.config import TrainConfig
 from engine.train.state import TrainState
 
-COLLAPSE_DB = 3.0
-"""The best state is taken instead of the last one when the last probe is this much worse."""
 EMPTY_ALPHA = 0.01
 
 
@@ -81,6 +79,7 @@ class Judge:
         if len(dataset.test_indices):
             self._held_out = draw_probe(dataset, dataset.test_indices, config, rng)
         self._folder = folder
+        self._step_back_db = config.step_back_db
         self._tell = listener
 
     def inspect(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> None:
@@ -110,7 +109,7 @@ class Judge:
     def choose(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> FlatGaussians:
         """The last Gaussians, or the best if those are much worse; the shading becomes theirs too."""
         last, _ = measure(self._probe, tracer, shading)
-        if last >= state.best_psnr - COLLAPSE_DB:
+        if last >= state.best_psnr - self._step_back_db:
             return state.gaussians
         self._tell(
             Warned(

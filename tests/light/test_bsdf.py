@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from engine.light.bsdf import OpaqueMaterial, RoughGlass, albedo_table, fresnel, frosted_table
-from engine.light.kernels_bsdf import table_value
+from engine.shading.kernels_microfacets import table_value
 
 
 def directions(cosines: np.ndarray, angles: np.ndarray) -> np.ndarray:

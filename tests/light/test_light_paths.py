@@ -7,6 +7,7 @@ import pytest
 from light_scenes import camera, film_of, psnr
 
 from engine.errors import ConfigError
+from engine.light.integrator import LitScene, PathTracer
 from engine.light.stage import (
     Dielectric,
     Diffuse,
@@ -209,3 +210,21 @@ def test_glass_that_is_open_and_a_camera_inside_glass_are_refused(tmp_path: Path
     (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(ConfigError, match=r"leaf\.obj is not closed"):
         stage_meshes(Stage(meshes=(StageMesh(file="leaf.obj", material=Glass()),)), tmp_path)
+
+
+def test_neither_threads_nor_samples_added_later_change_a_picture_of_meshes() -> None:
+    balls = [
+        StageMesh(shape="sphere", scale=0.6, position=(1.4 * k - 1.4, 0, 0), smooth_degrees=180, material=m)
+        for k, m in enumerate((Glass(), Metal(roughness=0.4), Mirror()))
+    ]
+    floor = StageMesh(shape="plane", position=(0, 0.6, 0), scale=4)
+    lamp = RectangleLight(position=(1, -3, 0), direction=(0, 1, 0), width=1, height=1, radiance=5)
+    lights = (PointLight(position=(0, -3, -2), intensity=9), lamp)
+    numbers = Integrator(samples=12, max_depth=4)
+    stage = Stage(gaussians=(), meshes=(floor, *balls), lights=lights, integrator=numbers)
+    view = camera((0, -1, -4), (0, 0, 0), (64, 48), 50)  # more paths than one thread follows at a time
+    one, two = (film_of(stage, view, threads=threads).image().rgb_linear for threads in (1, 2))
+    np.testing.assert_array_equal(one, two)
+    scene = LitScene(stage_meshes(stage, Path(), threads=2))
+    *_, last = PathTracer(scene, numbers, threads=2).refine(view.rays())
+    np.testing.assert_allclose(last.image().rgb_linear, one, atol=1e-6)

@@ -1,10 +1,14 @@
 """Stage files: what is refused and in which words, and the first stage that is written."""
 
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from engine.errors import ConfigError
+from engine.files import read_mesh
 from engine.light.stage import Glass, MetallicRoughness, PointLight, RectangleLight, Stage
 from engine.light.stage_file import StageFacts, parse_stage, read_stage, write_first_stage
 
@@ -125,9 +129,6 @@ def test_the_first_stage_can_be_read_and_so_can_all_that_it_suggests(tmp_path: P
 
 
 def test_reading_stages_needs_neither_torch_nor_numba() -> None:
-    import subprocess
-    import sys
-
     code = "import engine.light.stage_file, sys; assert not {'torch', 'numba'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -136,7 +137,12 @@ def test_a_stage_has_the_scene_as_trained_colours_in_shadow_by_default() -> None
     assert Stage().gaussians[0].light == "shadowed"
 
 
-def test_the_examples_are_stages() -> None:
+def test_the_examples_are_stages(tmp_path: Path) -> None:
     folder = Path(__file__).resolve().parents[2] / "examples" / "light"
-    stages = [read_stage(path) for path in sorted(folder.glob("*.toml"))]
-    assert [stage.gaussians[0].light for stage in stages] == ["shadowed", "emissive", "relit"]
+    for path in (*folder.glob("*.toml"), folder / "vase.py"):
+        shutil.copy(path, tmp_path)
+    subprocess.run([sys.executable, "vase.py"], cwd=tmp_path, check=True)
+    stages = [read_stage(path) for path in sorted(tmp_path.glob("*.toml"))]
+    assert [stage.gaussians[0].light for stage in stages] == ["shadowed", "emissive", "relit", "shadowed"]
+    vase = read_mesh(tmp_path / "vase.obj", looks=True)
+    assert vase.materials[0].texture is not None and vase.corner_uv is not None

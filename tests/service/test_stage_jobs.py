@@ -82,7 +82,7 @@ BAD = [
         "[[meshes]]\nshape = 'cube'\nposition = [nan, 0, 0]",
         "options", "#/options/stage/meshes/0/position/0", "finite",
     ),
-    ("[[meshes]]\nfile = 'chair.glb'", "options", "#/options/stage/meshes/0", "materials of a GLB"),
+    ("[[meshes]]\nfile = 'chair.glb'", "file-missing", "#/options/stage/meshes/0/file", "'chair.glb'"),
     (
         "[[meshes]]\nshape = 'cube'\nmaterial = { kind = 'glass', ior = 9 }",
         "options", "#/options/stage/meshes/0/material/ior", "stage.meshes[0].material.ior",
@@ -94,6 +94,7 @@ BAD = [
         "[[meshes]]\nfile = 'thing.obj'\nmaterial = { kind = 'diffuse', texture = 'wood.png' }",
         "file-missing", "#/options/stage/meshes/0/material/texture", "'wood.png'",
     ),
+    ("[integrator]\nlayers = true", "options", "#/options/", "choose the format exr"),
     ("[integrator]\nsamples = 65536", "ceiling", "#/options/stage/integrator/samples", "paths of light"),
     (
         "[[lights]]\nkind='point'\nposition=[0,0,0]\nintensity=1\n" * 1001,

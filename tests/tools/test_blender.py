@@ -13,7 +13,7 @@ from engine.files import ExportOptions, export_scene
 from engine.files.ply_container import read_ply
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii
-from engine.render.images import read_image
+from engine.render.images import read_image, write_exr
 from engine.render.path_file import read_camera_path
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
@@ -164,3 +164,10 @@ def attributes_of(path: Path) -> list[dict[str, np.ndarray]]:
             arrays[name] = values.reshape(-1, width) if width > 1 else values
         result.append(arrays)
     return result
+
+
+def test_blender_shows_the_layers_of_a_stage_as_sockets(tmp_path: Path) -> None:
+    parts = [f"{part}{c}" for part in ("", "background.", "shadow.", "things.") for c in "RGBA"]
+    write_exr(tmp_path / "a.exr", {name: np.full((4, 6), 0.5, np.float32) for name in parts})
+    told = run_blender(SCRIPTS / "show_layers.py", tmp_path / "a.exr")
+    assert "SOCKETS ['Alpha', 'Combined', 'background', 'shadow', 'things']" in told

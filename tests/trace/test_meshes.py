@@ -26,6 +26,16 @@ def test_rays_from_the_middle_of_a_cube(cube: TriangleScene, rng: np.random.Gene
     np.testing.assert_allclose(a + u * (b - a) + v * (c - a), hits.distances[:, None] * directions, atol=1e-6)
 
 
+def test_a_ray_sees_the_same_among_others_as_alone(cube: TriangleScene, rng: np.random.Generator) -> None:
+    rays = RayBatch(f32(rng.normal(0, 3, (43, 3))), f32(rng.normal(size=(43, 3))))
+    together, occluded = cube.closest(rays), cube.occluded(rays)
+    for k in range(len(rays)):
+        alone = cube.closest(rays[k : k + 1])
+        assert alone.distances[0] == together.distances[k] and alone.faces[0] == together.faces[k]
+        assert (alone.barycentrics[0] == together.barycentrics[k]).all()
+        assert cube.occluded(rays[k : k + 1])[0] == occluded[k] == together.hit[k]
+
+
 def test_limits_choose_what_is_met(cube: TriangleScene) -> None:
     origins, along = np.array([[0.2, 0.1, -3.0]]), np.tile([[0.0, 0.0, 1.0]], (5, 1))
     t_min = f32([0.0, 2.5, 4.5, 0.0, 2.5])

@@ -232,15 +232,13 @@ const steps = {
         found.place = await page.locator(".place").textContent();
         await page.keyboard.press("KeyF");
         found.flies = await page.getAttribute("[data-do=fly]", "aria-pressed");
-        // Two cameras make a path, saved as a file.
-        await page.keyboard.press("KeyK");
-        await page.keyboard.press("KeyN");
-        await page.keyboard.press("KeyK");
-        const [saved] = await Promise.all([page.waitForEvent("download"), page.click("[data-do=save-path]")]);
-        found.path = readFileSync(await saved.path(), "utf8");
-        await page.locator("#viewer canvas").focus();
         await page.keyboard.press("KeyR");
         for (let k = 0; k < 20 && !found.back; k++) found.back = (await still()) === start;
+        // Two cameras make a path, saved as a file.
+        for (const key of ["KeyN", "KeyK", "KeyN", "KeyK"]) await page.keyboard.press(key);
+        await page.focus("[data-do=save-path]");
+        const [saved] = await Promise.all([page.waitForEvent("download"), page.keyboard.press("Enter")]);
+        found.path = readFileSync(await saved.path(), "utf8");
         await tabTo(() => document.activeElement.closest("thead") !== null);
         await page.keyboard.press("Tab");
         await page.keyboard.press("Enter");

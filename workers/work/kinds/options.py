@@ -137,6 +137,12 @@ class RenderJobOptions(PictureOptions):
         None
     )
 
+    @model_validator(mode="after")
+    def _layers_fit(self) -> "RenderJobOptions":
+        if self.stage is not None and self.stage.integrator.layers and self.format != "exr":
+            raise ValueError("layers are kept by EXR only; choose the format exr")
+        return self
+
 
 class RelightJobOptions(PictureOptions):
     """Options of ``relight``: a scene with materials in other light.
