@@ -19,7 +19,7 @@ from engine.evaluate.truth_metrics import (
     normal_errors_degrees,
     pooled_psnr,
 )
-from engine.events import Listener, StageProgress
+from engine.events import Listener, StageProgress, Warned
 from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from engine.light.environment import EnvironmentMap, environment_frame, read_environment
 from engine.light.relighting import Relighter, RelitImage
@@ -83,7 +83,9 @@ class TruthMeasures:
             DatasetError: a picture of the truth cannot be used.
         """
         frame = environment_frame(self.truth.up_world)
-        if self.truth.environment is not None:
+        if self.truth.environment is not None and not self.truth.environment.is_file():
+            tell(Warned(f"{self.truth.path} names {self.truth.environment}, which is not there."))
+        elif self.truth.environment is not None:
             true = EnvironmentMap(read_environment(self.truth.environment), frame)
             raw, scaled, scales = environment_errors(environment, true)
             self.light |= {

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from engine.config import ReconstructionConfig, read_config
-from engine.errors import OutputError
+from engine.errors import ConfigError, OutputError
 from engine.evaluate.held_out import evaluate_held_out
-from engine.evaluate.truth import find_truth
+from engine.evaluate.truth import Truth, find_truth
 from engine.events import Listener, StageProgress, Warned
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.materials import has_materials
@@ -99,7 +99,7 @@ def measure_run(
     into: Path | None = None,
 ) -> None:
     """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
-    truth = find_truth(dataset.root)
+    truth = _truth(dataset, tell, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
     environment = _environment(output, config.train)
@@ -135,6 +135,17 @@ def measure_run(
     )
 
 
+def _truth(dataset: Dataset, tell: Listener, *, needed: bool) -> Truth | None:
+    """What is known of the photographs; a file that is none is told, and refused where it is ``needed``."""
+    try:
+        return find_truth(dataset.root)
+    except ConfigError as error:
+        if needed:
+            raise
+        tell(Warned(f"{error} Nothing is measured against it."))
+        return None
+
+
 def finished_shading(
     output: Path, config: TrainConfig, dataset: Dataset, extent_world: float
 ) -> ShadingModel:
@@ -163,6 +174,7 @@ def _evaluate_on(
     """Measure other photographs into a folder of their own."""
     name = on.resolve().name
     into = output / ON / name
+    find_truth(on)  # complains before anything is written
     dataset = Dataset.open_measured(
         on,
         output / CACHE / ON / name,

@@ -35,7 +35,7 @@ def leave(paths, p, x, y, z, d_x, d_y, d_z, density):
     paths.densities[p] = density
 
 
-@lean()
+@lean(forceinline=True)
 def ask(shadows, k, x, y, z, w_x, w_y, w_z, distance, red, green, blue, clamp):
     """Ask a light: what it brings if nothing is in its way, no more than ``clamp``."""
     most = max(red, green, blue)

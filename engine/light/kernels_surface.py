@@ -69,7 +69,7 @@ def material_at(materials, m, u, v):
     return red, green, blue, metallic, roughness
 
 
-@lean()
+@lean(forceinline=True)
 def vertex_colour(surfaces, face, a, b, c):
     """The colour of the corners of a face at a place, white where no mesh has colours of its own."""
     if len(surfaces.corner_rgb_linear) == 0:
@@ -77,7 +77,7 @@ def vertex_colour(surfaces, face, a, b, c):
     return hit_point(surfaces.corner_rgb_linear[face], a, b, c)
 
 
-@lean()
+@lean(forceinline=True)
 def bumped_normal(materials, m, corners, uv, u, v, n_x, n_y, n_z, s_x, s_y, s_z, d_x, d_y, d_z):
     """The shading normal s turned as the normal texture says; n is the face's, on the viewer's side.
 

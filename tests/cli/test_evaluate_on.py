@@ -70,3 +70,12 @@ def test_a_folder_that_cannot_be_used_is_told(run, octasplat, tmp_path, content)
     result = octasplat("evaluate", run.output, "--on", folder)
     assert result.exit_code == 1 and str(folder) in result.output
     assert not (run.output / "on" / "odd").exists()
+
+
+def test_a_file_that_is_no_truth_is_refused(run, octasplat, tmp_path):
+    name = min(path.name for path in (run.scene / "images").iterdir())
+    folder = part_of(run.scene, tmp_path / "odd_truth", {name})
+    (folder / "truth.json").write_text('{"answer": 42}')
+    result = octasplat("evaluate", run.output, "--on", folder)
+    assert result.exit_code == 1 and str(folder / "truth.json") in result.output
+    assert not (run.output / "on" / "odd_truth").exists()
