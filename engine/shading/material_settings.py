@@ -83,7 +83,7 @@ class MaterialSettings(BaseModel):
     white_weight: float = Field(0.01, ge=0)
     even_weight: float = Field(0.03, ge=0)
     harmonics_weight: float = Field(0.01, ge=0)
-    propagation: bool = True
+    propagation: bool = False
     propagation_every: float = Field(0.06, gt=0, le=1)
     propagation_until: float = Field(0.4, ge=0, le=1)
     environment_rate: float = Field(0.03, ge=0)

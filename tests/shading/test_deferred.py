@@ -145,6 +145,7 @@ def train(
     world, events = FlatWorld(), list[Event]()
     materials = {
         "learn": True, "environment_height": 16, "ambient_rays": 4, "ambient_parts": 2, "recipe": recipe,
+        "propagation": True,
     }  # fmt: skip
     config = small_config(materials=materials, sh_degree=0, iterations=72)
     first = with_first_materials(world.start(opacity=0.6), config.materials)
