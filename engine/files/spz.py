@@ -35,8 +35,6 @@ FRACTIONAL_BITS = 12
 SMALL_QUANTILE = 0.05
 STEPS_PER_SIGMA = 8.0
 """Positions get as many more bits as it takes to place a small Gaussian this finely."""
-SMALLEST_READ = FLAT_LOG_SCALE
-"""What a scale of 0 steps is read as: the format holds nothing thinner, so it is what is flat."""
 SH_STEPS = (8, 16)
 """Steps of the coefficients of degree 1 and of the others, in 1/128; coarser steps compress better."""
 
@@ -66,9 +64,8 @@ def read(path: Path) -> GaussianCloud:
     return GaussianCloud(
         means_world=half_turn_points(_fixed_point(positions, file.fractional_bits)),
         quats_wxyz=half_turn_quats(quats),
-        log_scales=np.where(
-            scales == 0, SMALLEST_READ, scales.astype(np.float32) / LOG_SCALE_STEPS - LOG_SCALE_OFFSET
-        ).astype(np.float32),
+        log_scales=scales.astype(np.float32) / LOG_SCALE_STEPS - LOG_SCALE_OFFSET,
+        thinnest=-LOG_SCALE_OFFSET,
         opacity_logits=logits_from_bytes(opacities[:, 0]),
         sh=half_turn_sh(sh),
         notes=tuple(notes),

@@ -36,6 +36,7 @@ class GaussianCloud:
             :class:`engine.gaussians.model.FlatGaussians`.
         notes: what the reader of the file left out or had to assume, one sentence each.
         channels: what else is known of each, by name.
+        thinnest: the smallest ln scale that the format can hold; what is no thicker counts as flat.
     """
 
     means_world: Float32[np.ndarray, "n 3"]
@@ -45,6 +46,7 @@ class GaussianCloud:
     sh: Float32[np.ndarray, "n k 3"]
     notes: tuple[str, ...] = ()
     channels: Channels = field(default_factory=Channels)
+    thinnest: float = float(FLAT_LOG_SCALE)
 
     def __post_init__(self) -> None:
         """Make sure that channels have as many rows as there are Gaussians."""
@@ -111,7 +113,9 @@ def flatten(
         cloud = select_rows(cloud, valid)
     scale_count = cloud.log_scales.shape[1]
     if scale_count == 3:
-        quats, in_plane, thickness = _flattened(cloud.quats_wxyz, cloud.log_scales)
+        quats, in_plane, thickness = _flattened(
+            cloud.quats_wxyz, cloud.log_scales, np.float32(max(cloud.thinnest, FLAT_LOG_SCALE))
+        )
     else:
         axis = np.full(len(cloud.means_world), two_scale_normal)
         quats, in_plane, thickness = turned(cloud.quats_wxyz, axis), cloud.log_scales, np.empty(0, np.float32)
@@ -168,18 +172,18 @@ def _valid(cloud: GaussianCloud, path: Path, drop_invalid: bool) -> Bool[np.ndar
 
 
 def _flattened(
-    quats_wxyz: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 3"]
+    quats_wxyz: Float32[np.ndarray, "n 4"], log_scales: Float32[np.ndarray, "n 3"], flat: np.float32
 ) -> tuple[Float32[np.ndarray, "n 4"], Float32[np.ndarray, "n 2"], Float32[np.ndarray, " m"]]:
     """Make the smallest axis the normal; also the thickness ratio of those that were not flat already.
 
-    Axis 0 wins ties, and always where it holds our own flat scale, so that our own files stay as they are.
+    Axis 0 wins ties, and always where it holds the flat scale, so that our own files stay as they are.
     """
-    own = np.abs(log_scales[:, 0] - FLAT_LOG_SCALE) <= ROUNDING
+    own = np.abs(log_scales[:, 0] - flat) <= ROUNDING
     axis = np.where(own, 0, np.argmin(log_scales, axis=1))
     order = (axis[:, None] + np.arange(3)) % 3
     ordered = np.take_along_axis(log_scales, order, axis=1)
     in_plane = np.ascontiguousarray(ordered[:, 1:])
-    thick: Bool[np.ndarray, " n"] = ordered[:, 0] > FLAT_LOG_SCALE + ROUNDING
+    thick: Bool[np.ndarray, " n"] = ordered[:, 0] > flat + ROUNDING
     ratios = np.exp(ordered[thick, 0] - in_plane[thick].min(axis=1))
     return turned(quats_wxyz, axis), in_plane, ratios
 
