@@ -9,7 +9,7 @@ from engine.versions import versions
 
 ROOT = Path(__file__).resolve().parent.parent
 HARMLESS = {"pydantic", "jaxtyping", "Jinja2", "pyoidn"}
-"""Checks of values and types, the layout of the report, and the denoiser of stages: no figure comes from them."""
+"""Checks of values and types, the layout of the report, the denoiser of stages: no figure comes from them."""
 
 
 def imported_names(module: str) -> set[str]:

@@ -114,7 +114,7 @@ def flatten(
     scale_count = cloud.log_scales.shape[1]
     if scale_count == 3:
         quats, in_plane, thickness = _flattened(
-            cloud.quats_wxyz, cloud.log_scales, np.float32(max(cloud.thinnest, FLAT_LOG_SCALE))
+            cloud.quats_wxyz, cloud.log_scales, np.float32(max(cloud.thinnest, float(FLAT_LOG_SCALE)))
         )
     else:
         axis = np.full(len(cloud.means_world), two_scale_normal)

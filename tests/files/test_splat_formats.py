@@ -125,6 +125,12 @@ def test_scenes_that_cannot_be_written_leave_no_file(make_flat: Make, tmp_path: 
 
 
 @pytest.mark.parametrize("name", FORMATS)
+def test_our_own_files_are_flat(make_flat: Make, tmp_path: Path, name: str) -> None:
+    export_scene(make_flat(50, 0), tmp_path / name)
+    assert read_scene(tmp_path / name)[1].flattened == 0
+
+
+@pytest.mark.parametrize("name", FORMATS)
 def test_min_opacity_leaves_faint_gaussians_out(make_flat: Make, tmp_path: Path, name: str) -> None:
     scene = make_flat(300, 0)
     bright = scene.opacities >= 0.5
