@@ -324,6 +324,7 @@ def _export(output: Path, config: ReconstructionConfig, threads: int, tell: List
         output,
         threads=threads,
         on_pass=lambda _done, _total: tell(StageProgress("export", 0, len(missing))),
+        on_unknown=lambda text: tell(Warned(text)),
     )
     return export_files(
         gaussians,

@@ -31,6 +31,8 @@ class PlainScene:
             least. None takes cameras all around.
         threads: to use; 0 takes all.
         on_pass: told (passes done, in all); it may raise to stop.
+        on_unknown: told in a sentence if the cameras of the run are not known any more, so that the colours
+            of the constant harmonics stay.
     """
 
     def __init__(
@@ -38,24 +40,25 @@ class PlainScene:
         gaussians: FlatGaussians,
         run: Path | None,
         *,
+        on_unknown: Callable[[str], None],
         threads: int = 0,
         on_pass: Callable[[int, int], None] = lambda _done, _total: None,
     ) -> None:
-        self._gaussians, self._run, self._threads, self._on_pass = gaussians, run, threads, on_pass
+        self._gaussians, self._run, self._threads = gaussians, run, threads
+        self._on_pass, self._on_unknown = on_pass, on_unknown
 
     @cached_property
     def gaussians(self) -> FlatGaussians:
-        """The scene without harmonics beyond the constant one.
-
-        The colours of its constant harmonics stay where the cameras of a run are not known any more.
-        """
+        """The scene without harmonics beyond the constant one."""
         if self._gaussians.sh_degree == 0:
             return self._gaussians
-        settings, images = TraceSettings(), _around(self._gaussians)
-        if self._run is not None:
+        if self._run is None:
+            settings, images = TraceSettings(), _around(self._gaussians)
+        else:
             try:
                 settings, images = _of_run(self._run)
-            except OctasplatError:
+            except OctasplatError as error:
+                self._on_unknown(f"The one colour of each Gaussian is the constant harmonic: {error}")
                 return with_colours(self._gaussians, self._gaussians.base_rgb_srgb)
         tracer = make_tracer(settings, threads=self._threads)
         colours = colours_for_cameras(self._gaussians, tracer, images, on_pass=self._on_pass)

@@ -60,12 +60,13 @@ class Film:
         height: of the picture, pixels.
         width: of the picture, pixels.
         layered: also keep what the layers of a compositor need.
+        guided: also keep what :meth:`denoised` needs.
 
     Attributes:
         plate: the scene alone, to be filled alongside; None unless ``layered``.
     """
 
-    def __init__(self, height: int, width: int, *, layered: bool = False) -> None:
+    def __init__(self, height: int, width: int, *, layered: bool = False, guided: bool = False) -> None:
         self._shape = (height, width)
         count = height * width
         self._layer, self._light, self._shade, self._albedo, self._normals = np.zeros((5, count, 3))
@@ -73,6 +74,7 @@ class Film:
         self._front_light = np.zeros((count, 3))
         self.plate = Film(height, width) if layered else None
         self._free = Film(height, width) if layered else None
+        self._guided = guided
 
     def add(
         self, paths: Paths, pixels: Int64[np.ndarray, " n"], counted: Float32[np.ndarray, " p"] | None = None
@@ -106,9 +108,11 @@ class Film:
             add(self._samples, counted)
             return
         self._samples[pixels] += each
-        add(self._albedo, paths.albedo_linear)
-        add(self._normals, paths.normals_world)
-        add(self._things, paths.things)
+        if self._guided:
+            add(self._albedo, paths.albedo_linear)
+            add(self._normals, paths.normals_world)
+        if self._guided or self._free is not None:
+            add(self._things, paths.things)
         if self._free is not None:
             self._free.add(paths, pixels, (paths.things == 0.0).astype(np.float32))
 

@@ -131,7 +131,9 @@ class PathTracer:
             yield self._finished(film)
 
     def _new_film(self, image: ImageRays) -> Film:
-        return Film(image.height_px, image.width_px, layered=self._plate is not None)
+        return Film(
+            image.height_px, image.width_px, layered=self._plate is not None, guided=self._clean is not None
+        )
 
     def _finished(self, film: Film) -> Film:
         return film if self._clean is None else film.denoised(self._clean)

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 
+from engine.files import read_scene
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.files.ply_container import PlyWriteElement, write_ply
 
@@ -106,3 +107,19 @@ def write_thick_gaussians(path, thickness):
     rows["scale_0"] = np.log(thickness)
     rows["rot_0"] = 1
     write_ply(path, [PlyWriteElement("vertex", len(rows), rows.dtype, iter([rows]))])
+
+
+def test_the_one_colour_of_a_format_without_harmonics_is_chosen(run, octasplat, tmp_path):
+    colours = {}
+    for colour in ("constant", "cameras", "0,0,1"):
+        path = tmp_path / f"{colour}.splat"
+        result = octasplat("export", run.output, path, "--colour", colour)
+        assert result.exit_code == 0, result.output
+        colours[colour] = read_scene(path)[0].base_rgb_srgb
+    gaussians = read_scene(run.output)[0]
+    if gaussians.sh_degree:
+        assert "will be left out" in result.stderr
+        assert all(np.abs(colours["constant"] - colours[name]).max() > 0.01 for name in ("cameras", "0,0,1"))
+    for text in ("red", "1,2", "0,0,0"):
+        result = octasplat("export", run.output, tmp_path / "x.splat", "--colour", text)
+        assert result.exit_code == 2 and not (tmp_path / "x.splat").exists()

@@ -104,6 +104,7 @@ def export(task: Task) -> None:
         task.run,
         threads=task.threads,
         on_pass=lambda _done, _total: tell(StageProgress("export", 0, count)),
+        on_unknown=lambda text: tell(Warned(text)),
     )
     with counted_stage("export", tell, count):
         failed = export_files(

@@ -159,5 +159,8 @@ def _one_colour(
     if colour == "constant" or gaussians.sh_degree == 0:
         return gaussians
     if colour == "cameras":
-        return PlainScene(gaussians, source if is_run(source) else None).gaussians
+        run = source if is_run(source) else None
+        return PlainScene(
+            gaussians, run, on_unknown=lambda text: click.echo(f"Warning: {text}", err=True)
+        ).gaussians
     return with_colours(gaussians, colours_toward(gaussians, np.array(colour)))

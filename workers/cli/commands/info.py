@@ -81,7 +81,7 @@ def _lines(source: Path, found: "Found") -> list[str]:
     from engine.evaluate.scene_facts import OPACITY_EDGES
 
     scene = found.scene
-    size = sum(path.stat().st_size for path in [source] if path.is_file())
+    size = source.stat().st_size if source.is_file() else 0
     channels = ", ".join(f"{name} ({width})" for name, width in scene.channels.items())
     up = "of the photographs" if found.photographs else "as most files have it; --up says otherwise"
     quantiles = " / ".join(f"{value:.3g}" for value in scene.scale_quantiles)
