@@ -142,8 +142,9 @@ def _batch(image: ImageRays) -> RayBatch:
 
 
 def _colours(
-    gaussians: FlatGaussians, directions_world: Float[np.ndarray, "n 3"]
+    gaussians: FlatGaussians, directions_world: Float[np.ndarray, "m 3"]
 ) -> Float32[np.ndarray, "n 3"]:
+    # m is 1, a direction for all, or n.
     basis = sh_basis(np.asarray(directions_world, np.float64), gaussians.sh_degree)
     colours = 0.5 + np.einsum(
         "nk,nkc->nc", np.broadcast_to(basis, (len(gaussians), basis.shape[1])), gaussians.sh
