@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64
 
 from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.gaussians.channels import stacked
@@ -29,7 +29,17 @@ from engine.shading.geometry_terms import (
 from engine.shading.learnt_light import LearntLight
 from engine.shading.material_settings import SEED_MATERIAL, SEED_REACH, MaterialSettings
 from engine.shading.protocol import Developed, Reversed, Sight
-from engine.shading.split_sum import Surface, shade, shade_reverse
+from engine.shading.reflections import (
+    Facets,
+    Mirrored,
+    facets_of,
+    follow,
+    follow_back,
+    mirrored_pair,
+    pair_mean,
+    pair_slope,
+)
+from engine.shading.split_sum import ShadeGradients, Surface, shade, shade_reverse
 from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 AMBIENT_COLUMN = 5
@@ -41,12 +51,11 @@ TURNS = 1 << 20
 
 @dataclass(frozen=True)
 class _Reflection:
-    """What the reflected rays of some pixels saw: of ``of`` (places in a buffer)."""
+    """What the reflected rays of a buffer met, two of each point where there are facets."""
 
-    of: Int64[np.ndarray, " s"]
-    seen: TraceResult
-    buffer: Buffer | None
-    linear: Float64[np.ndarray, "q 3"] | None
+    trace: TraceResult
+    mirrored: Mirrored | None = None
+    facets: Facets | None = None
 
 
 @dataclass(frozen=True)
@@ -157,7 +166,9 @@ class Deferred:
                 by_linear[(kept.linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
             blur = settings.blurred(sight.progress)
             back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
-            normal = back.normal + back.reflected if settings.reflected_gradient else back.normal
+            normal = back.normal
+            if settings.reflected_gradient:
+                normal = normal + back.reflected + self._facing_gradient(kept, back)
             by_material, rgb = back.material, by_rgb * np.float32(1 - kept.shaded)
             if settings.is_seed_deferred(sight.progress):
                 rgb[which] = by_rgb[which] * (1 - kept.surface.material[:, 3:4])
@@ -167,7 +178,7 @@ class Deferred:
                 rgb = weight * (seen.rgb_srgb - developed.rgb_srgb)
             spread_back(buffer, by_material, normal, by_features, by_alpha, by_normal)
             by_texels = back.texels(len(self.light.levels.texels))
-            further = self._reflected_back(kept, back.indirect, by_texels)
+            further = self._reflected_back(kept, back, by_texels)
             parameters = {"materials.texels": by_texels}
             self._regularise(sight, buffer, by_features, by_alpha, by_normal, by_depth)
         narrow = (x.astype(np.float32) for x in (rgb, -by_alpha, by_depth, by_normal, by_features))
@@ -267,61 +278,59 @@ class Deferred:
         settings = self.settings
         if not settings.visibility:
             return surface, None
-        of = np.arange(len(buffer.which))
-        if sight.view is not None and settings.secondary_share < 1:
-            # Every so-manieth pixel of the batch, which is drawn at random itself.
-            of = of[(of * settings.secondary_share) % 1 < settings.secondary_share]
-        rays = reflected_rays(sight.rays, buffer, of, self._gap)
-        seed = settings.recipe == "seed"
+        record, seed = sight.view is not None, settings.recipe == "seed"
+        if settings.indirect == "shaded" and not seed:
+            salt = int(sight.progress * TURNS)
+            facets = facets_of(surface, least_slope=settings.least_slope(sight.progress), salt=salt)
+            mirrored = follow(
+                mirrored_pair(sight.rays, buffer, facets, gap_world=self._gap),
+                sight.tracer, self.light.levels, self.frame, self._dimmed,
+                surfaces=settings.reflections, gap_world=self._gap, record=record,
+            )  # fmt: skip
+            visibility, indirect = pair_mean(mirrored.seen)
+            surface = replace(surface, visibility=visibility, indirect_linear=indirect)
+            return surface, _Reflection(mirrored.trace, mirrored, facets)
+        rays = reflected_rays(sight.rays, buffer, self._gap)
         if seed:
             rays = RayBatch(rays.origins_world, rays.directions_world, rays.t_min, SEED_REACH)
-        seen = sight.tracer.trace(rays, record=sight.view is not None)
-        visibility = surface.visibility.copy()
-        visibility[of] = seen.transmittance > HIDDEN if seed else seen.transmittance
+        seen = sight.tracer.trace(rays, record=record)
+        visibility = (seen.transmittance > HIDDEN if seed else seen.transmittance).astype(np.float64)
         indirect = np.zeros_like(surface.indirect_linear)
-        below, linear = None, None
-        if settings.indirect == "shaded" and not seed:
-            below = gather(rays, seen)
-            below = replace(below, surface=self._dimmed(seen, below))
-            linear = shade(below.surface, self.light.levels, self.frame)
-            indirect[of[below.which]] = below.alpha[:, None] * linear
-        elif seed and settings.indirect != "none":
-            indirect[of] = (1.0 - visibility[of, None]) * seen.rgb_srgb
+        if seed and settings.indirect != "none":
+            indirect = (1.0 - visibility[:, None]) * seen.rgb_srgb
         elif settings.indirect == "harmonics":
             alpha = np.maximum(1.0 - seen.transmittance.astype(np.float64), 1e-6)[:, None]
-            indirect[of] = srgb_to_linear(seen.rgb_srgb / alpha) * alpha
+            indirect = srgb_to_linear(seen.rgb_srgb / alpha) * alpha
         surface = replace(surface, visibility=visibility, indirect_linear=indirect)
-        return surface, _Reflection(of, seen, below, linear)
+        return surface, _Reflection(seen)
 
     def _reflected_back(
-        self, kept: _Kept, by_indirect: Float64[np.ndarray, "p 3"], by_texels: Float64[np.ndarray, "t 3"]
+        self, kept: _Kept, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]
     ) -> tuple[tuple[Recording, TraceGradients], ...]:
-        """Gradients by what reflected rays met: its materials and normals, or its harmonics; no geometry."""
+        """Gradients by what reflected rays met: its materials, or its harmonics; no geometry."""
         reflection = kept.reflection
-        if reflection is None or (hits := reflection.seen.hits) is None:
+        if reflection is None or (hits := reflection.trace.hits) is None:
             return ()
-        seen, count = reflection.seen, len(reflection.of)
-        nothing = np.zeros((count, 3), np.float32)
+        if (mirrored := reflection.mirrored) is not None:
+            by_light = np.concatenate([back.indirect, back.indirect]) / 2
+            return follow_back(mirrored, self.light.levels, self.frame, by_light, by_texels)
+        seen = reflection.trace
         if self.settings.recipe == "seed":
-            hidden = seen.transmittance <= HIDDEN
-            by_rgb = (by_indirect[reflection.of] * hidden[:, None]).astype(np.float32)
-            return ((hits, TraceGradients(rgb_srgb=by_rgb)),)
-        if self.settings.indirect == "harmonics":
+            slope = (seen.transmittance <= HIDDEN).astype(np.float64)[:, None]
+        elif self.settings.indirect == "harmonics":
             alpha = np.maximum(1.0 - seen.transmittance.astype(np.float64), 1e-6)[:, None]
             slope = 1.0 / encoding_slope(srgb_to_linear(seen.rgb_srgb / alpha))
-            by_rgb = (by_indirect[reflection.of] * slope).astype(np.float32)
-            return ((hits, TraceGradients(rgb_srgb=by_rgb)),)
-        below = reflection.buffer
-        if below is None:
+        else:
             return ()
-        by_linear = by_indirect[reflection.of[below.which]] * below.alpha[:, None]
-        back = shade_reverse(below.surface, self.light.levels, self.frame, by_linear)
-        by_texels += back.texels(len(by_texels))
-        by_features = np.zeros((count, seen.features.shape[1]))
-        by_alpha, by_normal = np.zeros(count), np.zeros((count, 3))
-        spread_back(below, back.material, np.zeros_like(back.normal), by_features, by_alpha, by_normal)
-        gradients = TraceGradients(rgb_srgb=nothing, features=by_features.astype(np.float32))
-        return ((hits, gradients),)
+        return ((hits, TraceGradients(rgb_srgb=(back.indirect * slope).astype(np.float32))),)
+
+    @staticmethod
+    def _facing_gradient(kept: _Kept, back: ShadeGradients) -> Float64[np.ndarray, "p 3"] | float:
+        """Gradients by the normals through what reflected rays meet."""
+        reflection = kept.reflection
+        if reflection is None or reflection.mirrored is None or reflection.facets is None:
+            return 0.0
+        return pair_slope(reflection.mirrored.seen, reflection.facets, back.around, back.specular)
 
     def _regularise(
         self,

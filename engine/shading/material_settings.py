@@ -29,6 +29,9 @@ class MaterialSettings(BaseModel):
         secondary_from: when visibility and indirect light begin.
         secondary_share: share of a batch's pixels that are given a reflected ray.
         visibility: whether what stands in the way of a reflection hides the environment there.
+        reflections: surfaces on the path of a reflected ray.
+        facet_slope: least angle between a normal and the two facets beside it at which rays are reflected, at
+            the beginning and from ``blur_until`` on; the rougher the surface, the larger.
         indirect: light of what stands there: ``shaded`` by the split sum, from the ``harmonics``, or
             ``none``.
         ambient: whether the irradiance is dimmed where other things hide the environment.
@@ -67,6 +70,8 @@ class MaterialSettings(BaseModel):
     secondary_from: float = Field(0.05, ge=0, le=1)
     secondary_share: float = Field(1.0, ge=0, le=1)
     visibility: bool = True
+    reflections: int = Field(3, ge=1, le=8)
+    facet_slope: tuple[float, float] = (0.1, 0.01)
     indirect: Literal["shaded", "harmonics", "none"] = "shaded"
     ambient: bool = True
     ambient_rays: int = Field(16, ge=4)
@@ -105,3 +110,9 @@ class MaterialSettings(BaseModel):
     def blurred(self, progress: float) -> float:
         """Roughness of the level that leads reflected directions."""
         return self.blur * max(0.0, 1.0 - progress / self.blur_until) if self.blur_until > 0 else 0.0
+
+    def least_slope(self, progress: float) -> float:
+        """Tangent of the least angle between a normal and its facets."""
+        first, last = self.facet_slope
+        share = min(progress / self.blur_until, 1.0) if self.blur_until > 0 else 1.0
+        return first * (last / first) ** share
