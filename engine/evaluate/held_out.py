@@ -20,13 +20,16 @@ from engine.light.environment import EnvironmentMap
 from engine.light.relighting import Relighter
 from engine.render.images import write_png
 from engine.render.names import render_names
-from engine.render.renderer import background_colour, render_rays
+from engine.render.oversampling import render_filtered
+from engine.render.renderer import background_colour
 from engine.scene import Dataset
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer, TraceSettings
 from engine.writing import write_json
 
+SIDE = 2
+"""So many rays across a pixel, and as many down, where a shading model shades; else one at its centre."""
 RENDERS, METRICS, REPORT = "renders", "metrics.json", "report.html"
 
 
@@ -111,7 +114,7 @@ def _rendered(
     for index in dataset.test_indices:
         rgb, alpha, weight = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
-        image = render_rays(tracer, rays, colour, shading)
+        image = render_filtered(tracer, rays, colour, shading, SIDE)
         if measures is not None:
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])

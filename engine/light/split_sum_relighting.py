@@ -1,7 +1,5 @@
 """Scenes with materials in another light by the split sum: fast, as they were learnt."""
 
-from itertools import product
-
 import numpy as np
 from jaxtyping import Float32
 
@@ -9,7 +7,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.light.environment import EnvironmentMap
 from engine.light.relighting import Part, RelitImage, silent
 from engine.rays import ImageRays
-from engine.render.renderer import background_colour, render_rays
+from engine.render.oversampling import pixel_means
 from engine.shading.deferred import Deferred
 from engine.shading.material_settings import MaterialSettings
 from engine.trace.make import make_tracer
@@ -61,14 +59,5 @@ class SplitSumRelighter:
     def render(self, image: ImageRays, part: Part = silent) -> RelitImage:
         """What a camera sees; ``part`` is told the share that is done."""
         assert self._radiance is not None, "an environment must be put first"
-        light = np.zeros((image.height_px, image.width_px, 3))
-        coverage = np.zeros((image.height_px, image.width_px))
-        offsets = [((k + 0.5) / self._side - 0.5) for k in range(self._side)]
-        for number, (down, across) in enumerate(product(offsets, offsets)):
-            part(number / self._side**2)
-            shifted = image.shifted(across, down)
-            found = render_rays(self._tracer, shifted, background_colour("black"), self._shading)
-            light += found.alpha[..., None] * found.layers["linear"]
-            coverage += found.alpha
-        linear = light / np.maximum(coverage, 1e-6)[..., None]
-        return RelitImage(linear.astype(np.float32), (coverage / self._side**2).astype(np.float32))
+        found = pixel_means(self._tracer, image, self._shading, self._side, part)
+        return RelitImage(found.linear, found.alpha)
