@@ -168,7 +168,8 @@ class Deferred:
             back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
             normal = back.normal
             if settings.reflected_gradient:
-                normal = normal + back.reflected + self._facing_gradient(kept, back)
+                led = back.reflected + self._facing_gradient(kept, back)
+                normal = normal + clipped(led, settings.normal_clip)
             by_material, rgb = back.material, by_rgb * np.float32(1 - kept.shaded)
             if settings.is_seed_deferred(sight.progress):
                 rgb[which] = by_rgb[which] * (1 - kept.surface.material[:, 3:4])
@@ -352,6 +353,21 @@ class Deferred:
             smooth_normal_term(sight, self._window, settings.smooth_normal_weight, by_normal)
         if self._window > 1 and settings.smooth_weight > 0:
             smoothness_term(sight, self._window, settings.smooth_weight, by_features, by_alpha)
+
+
+def clipped(
+    gradients: Float64[np.ndarray, "p 3"], most: float
+) -> Float64[np.ndarray, "p 3"]:
+    """Gradients no longer than ``most`` times the median of those that are not 0; 0 leaves them alone.
+
+    One pixel that looks into a mirror in a mirror says more loudly than a hundred others where to turn, and
+    is as likely to be wrong.
+    """
+    lengths = np.linalg.norm(gradients, axis=1)
+    if most == 0 or not (lengths > 0).any():
+        return gradients
+    longest = most * float(np.median(lengths[lengths > 0]))
+    return gradients * np.minimum(1.0, longest / np.maximum(lengths, 1e-30))[:, None]
 
 
 def encoding_slope(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:

@@ -39,6 +39,8 @@ class MaterialSettings(BaseModel):
         ambient_parts: rebuilds of the hierarchy in which all Gaussians have their turn.
         hdr: whether the environment may be brighter than 1.
         reflected_gradient: whether normals learn through the reflected direction.
+        normal_clip: gradients by normals through the reflected direction are cut off at so many times their
+            median of a batch; 0 leaves them alone.
         start: distance from the surface at which reflected rays begin, of the extent.
         blur: roughness of the level that leads reflected directions at first, and sees farther than a
             sharp one; it falls to 0 until ``blur_until``.
@@ -78,6 +80,7 @@ class MaterialSettings(BaseModel):
     ambient_parts: int = Field(20, ge=1)
     hdr: bool = True
     reflected_gradient: bool = True
+    normal_clip: float = Field(0.0, ge=0)
     start: float = Field(0.004, gt=0)
     blur: float = Field(0.5, ge=0, le=1)
     blur_until: float = Field(0.3, ge=0, le=1)
