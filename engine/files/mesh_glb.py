@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int, Int32
+from jaxtyping import Float32, Float64, Int, Int32, UInt8
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
@@ -31,6 +31,7 @@ from engine.files.options import ExportOptions
 from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from engine.files.spatial import kd_chunks
 from engine.files.textures import png_bytes, white_with_alpha_png
+from engine.gaussians.frames import quaternions
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES, octagon_triangles
 from engine.surface.mesh import TriangleMesh
@@ -39,6 +40,12 @@ COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_me
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
 ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "colour": 3}
 UNLIT = "KHR_materials_unlit"
+SAMPLER = {
+    "magFilter": gltf.LINEAR,
+    "minFilter": gltf.LINEAR_MIPMAP_LINEAR,
+    "wrapS": gltf.CLAMP_TO_EDGE,
+    "wrapT": gltf.CLAMP_TO_EDGE,
+}
 
 Chunks = list[Int[np.ndarray, "_"]]
 
@@ -228,66 +235,58 @@ def _per_corner(values: Float32[np.ndarray, "n c"] | Int[np.ndarray, "n c"]) -> 
 
 
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
-    """Write a surface, unlit, with normals, and with a texture or the colours of its vertices.
+    """Write a surface with normals and with a texture or the colours of its vertices.
+
+    Unlit, unless it has materials: then these are textures beside the base colour's, tangents say how its
+    normals lie, and the root node turns the light's up to y and its forward to x, which is how environments
+    lie in glTF's viewers and in Blender.
 
     Raises:
         SceneFileError: more than the 4 GiB that a GLB can hold.
         OSError: the file cannot be written.
     """
     attributes = {"POSITION": mesh.vertices_world, "NORMAL": mesh.vertex_normals()}
+    data = _SurfaceData()
     shading: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material: dict[str, object] = {"name": "surface", "pbrMetallicRoughness": shading, "doubleSided": True}
+    node: dict[str, object] = {"name": "surface", "rotation": gltf.HALF_TURN_ABOUT_X, "mesh": 0}
     document: dict[str, object] = {
         "asset": {"version": "2.0", "generator": "octasplat"},
-        "extensionsUsed": [UNLIT],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "surface", "rotation": gltf.HALF_TURN_ABOUT_X, "mesh": 0}],
-        "materials": [
-            {
-                "name": "surface",
-                "pbrMetallicRoughness": shading,
-                "extensions": {UNLIT: {}},
-                "doubleSided": True,
-            }
-        ],
+        "nodes": [node],
+        "materials": [material],
     }
-    data: list[bytes] = []
-    views: list[dict[str, object]] = []
-
-    def add(piece: bytes, target: int | None = None) -> int:
-        """Add a buffer view and return its number."""
-        views.append({"buffer": 0, "byteOffset": sum(map(len, data)), "byteLength": len(piece)})
-        if target is not None:
-            views[-1]["target"] = target
-        data.append(piece.ljust(padded(len(piece)), b"\0"))
-        return len(views) - 1
-
+    if mesh.materials is None:
+        document["extensionsUsed"] = [UNLIT]
+        material["extensions"] = {UNLIT: {}}
+    else:
+        attributes["TANGENT"] = mesh.materials.tangents
+        node["rotation"] = _quat_xyzw(mesh.materials.light_frame[[2, 1, 0]])
     if mesh.texture_srgb is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = mesh.uv
-        sampler = {
-            "magFilter": gltf.LINEAR,
-            "minFilter": gltf.LINEAR_MIPMAP_LINEAR,
-            "wrapS": gltf.CLAMP_TO_EDGE,
-            "wrapT": gltf.CLAMP_TO_EDGE,
-        }
-        image = {"name": "surface", "mimeType": "image/png", "bufferView": add(png_bytes(mesh.texture_srgb))}
-        document |= {"textures": [{"sampler": 0, "source": 0}], "samplers": [sampler], "images": [image]}
-        shading["baseColorTexture"] = {"index": 0}
+        shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)
+        if mesh.materials is not None:
+            shading["metallicFactor"] = 1.0
+            packed = data.texture("materials", mesh.materials.occlusion_roughness_metallic)
+            shading["metallicRoughnessTexture"] = packed
+            material["occlusionTexture"] = packed
+            material["normalTexture"] = data.texture("normals", mesh.materials.normals)
+        document |= {"textures": data.textures, "samplers": [SAMPLER], "images": data.images}
     elif mesh.rgb_srgb is not None:
         attributes["COLOR_0"] = srgb_to_linear(mesh.rgb_srgb)
     accessors: list[dict[str, object]] = []
     used: dict[str, int] = {}
     for semantic, values in attributes.items():
-        view = add(np.ascontiguousarray(values, "<f4").tobytes(), gltf.ARRAY_BUFFER)
+        view = data.add(np.ascontiguousarray(values, "<f4").tobytes(), gltf.ARRAY_BUFFER)
         used[semantic] = len(accessors)
         accessors.append(gltf.accessor(view, gltf.FLOAT, len(values), gltf.vector_type(values.shape[1])))
     accessors[0] |= {
         "min": mesh.vertices_world.min(axis=0).tolist(),
         "max": mesh.vertices_world.max(axis=0).tolist(),
     }
-    view = add(mesh.faces.astype("<u4").tobytes(), gltf.ELEMENT_ARRAY_BUFFER)
+    view = data.add(mesh.faces.astype("<u4").tobytes(), gltf.ELEMENT_ARRAY_BUFFER)
     accessors.append(gltf.accessor(view, gltf.UNSIGNED_INT, mesh.faces.size, "SCALAR"))
-    length = sum(map(len, data))
     document |= {
         "meshes": [
             {
@@ -296,16 +295,56 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
             }
         ],
         "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": length}],
+        "bufferViews": data.views,
+        "buffers": [{"byteLength": data.length}],
     }
     text = gltf.json_bytes(document)
     room = padded(len(text))
-    if gltf.glb_bytes(room, length) > gltf.MAX_BYTES:
+    if gltf.glb_bytes(room, data.length) > gltf.MAX_BYTES:
         advice = "Decimate it with --max-triangles, or name a .ply."
-        raise gltf.too_large(path, "the surface needs", gltf.glb_bytes(room, length), advice)
-    write_glb(path, room, length, data, lambda: text)
+        raise gltf.too_large(path, "the surface needs", gltf.glb_bytes(room, data.length), advice)
+    write_glb(path, room, data.length, data.pieces, lambda: text)
     return (path,)
+
+
+class _SurfaceData:
+    """The binary part of a surface as it grows, and what the document says of it.
+
+    Attributes:
+        pieces: in the order of the file.
+        length: bytes of all pieces.
+        views: of the buffer.
+        textures: of the document.
+        images: likewise.
+    """
+
+    def __init__(self) -> None:
+        self.pieces: list[bytes] = []
+        self.length = 0
+        self.views: list[dict[str, object]] = []
+        self.textures: list[dict[str, object]] = []
+        self.images: list[dict[str, object]] = []
+
+    def add(self, piece: bytes, target: int | None = None) -> int:
+        """Add a buffer view and return its number."""
+        self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(piece)})
+        if target is not None:
+            self.views[-1]["target"] = target
+        self.pieces.append(piece.ljust(padded(len(piece)), b"\0"))
+        self.length += len(self.pieces[-1])
+        return len(self.views) - 1
+
+    def texture(self, name: str, pixels: UInt8[np.ndarray, "h w 3"]) -> dict[str, object]:
+        """Add an image and return how a material names it."""
+        view = self.add(png_bytes(pixels))
+        self.images.append({"name": name, "mimeType": "image/png", "bufferView": view})
+        self.textures.append({"sampler": 0, "source": len(self.images) - 1})
+        return {"index": len(self.textures) - 1}
+
+
+def _quat_xyzw(rotation: Float64[np.ndarray, "3 3"]) -> list[float]:
+    w, x, y, z = quaternions(rotation[None])[0].tolist()
+    return [x, y, z, w]
 
 
 register(
@@ -318,4 +357,4 @@ register(
     )
 )
 register(MeshReader("glb", ("*.glb",), read, read_looks))
-register(SurfaceWriter("glb", ("*.glb",), write_surface, textured=True))
+register(SurfaceWriter("glb", ("*.glb",), write_surface, textured=True, lit=True))
