@@ -7,6 +7,11 @@ coarse in the dark. Vertices stay in the world frame of COLMAP (y down, z forwar
 root node brings them to glTF's (y up). The scene is cut into spatial chunks, each with its own node, because
 viewers sort transparent objects, not triangles.
 
+The lit variant has the base colour of the materials in place of the colour, normals, and second texture
+coordinates that look metallic and roughness up in an image which holds all pairs: so every Gaussian has its
+own, to 8 bits, though glTF has one material for all. Light falls on it as viewers lay it, so its root node
+turns the light's up to y; it carries no ids, as it is not what edits come from.
+
 The opaque variant needs no sorting: alpha is cut at a threshold (``alphaMode`` MASK), and each octagon
 shrinks to the ellipse that is left of it.
 """
@@ -17,10 +22,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, Int32, UInt8
+from jaxtyping import Float32, Int, Int32, UInt8
 
 from engine.colour import srgb_to_linear
-from engine.errors import SceneFileError
+from engine.errors import ConfigError, SceneFileError
 from engine.files import gltf
 from engine.files.glb_materials import glb_materials, texture_frame
 from engine.files.gltf import GlbFile, channel_attributes, padded, write_glb
@@ -30,8 +35,13 @@ from engine.files.octagon_soup import OctagonBatch, OctagonSoup
 from engine.files.options import ExportOptions
 from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from engine.files.spatial import kd_chunks
-from engine.files.textures import png_bytes, white_with_alpha_png
-from engine.gaussians.frames import quaternions
+from engine.files.textures import (
+    material_ramp_png,
+    material_ramp_uv,
+    png_bytes,
+    white_with_alpha_png,
+)
+from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, has_materials
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES, octagon_triangles
 from engine.surface.mesh import TriangleMesh
@@ -160,31 +170,42 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     A scene for which one file is too small goes into ``path``, ``<stem>.part2.glb`` and so on, by chunks.
 
     Raises:
+        ConfigError: the octagons are to be lit and have no materials.
         SceneFileError: nothing to write, or a chunk that is larger than the 4 GiB that a GLB can hold.
         OSError: a file cannot be written.
     """
+    ramp = b""
+    if options.light_up is not None:
+        if not has_materials(gaussians):
+            raise ConfigError(f"{path}: not written, as the scene has no materials to be lit by.")
+        options, ramp = options.model_copy(update={"ids": False}), material_ramp_png()
     soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
     png = white_with_alpha_png(options.texture_size, options.q)
-    parts = _parts(soup, path, len(png), options)
+    parts = _parts(soup, path, (len(png), len(ramp)), options)
     paths = [path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, len(parts) + 1))]
     for part_path, (layout, chunks) in zip(paths, parts, strict=True):
         bounds: list[Bounds] = []
-        data = _octagon_data(layout, soup, chunks, png, options.ids, bounds)
+        data = _octagon_data(layout, soup, chunks, (png, ramp), options, bounds)
         write_glb(part_path, layout.json_room, layout.length, data, lambda: layout.json(bounds))  # noqa: B023
     return tuple(paths)
 
 
 def _parts(
-    soup: OctagonSoup, path: Path, png_size: int, options: ExportOptions
+    soup: OctagonSoup, path: Path, png_sizes: tuple[int, int], options: ExportOptions
 ) -> list[tuple[GlbLayout, Chunks]]:
     """The fewest files that hold all chunks; neighbouring chunks stay together."""
     chunks = kd_chunks(soup.means_world, options.chunks)
-    channels = channel_attributes(soup.channel_widths)
+    channels = channel_attributes(soup.channel_widths, widest=1)
     for count in range(1, len(chunks) + 1):
         bounds = np.linspace(0, len(chunks), count + 1).astype(int).tolist()
         groups = [chunks[start:end] for start, end in itertools.pairwise(bounds)]
         parts = [
-            (GlbLayout([len(chunk) for chunk in group], png_size, options, extras, channels), group)
+            (
+                GlbLayout(
+                    [len(chunk) for chunk in group], png_sizes[0], options, extras, channels, png_sizes[1]
+                ),
+                group,
+            )
             for group, extras in zip(groups, _extras(soup, options, count), strict=True)
         ]
         if all(layout.total <= gltf.MAX_BYTES for layout, _ in parts):
@@ -204,29 +225,40 @@ def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[
 
 
 def _octagon_data(
-    layout: GlbLayout, soup: OctagonSoup, chunks: Chunks, png: bytes, ids: bool, bounds: list[Bounds]
+    layout: GlbLayout,
+    soup: OctagonSoup,
+    chunks: Chunks,
+    images: tuple[bytes, bytes],
+    options: ExportOptions,
+    bounds: list[Bounds],
 ) -> Iterator[bytes]:
     """The binary part in the order of the layout; adds the bounds of each chunk to ``bounds``."""
-    yield png.ljust(padded(len(png)), b"\0")
+    fall_off, ramp = images
+    yield fall_off.ljust(padded(len(fall_off)), b"\0")
     yield octagon_triangles(layout.largest).astype("<u4").tobytes()
-    if ids:
+    if options.ids:
         yield np.tile(np.arange(SIDES, dtype="<f4"), layout.largest).tobytes()
+    yield ramp.ljust(padded(len(ramp)), b"\0")
     for chunk in chunks:
         batch = soup.batch(chunk)
-        yield from _chunk_data(batch, ids)
+        yield from _chunk_data(batch, options)
         corners = batch.corners_world.reshape(-1, 3)
         bounds.append((corners.min(axis=0).tolist(), corners.max(axis=0).tolist()))
 
 
-def _chunk_data(batch: OctagonBatch, ids: bool) -> Iterator[bytes]:
+def _chunk_data(batch: OctagonBatch, options: ExportOptions) -> Iterator[bytes]:
     """The attributes of one chunk, in the order of the layout; all are multiples of four bytes."""
+    lit = options.light_up is not None
     yield batch.corners_world.astype("<f4").tobytes()
-    rgba = np.concatenate([srgb_to_linear(batch.rgb_srgb), batch.opacities[:, None]], axis=1)
-    yield _per_corner(rgba).tobytes()
+    rgb = np.clip(batch.channels[ALBEDO], 0.0, 1.0) if lit else srgb_to_linear(batch.rgb_srgb)
+    yield _per_corner(np.concatenate([rgb, batch.opacities[:, None]], axis=1)).tobytes()
     yield batch.uv.astype("<f4").tobytes()
-    if ids:
+    if lit:
+        yield _per_corner(batch.normals_world).tobytes()
+        yield _per_corner(material_ramp_uv(batch.channels[METALLIC], batch.channels[ROUGHNESS])).tobytes()
+    if options.ids:
         yield _per_corner(batch.ids[:, None]).tobytes()
-    for attribute in channel_attributes(batch.channels.widths):
+    for attribute in channel_attributes(batch.channels.widths, widest=1):
         yield _per_corner(batch.channels[attribute.channel][:, attribute.part]).tobytes()
 
 
@@ -262,7 +294,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
         material["extensions"] = {UNLIT: {}}
     else:
         attributes["TANGENT"] = mesh.materials.tangents
-        node["rotation"] = _quat_xyzw(mesh.materials.light_frame[[2, 1, 0]])
+        node["rotation"] = gltf.light_turn(mesh.materials.light_frame)
     if mesh.texture_srgb is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = mesh.uv
         shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)
@@ -340,11 +372,6 @@ class _SurfaceData:
         self.images.append({"name": name, "mimeType": "image/png", "bufferView": view})
         self.textures.append({"sampler": 0, "source": len(self.images) - 1})
         return {"index": len(self.textures) - 1}
-
-
-def _quat_xyzw(rotation: Float64[np.ndarray, "3 3"]) -> list[float]:
-    w, x, y, z = quaternions(rotation[None])[0].tolist()
-    return [x, y, z, w]
 
 
 register(

@@ -71,3 +71,15 @@ def test_refusals(shiny, octasplat, tmp_path, source, name, complaint):
     assert result.exit_code == 1
     assert complaint in result.output and result.output.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_octagons_are_lit_where_asked(shiny, octasplat, tmp_path):
+    result = octasplat("export", shiny, tmp_path / "a.glb", "--materials", "--up", "z", "--chunks", 1)
+    assert result.exit_code == 0, result.output
+    document = GlbFile(tmp_path / "a.glb").document
+    assert [image["name"] for image in document["images"]] == ["radial_alpha", "materials"]
+    result = octasplat("export", shiny / "plain.ply", tmp_path / "b.glb", "--materials")
+    assert result.exit_code == 1 and "plain.ply has no materials" in result.output
+    result = octasplat("export", shiny, tmp_path / "b.ply", "--materials")
+    assert result.exit_code == 2 and "--materials is for octagon GLB" in result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["a.glb"]

@@ -8,7 +8,6 @@ from typing import Any
 
 import click
 import numpy as np
-from jaxtyping import Float64
 from pydantic import ValidationError
 
 from engine.config import read_config
@@ -30,7 +29,7 @@ from engine.trace.protocol import TraceSettings
 from engine.writing import replacing
 from workers.cli.progress import show_progress
 from workers.cli.scene_files import open_scene
-from workers.rendering.cameras import axis_named
+from workers.rendering.cameras import light_up
 
 MATERIAL_DEFAULTS = {"texture_side": 1024, "max_triangles": 60_000}
 """With materials, where nothing else is said."""
@@ -81,7 +80,7 @@ def run_surface(
     features, frame, light = None, None, None
     if asked.materials:
         require_materials(gaussians, source / SCENE if is_run(source) else source)
-        features, frame = material_features(gaussians), _light_frame(asked)
+        features, frame = material_features(gaussians), environment_frame(light_up(source, asked.up))
         light = _light_to_copy(source, output)
     cameras, settings = _cameras(source, asked.scene, gaussians, options)
     try:
@@ -102,13 +101,6 @@ def run_surface(
         click.echo(_summary(extracted))
         for path in files:
             click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")
-
-
-def _light_frame(asked: Asked) -> Float64[np.ndarray, "3 3"]:
-    up_world = axis_named(asked.up or "-y")
-    if asked.up is None and is_run(asked.source) and (asked.source / CONFIG).exists():
-        up_world = np.array(read_config(asked.source / CONFIG).train.materials.up_world, np.float64)
-    return environment_frame(up_world)
 
 
 def _light_to_copy(source: Path, output: Path) -> Path | None:

@@ -40,6 +40,7 @@ scene.cycles.samples = int(samples)
 scene.cycles.use_denoising = False
 scene.cycles.use_adaptive_sampling = False
 scene.cycles.blur_glossy = 0.0
+scene.cycles.transparent_max_bounces = 128
 scene.cycles.sample_clamp_indirect = 0.0
 scene.render.threads_mode, scene.render.threads = "FIXED", 2
 scene.render.film_transparent = True
