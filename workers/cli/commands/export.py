@@ -114,6 +114,8 @@ def export(
     OUT's name says the format, unless --format does; the formats are listed below. Where two take a name, as
     *.ply and *.mesh.ply do, the longer pattern wins.
     """
+    if up and not materials:
+        raise click.UsageError("--up goes with --materials.")
     from engine.files import ExportOptions, export_scene, exporter_for
     from engine.gaussians.materials import require_materials
     from engine.gaussians.octagon import CHI2_2_99

@@ -119,6 +119,8 @@ def surface(
     --materials takes 60,000 triangles and a texture of 1,024 pixels where nothing else is said. Of a run,
     environment.hdr goes beside the file.
     """
+    if up and not materials:
+        raise click.UsageError("--up goes with --materials.")
     from engine.errors import Cancelled
     from workers.cli.signals import Stopped, stop_on_signals
     from workers.cli.surfacing import Asked, run_surface
