@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float32
 
+from engine.gaussians.materials import with_room_for_bounced
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import EnvironmentMap
 from engine.light.relighting import Part, RelitImage, silent
@@ -45,16 +46,20 @@ class SplitSumRelighter:
         changed = {"learn": True, "environment_height": HEIGHT, "visibility": True, "indirect": "shaded"}
         shading = (learnt or MaterialSettings()).model_copy(update=changed)
         self._shading = Deferred(shading, extent_world=extent_world)
+        self._gaussians = with_room_for_bounced(gaussians)
         self._tracer = make_tracer(settings, threads=threads, build_quality=2)
-        self._tracer.build(gaussians, self._shading.features(gaussians))
+        self._tracer.build(self._gaussians, self._shading.features(self._gaussians))
         self._radiance: Float32[np.ndarray, "h w 3"] | None = None
 
     def put(self, environment: EnvironmentMap) -> None:
         """Take this environment from now on."""
-        if self._radiance is not environment.radiance_linear:
+        other = self._radiance is not environment.radiance_linear
+        if other:
             self._shading.light.put(environment.radiance_linear)
             self._radiance = environment.radiance_linear
-        self._shading.frame = environment.frame
+        if other or not np.array_equal(self._shading.frame, environment.frame):
+            self._shading.frame = environment.frame
+            self._shading.relight(self._gaussians, self._tracer)
 
     def render(self, image: ImageRays, part: Part = silent) -> RelitImage:
         """What a camera sees; ``part`` is told the share that is done."""

@@ -10,14 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
 from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.gaussians.channels import stacked
-from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
+from engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
-from engine.shading.ambient import ambient_visibility
+from engine.shading.ambient import OPEN, ambient_visibility, bounced_light
 from engine.shading.buffer import Buffer, gather, reflected_rays, spread_back
 from engine.shading.environment_frame import environment_frame
 from engine.shading.geometry_terms import (
@@ -43,6 +43,7 @@ from engine.shading.split_sum import ShadeGradients, Surface, shade, shade_rever
 from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 AMBIENT_COLUMN = 5
+BOUNCED_COLUMNS = slice(6, 9)
 HIDDEN = 0.5
 """Transmittance below which the seed's way of seeing counts the environment as hidden."""
 TURNS = 1 << 20
@@ -96,24 +97,57 @@ class Deferred:
         self._features: Float32[np.ndarray, "n f"] = np.empty((0, 5), np.float32)
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"]:
-        """The materials side by side, and the ambient visibility where it is known."""
-        names = [name for name in (*MATERIAL_WIDTHS, AMBIENT) if name in gaussians.channels]
+        """The materials side by side, and what reaches a Gaussian from all around where it is known."""
+        names = [name for name in (*MATERIAL_WIDTHS, AMBIENT, BOUNCED) if name in gaussians.channels]
         self._features = stacked(gaussians.channels, names)
         return self._features
 
     def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
-        """Measure the ambient visibility of some of the Gaussians, by turns."""
+        """Measure what reaches some of the Gaussians from all around, by turns."""
         settings = self.settings
         if not settings.ambient or progress < settings.secondary_from or AMBIENT not in gaussians.channels:
             return
         parts = settings.ambient_parts
         turn = int(progress * TURNS) * 7919 % parts
-        ids = np.arange(turn, len(gaussians), parts)
-        visible = ambient_visibility(
-            gaussians, ids, tracer, rays=settings.ambient_rays, gap_world=2 * self._gap
+        self._look_around(gaussians, np.arange(turn, len(gaussians), parts), tracer)
+
+    def relight(self, gaussians: FlatGaussians, tracer: Tracer) -> None:
+        """Find the light that surfaces send each other under an environment that was just put."""
+        if BOUNCED in gaussians.channels and self.settings.ambient:
+            self._look_around(gaussians, np.arange(len(gaussians)), tracer)
+
+    def _look_around(self, gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer) -> None:
+        """Measure ambient visibility and bounced light of some of the Gaussians."""
+        channels, rays = gaussians.channels, self.settings.ambient_rays
+        visible, side = ambient_visibility(gaussians, ids, tracer, rays=rays, gap_world=2 * self._gap)
+        channels[AMBIENT][ids, 0] = visible
+        self._features[ids, AMBIENT_COLUMN] = visible
+        if BOUNCED not in channels:
+            return
+        dim = visible < OPEN
+        bounced = np.zeros((len(ids), 3), np.float32)
+        bounced[dim] = bounced_light(
+            gaussians, ids[dim], side[dim], lambda fan: self._radiance(fan, tracer), rays=rays,
+            gap_world=2 * self._gap,
+        )  # fmt: skip
+        channels[BOUNCED][ids] = bounced
+        self._features[ids, BOUNCED_COLUMNS] = bounced
+
+    def _radiance(self, rays: RayBatch, tracer: Tracer) -> Float64[np.ndarray, "r 3"]:
+        """What rays meet, times the share of it that hides the rest; lit by the environment alone.
+
+        So a Gaussian's bounced light does not depend on that of others, and not on whose turn it was.
+        """
+        seen = tracer.trace(rays)
+        buffer = gather(rays, seen)
+        surface = self._dimmed(seen, buffer)
+        out = np.zeros((len(rays), 3))
+        surface = replace(
+            surface, visibility=surface.ambient, bounced_linear=np.zeros((len(buffer.which), 3))
         )
-        gaussians.channels[AMBIENT][ids, 0] = visible
-        self._features[ids, 5] = visible
+        linear = shade(surface, self.light.levels, self.frame)
+        out[buffer.which] = buffer.alpha[:, None] * linear
+        return out
 
     def develop(self, sight: Sight) -> Developed:
         """Display colours, shaded as far as the training has handed over to that."""
@@ -241,13 +275,17 @@ class Deferred:
         self.light.restore(own)
 
     def _dimmed(self, seen: TraceResult, buffer: Buffer) -> Surface:
-        """The surface of a buffer with its ambient visibility, to which no gradient goes."""
+        """The surface of a buffer with what reaches it from all around, to which no gradient goes."""
         surface = buffer.surface
         if self.settings.recipe == "seed":  # the seed's matt part is a colour of its own
             return replace(surface, ambient=np.zeros(len(buffer.which)))
         if not self.settings.ambient or seen.features.shape[1] <= AMBIENT_COLUMN:
             return surface
-        return replace(surface, ambient=seen.features[buffer.which, AMBIENT_COLUMN] / buffer.alpha)
+        around = seen.features[buffer.which].astype(np.float64) / buffer.alpha[:, None]
+        surface = replace(surface, ambient=around[:, AMBIENT_COLUMN])
+        if around.shape[1] < BOUNCED_COLUMNS.stop:
+            return surface
+        return replace(surface, bounced_linear=around[:, BOUNCED_COLUMNS])
 
     def _layers(
         self,
@@ -355,9 +393,7 @@ class Deferred:
             smoothness_term(sight, self._window, settings.smooth_weight, by_features, by_alpha)
 
 
-def clipped(
-    gradients: Float64[np.ndarray, "p 3"], most: float
-) -> Float64[np.ndarray, "p 3"]:
+def clipped(gradients: Float64[np.ndarray, "p 3"], most: float) -> Float64[np.ndarray, "p 3"]:
     """Gradients no longer than ``most`` times the median of those that are not 0; 0 leaves them alone.
 
     One pixel that looks into a mirror in a mirror says more loudly than a hundred others where to turn, and

@@ -35,6 +35,7 @@ class MaterialSettings(BaseModel):
         indirect: light of what stands there: ``shaded`` by the split sum, from the ``harmonics``, or
             ``none``.
         ambient: whether the irradiance is dimmed where other things hide the environment.
+        bounced: whether matt surfaces are lit by what others send, too.
         ambient_rays: rays from each side of a Gaussian that say how much.
         ambient_parts: rebuilds of the hierarchy in which all Gaussians have their turn.
         hdr: whether the environment may be brighter than 1.
@@ -76,11 +77,12 @@ class MaterialSettings(BaseModel):
     facet_slope: tuple[float, float] = (0.1, 0.01)
     indirect: Literal["shaded", "harmonics", "none"] = "shaded"
     ambient: bool = True
+    bounced: bool = True
     ambient_rays: int = Field(16, ge=4)
     ambient_parts: int = Field(20, ge=1)
     hdr: bool = True
     reflected_gradient: bool = True
-    normal_clip: float = Field(0.0, ge=0)
+    normal_clip: float = Field(2.0, ge=0)
     start: float = Field(0.004, gt=0)
     blur: float = Field(0.5, ge=0, le=1)
     blur_until: float = Field(0.3, ge=0, le=1)
