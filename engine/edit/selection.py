@@ -2,13 +2,63 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
+from engine.edit.axes import infer_q
+from engine.edit.matching import match_octagons
+from engine.edit.where import MAX_LENGTH, check_where, where
 from engine.errors import ConfigError
+from engine.files import Mesh
 from engine.gaussians.channels import common_widths
 from engine.gaussians.model import FlatGaussians, concatenate
+from engine.gaussians.octagon import CHI2_2_99, octagon_radii
+
+
+class Selection(BaseModel):
+    """Which Gaussians are meant: those for which all that is given holds.
+
+    Attributes:
+        where: comparisons of their numbers, such as 'metallic > 0.5 and z < 0'.
+        box: two corners of a box that their centres lie in, x, y, z of each, smallest coordinates first.
+        sphere: centre x, y, z and radius of a sphere that their centres lie in.
+        inverse: the others instead.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    where: str | None = Field(None, max_length=MAX_LENGTH)
+    box: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
+    sphere: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
+    inverse: bool = False
+
+    @field_validator("where")
+    @classmethod
+    def _can_be_read(cls, text: str | None) -> str | None:
+        try:
+            if text is not None:
+                check_where(text)
+        except ConfigError as error:
+            raise ValueError(str(error).removesuffix(".")) from None
+        return text
+
+    def of(self, gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
+        """Which of a scene.
+
+        Raises:
+            ConfigError: the expression names what the scene does not have, or a box or sphere is none.
+        """
+        chosen = np.ones(len(gaussians), dtype=bool)
+        if self.where is not None:
+            chosen &= where(gaussians, self.where)
+        if self.box is not None:
+            chosen &= inside_box(gaussians, np.array(self.box[:3]), np.array(self.box[3:]))
+        if self.sphere is not None:
+            chosen &= inside_sphere(gaussians, np.array(self.sphere[:3]), self.sphere[3])
+        return ~chosen if self.inverse else chosen
 
 
 def inside_box(
@@ -40,6 +90,26 @@ def inside_sphere(
     offsets = gaussians.means_world.astype(np.float64) - np.asarray(centre_world, np.float64)
     result: np.ndarray = np.linalg.norm(offsets, axis=1) <= radius_world
     return result
+
+
+def in_mesh(gaussians: FlatGaussians, mesh: Mesh, path: Path) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians have their octagon in a mesh that was exported from the scene, wherever it lies now.
+
+    Args:
+        gaussians: the scene.
+        mesh: what is left of its octagons after others were deleted in a mesh editor.
+        path: its file, named in errors.
+
+    Raises:
+        SceneFileError: the mesh does not belong to the scene, or its vertices cannot be identified.
+    """
+    opacities = gaussians.opacities
+    octagons = match_octagons(
+        path, mesh, opacities, octagon_radii(opacities, infer_q(mesh, opacities, CHI2_2_99))
+    )
+    chosen = np.zeros(len(gaussians), dtype=bool)
+    chosen[octagons.gids] = True
+    return chosen
 
 
 def with_sh_degree(gaussians: FlatGaussians, degree: int) -> FlatGaussians:
