@@ -1,14 +1,12 @@
-"""Materials of chosen Gaussians changed: set to values, or scaled by factors."""
+"""Materials of chosen Gaussians changed, and harmonics that show it."""
 
-import re
 from dataclasses import replace
-from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
 
-from engine.colour import linear_to_srgb, srgb_to_linear
+from engine.colour import linear_to_srgb
+from engine.edit.choices import MaterialChange
 from engine.gaussians.channels import stacked
 from engine.gaussians.harmonics import sh_basis, spread_directions
 from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
@@ -16,102 +14,22 @@ from engine.gaussians.model import FlatGaussians
 from engine.shading.environment_levels import LightLevels
 from engine.shading.split_sum import Surface, shade
 
-_HEX = re.compile(r"#([0-9a-fA-F]{6})")
 _AT_ONCE = 1 << 14
 _DIRECTIONS = 64
 """From which a Gaussian is looked at to see how its look changes."""
 
 
-def read_colour(value: object) -> object:
-    """Linear values of a text: ``#rrggbb`` has display values, ``r,g,b`` linear ones.
-
-    Anything else is given back as it is. Raises ValueError where a text is neither.
-    """
-    if not isinstance(value, str):
-        return value
-    if found := _HEX.fullmatch(value.strip()):
-        shown = np.frombuffer(bytes.fromhex(found[1]), np.uint8) / 255.0
-        return tuple(float(part) for part in srgb_to_linear(shown))
-    try:
-        return tuple(float(part) for part in value.split(","))
-    except ValueError:
-        raise ValueError("write it as r,g,b from 0 to 1, linear, or as #rrggbb, display values") from None
-
-
-_Share = Annotated[float, Field(ge=0, le=1)]
-_Factor = Annotated[FiniteFloat, Field(ge=0)]
-_Colour = Annotated[
-    tuple[_Share, _Share, _Share],
-    BeforeValidator(read_colour, json_schema_input_type=tuple[_Share, _Share, _Share] | str),
-]
-
-
-class _Given(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    def given(self) -> dict[str, Any]:
-        """What is not left as it is, by channel."""
-        return {name: value for name in MATERIAL_WIDTHS if (value := getattr(self, name)) is not None}
-
-
-class MaterialValues(_Given):
-    """Values of a material.
-
-    Attributes:
-        albedo: base colour, r, g, b from 0 to 1, linear; or a text such as '#ff8000', display values.
-        metallic: from 0 to 1.
-        roughness: from 0 to 1.
-    """
-
-    albedo: _Colour | None = None
-    metallic: _Share | None = None
-    roughness: _Share | None = None
-
-
-class MaterialFactors(_Given):
-    """Factors of a material; what comes out is kept within 0 and 1.
-
-    Attributes:
-        albedo: of the linear base colour.
-        metallic: likewise.
-        roughness: likewise.
-    """
-
-    albedo: _Factor | None = None
-    metallic: _Factor | None = None
-    roughness: _Factor | None = None
-
-
-class MaterialChange(BaseModel):
-    """What becomes of materials.
-
-    Attributes:
-        set: values that they get.
-        scale: factors that they are multiplied by.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    set: MaterialValues = MaterialValues()
-    scale: MaterialFactors = MaterialFactors()
-
-    @model_validator(mode="after")
-    def _says_something_once(self) -> "MaterialChange":
-        both = self.set.given().keys() & self.scale.given().keys()
-        if both:
-            raise ValueError(f"{sorted(both)[0]} is set and scaled; choose one")
-        if not self.set.given() and not self.scale.given():
-            raise ValueError("nothing is changed; set or scale albedo, metallic or roughness")
-        return self
-
-    def applied(self, gaussians: FlatGaussians, chosen: Bool[np.ndarray, " n"]) -> FlatGaussians:
-        """The scene, which has materials, with those of the chosen Gaussians changed and all else shared."""
-        changed: dict[str, np.ndarray] = {}
-        for name, value in (*self.set.given().items(), *self.scale.given().items()):
-            changed[name] = gaussians.channels[name].copy()
-            new = value if name in self.set.given() else changed[name][chosen] * np.float32(value)
-            changed[name][chosen] = np.clip(new, 0.0, 1.0)
-        return gaussians.with_channels(changed)
+def with_materials(
+    gaussians: FlatGaussians, chosen: Bool[np.ndarray, " n"], change: MaterialChange
+) -> FlatGaussians:
+    """The scene, which has materials, with those of the chosen Gaussians changed and all else shared."""
+    values, factors = change.set.given(), change.scale.given()
+    changed = {name: gaussians.channels[name].copy() for name in (*values, *factors)}
+    for name, value in values.items():
+        changed[name][chosen] = value
+    for name, factor in factors.items():
+        changed[name][chosen] = np.clip(changed[name][chosen] * np.float32(factor), 0.0, 1.0)
+    return gaussians.with_channels(changed)
 
 
 def with_harmonics_following(

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from engine.config import read_config
-from engine.edit.material_change import MaterialChange, with_harmonics_following
-from engine.edit.selection import Selection
+from engine.edit.choices import MaterialChange, Selection
+from engine.edit.material_change import with_harmonics_following, with_materials
 from engine.errors import ConfigError, OutputError
 from engine.files.gaussian_ply import read_near_world, write_gaussian_ply
 from engine.gaussians.materials import require_materials
@@ -48,7 +48,7 @@ def change_materials(
         raise ConfigError(
             f"{source}: none of its {len(chosen):,} Gaussians is chosen, so nothing is changed."
         )
-    changed = change.applied(gaussians, chosen)
+    changed = with_materials(gaussians, chosen, change)
     if not follows(source):
         return changed
     settings = read_config(source / CONFIG).train.materials

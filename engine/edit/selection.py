@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from engine.edit.axes import infer_q
+from engine.edit.choices import Selection
 from engine.edit.matching import match_octagons
-from engine.edit.where import MAX_LENGTH, check_where, where
+from engine.edit.where import where
 from engine.errors import ConfigError
 from engine.files import Mesh
 from engine.gaussians.channels import common_widths
@@ -18,47 +18,20 @@ from engine.gaussians.model import FlatGaussians, concatenate
 from engine.gaussians.octagon import CHI2_2_99, octagon_radii
 
 
-class Selection(BaseModel):
-    """Which Gaussians are meant: those for which all that is given holds.
+def chosen_by(gaussians: FlatGaussians, selection: Selection) -> Bool[np.ndarray, " n"]:
+    """Which of a scene are meant.
 
-    Attributes:
-        where: comparisons of their numbers, such as 'metallic > 0.5 and z < 0'.
-        box: two corners of a box that their centres lie in, x, y, z of each, smallest coordinates first.
-        sphere: centre x, y, z and radius of a sphere that their centres lie in.
-        inverse: the others instead.
+    Raises:
+        ConfigError: the expression names what the scene does not have, or a box or sphere is none.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    where: str | None = Field(None, max_length=MAX_LENGTH)
-    box: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
-    sphere: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
-    inverse: bool = False
-
-    @field_validator("where")
-    @classmethod
-    def _can_be_read(cls, text: str | None) -> str | None:
-        try:
-            if text is not None:
-                check_where(text)
-        except ConfigError as error:
-            raise ValueError(str(error).removesuffix(".")) from None
-        return text
-
-    def of(self, gaussians: FlatGaussians) -> Bool[np.ndarray, " n"]:
-        """Which of a scene.
-
-        Raises:
-            ConfigError: the expression names what the scene does not have, or a box or sphere is none.
-        """
-        chosen = np.ones(len(gaussians), dtype=bool)
-        if self.where is not None:
-            chosen &= where(gaussians, self.where)
-        if self.box is not None:
-            chosen &= inside_box(gaussians, np.array(self.box[:3]), np.array(self.box[3:]))
-        if self.sphere is not None:
-            chosen &= inside_sphere(gaussians, np.array(self.sphere[:3]), self.sphere[3])
-        return ~chosen if self.inverse else chosen
+    chosen = np.ones(len(gaussians), dtype=bool)
+    if selection.where is not None:
+        chosen &= where(gaussians, selection.where)
+    if (box := selection.box) is not None:
+        chosen &= inside_box(gaussians, np.array(box[:3]), np.array(box[3:]))
+    if (sphere := selection.sphere) is not None:
+        chosen &= inside_sphere(gaussians, np.array(sphere[:3]), sphere[3])
+    return ~chosen if selection.inverse else chosen
 
 
 def inside_box(

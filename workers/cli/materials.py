@@ -5,8 +5,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from engine.edit.choices import MaterialChange, Selection
 from engine.edit.masked import under_masks
-from engine.edit.material_change import MaterialChange
 from engine.edit.material_run import (
     change_materials,
     check_new_run,
@@ -14,7 +14,7 @@ from engine.edit.material_run import (
     follows,
     write_changed_run,
 )
-from engine.edit.selection import Selection, in_mesh
+from engine.edit.selection import chosen_by, in_mesh
 from engine.errors import ConfigError
 from engine.files import read_mesh
 from engine.gaussians.materials import MATERIAL_WIDTHS, require_materials
@@ -40,7 +40,7 @@ def run_material(options: dict[str, Any]) -> None:
         (output,) = targets_for(output, [source], [source])
     gaussians = open_scene(source, quiet=options["quiet"])
     require_materials(gaussians, source / SCENE if is_run(source) else source)
-    chosen = selection.model_copy(update={"inverse": False}).of(gaussians)
+    chosen = chosen_by(gaussians, selection.model_copy(update={"inverse": False}))
     if options["mesh"] is not None:
         chosen &= in_mesh(gaussians, read_mesh(options["mesh"]), options["mesh"])
     if options["masks"]:

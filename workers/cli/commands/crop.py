@@ -25,7 +25,8 @@ def crop(
     if where is None and box is None and sphere is None:
         raise click.UsageError("Say what to keep: --box, --sphere or --where.")
 
-    from engine.edit.selection import Selection
+    from engine.edit.choices import Selection
+    from engine.edit.selection import chosen_by
     from engine.errors import ConfigError
     from workers.cli.editing import checked_options, speaker, targets_for, write_scene
     from workers.cli.scene_files import open_scene
@@ -35,7 +36,7 @@ def crop(
     gaussians = open_scene(source, quiet=quiet)
     given = {"where": where, "box": box, "sphere": sphere, "inverse": inverse}
     selection: Selection = checked_options(Selection, given)
-    keep = selection.of(gaussians)
+    keep = chosen_by(gaussians, selection)
     if not keep.any():
         low, high = gaussians.means_world.min(axis=0), gaussians.means_world.max(axis=0)
         bounds = " to ".join(" ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
