@@ -26,7 +26,7 @@ class Selection(BaseModel):
     """Which Gaussians are meant: those for which all that is given holds.
 
     Attributes:
-        where: comparisons of their numbers, such as 'metallic > 0.5 and z < 0'.
+        where: comparisons that hold for them, such as 'metallic > 0.5 and z < 0'; None means all.
         box: two corners of a box that their centres lie in, x, y, z of each, smallest coordinates first.
         sphere: centre x, y, z and radius of a sphere that their centres lie in.
         inverse: the others instead.

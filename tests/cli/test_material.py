@@ -1,17 +1,22 @@
 """``octasplat material``: other materials for chosen Gaussians of a run or a file."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from pydantic import ValidationError
 
 from engine.colour import linear_to_srgb
 from engine.files import export_scene, read_mesh
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.light.environment import write_environment
 from engine.render.images import read_image
+from workers.work.kinds import kind_named
+from workers.work.programs import material
+from workers.work.task import Task
 
 VIEW = "view_000"
 
@@ -67,6 +72,26 @@ def test_the_folder_is_a_run_for_every_command(shiny_run, changed, octasplat, tm
     assert done.exit_code == 0 and (changed / "metrics.json").exists(), done.output
     done = octasplat("material", changed, "-o", tmp_path / "again", "--set", "roughness=1")
     assert done.exit_code == 0 and len(json.loads((tmp_path / "again" / "edits.json").read_text())) == 2
+
+
+def test_a_job_gives_the_bytes_of_the_command(shiny_run, changed, tmp_path):
+    shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
+    asked = {
+        "set": {"albedo": "#ff8000", "metallic": 0}, "scale": {"roughness": 1.5},
+        "where": "x > 0 and roughness < 0.6",
+    }  # fmt: skip
+    options = kind_named("material").resolve(asked)
+    material(Task(tmp_path / "attempt", options.model_dump(mode="json"), title="a thing", threads=1))
+    results = tmp_path / "attempt" / "results"
+    assert (results / "scene.ply").read_bytes() == (changed / "scene.ply").read_bytes()
+    assert (results / "edits.json").read_bytes() == (changed / "edits.json").read_bytes()
+    assert json.loads((results / "config.json").read_text())["scene"] == "a thing"
+    for kind in ("relight", "material", "render", "evaluate"):  # what it is given is among these results
+        wanted = set(kind_named(kind).source_files) - {"edits.json"}
+        assert wanted <= {path.name for path in results.iterdir()}, kind
+    for wrong in ({}, {"set": {"roughness": 2}}, {**asked, "where": "open(1) > 2"}):
+        with pytest.raises(ValidationError):
+            kind_named("material").resolve(wrong)
 
 
 def test_harmonics_follow_and_come_back(changed, shiny_run, octasplat, tmp_path):

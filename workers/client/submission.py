@@ -1,12 +1,12 @@
 """From a folder to results: upload, queue, wait, download."""
 
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from engine.errors import OctasplatError
+from engine.errors import ConfigError, OctasplatError
 from engine.events import Listener, Warned, ignore
 from engine.light.companions import companions
 from engine.light.stage_file import named_files, read_stage, with_files
@@ -115,6 +115,26 @@ def with_stage(what: Derivation, stage: Path) -> Derivation:
             files[(PurePosixPath(sent).parent / beside).as_posix()] = path.parent / beside
     options = {**what.options, "stage": with_files(read, names).model_dump(mode="json")}
     return replace(what, options=options, files={**what.files, **files})
+
+
+def with_environments(what: Derivation, maps: Sequence[Path]) -> Derivation:
+    """The same with maps of light, which are sent under their own names, or plain ones where those are odd.
+
+    Raises:
+        ConfigError: one is not there, or two have one name.
+    """
+    files: dict[str, Path] = {}
+    for path in maps:
+        if not path.is_file():
+            raise ConfigError(f"{path}: there is no such file; name an HDR or EXR image.")
+        try:
+            name = check_name(path.name)
+        except NameRefused:
+            name = check_name(f"map_{len(files)}{path.suffix.lower()}")
+        if name in files:
+            raise ConfigError(f"{path}: two environments are called {name}; rename one.")
+        files[name] = path
+    return replace(what, options={**what.options, "environments": list(files)}, files={**what.files, **files})
 
 
 def derive(api: Api, what: Derivation, listener: Listener = ignore) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from engine.writing import write_json
 from workers.store.names import check_name
 from workers.work.kinds.options import (
     ExportJobOptions,
+    MaterialJobOptions,
     PictureOptions,
     ReconstructOptions,
     RelightJobOptions,
@@ -162,6 +163,23 @@ def relight(task: Task) -> None:
         return relight_files(options.mode, arguments, tell, say, keeping)
 
     _make_pictures(task, options, work)
+
+
+def material(task: Task) -> None:
+    """The scene of a reconstruction with other materials: results like those of a run."""
+    from engine.edit.material_run import change_materials, edit_note, write_changed_run
+    from engine.edit.selection import chosen_by
+
+    options = MaterialJobOptions.model_validate(task.options)
+    tell = stopping(task.listener, task.should_stop)
+    with counted_stage("edit", tell, 0):
+        gaussians, _ = read_gaussian_ply(task.run / SCENE)
+        chosen = chosen_by(gaussians, options)
+        changed = change_materials(task.run, gaussians, chosen, options)
+        folder = task.folder / "changed"
+        write_changed_run(task.run, changed, folder, edit_note(options, options, chosen))
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        _publish(task, path, path.relative_to(folder).as_posix())
 
 
 def _picture_arguments(task: Task, options: PictureOptions) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from engine.config import ReconstructionConfig
+from engine.edit.choices import MaterialChange, Selection
 from engine.errors import SceneFileError
 from engine.files import exporter_for
 from engine.light.stage import Stage
@@ -17,7 +18,7 @@ from engine.train.config import preset, with_materials
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _TAKEN = frozenset(
     {"scene.ply", "config.json", "held_out.json", "views.json", "events.jsonl", "metrics.json", "report.html"}
-    | {"training.json", "environment.hdr", "renders", "checkpoints", "cache", "poses"}
+    | {"training.json", "environment.hdr", "edits.json", "renders", "checkpoints", "cache", "poses"}
 )  # fmt: skip
 
 
@@ -171,6 +172,10 @@ class RelightJobOptions(PictureOptions):
     def rays(self) -> int:
         """Rays or paths a pixel, under all environments together."""
         return len(self.environments) * (self.samples or (64 if self.by == "path" else 4))
+
+
+class MaterialJobOptions(Selection, MaterialChange):
+    """Options of ``material``: what becomes of the materials of which Gaussians."""
 
 
 def _learns_materials(train: object) -> bool:
