@@ -61,6 +61,18 @@ def test_several_environments_have_folders_and_a_film(scene, tmp_path):
     assert (tmp_path / "film.mp4").stat().st_size > 500
 
 
+def test_light_is_cut_off_where_asked(scene, tmp_path):
+    """White metal in light of 0.5, or of what is left of it."""
+    for most, left in ((0.2, 0.2), (3, 0.5)):
+        done = relight(
+            scene / "ball.ply", "--environment", scene / "white.hdr", "-o", tmp_path / str(most), "--exr",
+            "--clamp", most, *SMALL,
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+        image = read_channels(tmp_path / str(most) / "frame_0000.exr")
+        assert image["G"][9:15, 13:19].mean() == pytest.approx(left, rel=0.03)
+
+
 @pytest.mark.parametrize(("by", "least"), [("split-sum", 60), ("path", 25)])
 def test_a_turned_environment_is_the_map_turned(scene, tmp_path, by, least):
     for name, environment, turn in (("a", "turned.exr", 0), ("b", "sides.exr", 180), ("c", "sides.exr", 0)):

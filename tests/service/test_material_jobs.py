@@ -4,7 +4,7 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from service_bench import running
+from service_bench import committed_dataset, running
 from test_stage_jobs import HDR, finished, sent
 
 from engine.errors import ConfigError
@@ -44,6 +44,28 @@ def test_materials_and_light_are_asked_for_over_http(conninfo: str, tmp_path: Pa
             assert missing.json()["errors"][0]["pointer"] == "#/options/environments/0"
             refused = await http.post("/v1/jobs", json={**body, "source_id": plain})
             assert "has no environment.hdr" in refused.json()["errors"][0]["detail"]
+
+    asyncio.run(conversation())
+
+
+def test_other_photographs_are_measured_over_http(conninfo: str, tmp_path: Path) -> None:
+    async def conversation() -> None:
+        async with running(conninfo, tmp_path) as (http, service):
+            source = await finished(http, service, SHINY)
+            others, bare = [await committed_dataset(service, has_poses=posed) for posed in (True, False)]
+            body = {"kind": "evaluate", "source_id": source}
+            own = (await http.post("/v1/jobs", json=body)).json()
+            assert own["options"] == {"all_views": False} and own["dataset_id"] not in (None, others)
+            made = (await http.post("/v1/jobs", json={**body, "dataset_id": others})).json()
+            assert made["options"] == {"all_views": True} and made["dataset_id"] == others
+            files = await sent(http, {"studio.hdr": HDR})
+            for dataset, words in ((bare, "no COLMAP model"), (files, "no photographs"), (source, "no such")):
+                refused = await http.post("/v1/jobs", json={**body, "dataset_id": dataset})
+                [fault] = refused.json()["errors"]
+                assert refused.status_code == 422 and words in fault["detail"], fault
+                assert fault["pointer"] == "#/dataset_id"
+            refused = await http.post("/v1/jobs", json={**body, "kind": "render", "dataset_id": others})
+            assert refused.json()["errors"][0]["pointer"] == "#/dataset_id"
 
     asyncio.run(conversation())
 

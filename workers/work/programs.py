@@ -22,6 +22,7 @@ from engine.stages import counted_stage, stopping
 from engine.writing import write_json
 from workers.store.names import check_name
 from workers.work.kinds.options import (
+    EvaluateOptions,
     ExportJobOptions,
     MaterialJobOptions,
     PictureOptions,
@@ -79,17 +80,18 @@ def _publish_run(task: Task) -> None:
 
 
 def evaluate(task: Task) -> None:
-    """The held-out views of a finished reconstruction, measured again."""
-    evaluate_run(
+    """The held-out views of a finished reconstruction measured again, or all views of these photographs."""
+    all_views = EvaluateOptions.model_validate(task.options).all_views
+    metrics = evaluate_run(
         task.run,
-        scene=task.scene,
+        scene=None if all_views else task.scene,
+        on=task.scene if all_views else None,
         threads=task.threads,
         listener=stopping(task.listener, task.should_stop),
     )
-    for name in ("metrics.json", "report.html"):
-        _publish(task, task.run / name, name)
-    for path in sorted((task.run / "renders").rglob("*.png")):
-        _publish(task, path, path.relative_to(task.run).as_posix())
+    folder = metrics.parent
+    for path in (metrics, folder / REPORT, *sorted((folder / "renders").rglob("*.png"))):
+        _publish(task, path, path.relative_to(folder).as_posix())
 
 
 def export(task: Task) -> None:
@@ -156,6 +158,7 @@ def relight(task: Task) -> None:
         "samples": options.samples,
         "depth": options.depth,
         "rotate": options.rotation_degrees,
+        "clamp": options.clamp,
         "spin": options.spin,
     }
 

@@ -108,6 +108,12 @@ def submit(
     metavar="MAP",
     help="Relight: an HDR or EXR image, which is sent; several have their turns.",
 )
+@click.option(
+    "--on",
+    type=click.Path(path_type=Path),
+    metavar="SCENE",
+    help="Evaluate: measure all photographs of this folder, ZIP file or dataset in the same world instead.",
+)
 @set_option
 @click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
@@ -117,7 +123,7 @@ def submit(
 @server_option
 @quiet_option
 def derive(
-    kind: str, job_id: str, stage: Path | None, environments: tuple[Path, ...], wait: bool,
+    kind: str, job_id: str, stage: Path | None, environments: tuple[Path, ...], on: Path | None, wait: bool,
     output: Path | None, server: str | None, quiet: bool, **given: Any,
 ) -> None:  # fmt: skip
     """Queue a job of the KIND evaluate, export, render, relight or material on the results of JOB.
@@ -131,7 +137,7 @@ def derive(
     with connected(server) as api:
         source = _job(api, job_id)["id"]
         what = Derivation(
-            source, kind, _assigned({}, given["assignments"]),
+            source, kind, _assigned({}, given["assignments"]), scene=on,
             label=given["label"], queue=given["queue"], priority=given["priority"],
         )  # fmt: skip
         if stage is not None:

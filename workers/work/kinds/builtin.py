@@ -59,7 +59,7 @@ def register_all() -> None:
     register(
         JobKind(
             name="evaluate",
-            title="Measure the held-out views of a reconstruction again",
+            title="Measure views of a reconstruction: those held out again, or other photographs",
             needs="result",
             options=EvaluateOptions,
             program="workers.work.programs:evaluate",
@@ -67,6 +67,7 @@ def register_all() -> None:
             resolve=validated(EvaluateOptions),
             source_files=(*_RUN_FILES, _LIGHT, "edits.json"),
             needs_photographs=lambda _options: True,
+            on_others=lambda options: options.model_copy(update={"all_views": True}),
         )
     )
     register(

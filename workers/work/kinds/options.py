@@ -62,9 +62,16 @@ class ReconstructOptions(ReconstructionConfig):
 
 
 class EvaluateOptions(BaseModel):
-    """Options of ``evaluate``: the held-out views of a finished reconstruction are measured again."""
+    """Options of ``evaluate``: views of a finished reconstruction are measured.
+
+    Attributes:
+        all_views: all photographs, not only those that were held out; so it is with the photographs of
+            another dataset, in the same world, which the job names as 'dataset_id'.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    all_views: bool = False
 
 
 class ExportJobOptions(BaseModel):
@@ -154,6 +161,7 @@ class RelightJobOptions(PictureOptions):
         samples: rays or paths a pixel; None takes 4 rays or 64 paths.
         depth: most surfaces on a path.
         rotation_degrees: turns the light about the vertical.
+        clamp: radiance at which the light of the environments is cut off; None takes all of it.
         spin: turn the light once round from the first image to the last.
         background: behind the scene; None takes that of the reconstruction's evaluation.
     """
@@ -165,6 +173,7 @@ class RelightJobOptions(PictureOptions):
     samples: int | None = Field(None, ge=1, le=4096)
     depth: int = Field(6, ge=1, le=64)
     rotation_degrees: float = Field(0.0, ge=-360, le=360)
+    clamp: float | None = Field(None, gt=0)
     spin: bool = False
     background: Literal["black", "white", "environment"] | None = None
 
