@@ -86,9 +86,9 @@ class MaterialValues(_Given):
     """Values of a material.
 
     Attributes:
-        albedo: base colour, r, g, b from 0 to 1, linear; or a text such as '#ff8000', display values.
-        metallic: from 0 to 1.
-        roughness: from 0 to 1.
+        albedo: base colour: r,g,b from 0 to 1, linear, or a text such as '#ff8000', display values.
+        metallic: 0 is matt or glazed, 1 is metal.
+        roughness: 0 is a mirror, 1 is as rough as can be.
     """
 
     albedo: _Colour | None = None
@@ -101,8 +101,8 @@ class MaterialFactors(_Given):
 
     Attributes:
         albedo: of the linear base colour.
-        metallic: likewise.
-        roughness: likewise.
+        metallic: from 0, below 1 less metallic.
+        roughness: from 0, below 1 smoother.
     """
 
     albedo: _Factor | None = None

@@ -26,9 +26,11 @@ from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
 from service.web.forms import WITHOUT_FORM, options_form
 from service.web.light import light_form
 from service.web.reading import job_counts, job_detail, job_lines, photographs_of
+from service.web.relight import relight_form
 from service.web.results import (
     CONFIG,
     HELD_OUT,
+    LAYERS,
     METRICS,
     REPORT,
     SCENE,
@@ -86,6 +88,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     metrics, config = await asyncio.to_thread(
         lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)]
     )
+    held_out = await asyncio.to_thread(read_names, service.storage, by_name.get(HELD_OUT))
     figures = measured(metrics, artifacts, photographs)
     preview = detail.line.job.preview or {}
     shown = f"images/{preview.get('view')}"
@@ -101,6 +104,8 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         detail=detail,
         measured=figures,
         light=light_form(figures, artifacts, photographs, service.settings) if who.may("write") else None,
+        relight=await relight_form(service, who, artifacts, held_out),
+        layers=LAYERS,
         pictures=[row for row in artifacts if row.name.startswith("views/") and row.name.endswith(".png")][
             :MAX_PICTURES
         ],

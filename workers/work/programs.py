@@ -90,7 +90,8 @@ def evaluate(task: Task) -> None:
         listener=stopping(task.listener, task.should_stop),
     )
     folder = metrics.parent
-    for path in (metrics, folder / REPORT, *sorted((folder / "renders").rglob("*.png"))):
+    pictures = [path for part in ("renders", "layers") for path in sorted((folder / part).rglob("*.png"))]
+    for path in (metrics, folder / REPORT, *pictures):
         _publish(task, path, path.relative_to(folder).as_posix())
 
 
