@@ -212,6 +212,8 @@ _NAMED = {
     REPORT: (_FIGURES, "a browser; one file, to keep or to send"),
     CONFIG: (_RECORDS, "a text editor: every setting of the run"),
     HELD_OUT: (_RECORDS, "a text editor: the photographs that training never saw"),
+    "environment.hdr": (_SCENE, "Blender and whatever takes HDR light: what lit the photographs, all around"),
+    "edits.json": (_RECORDS, "a text editor: what was changed since the training"),
     "views.json": (_RECORDS, "octasplat render and surface, which need no photographs then"),
     "events.jsonl": (_RECORDS, "a text editor: what happened when, a line each"),
     "training.json": (_RECORDS, "a text editor"),

@@ -70,6 +70,7 @@ def test_the_folder_is_a_run_for_every_command(shiny_run, changed, octasplat, tm
     assert octasplat("export", changed, tmp_path / "mesh.glb").exit_code == 0
     done = octasplat("evaluate", changed)
     assert done.exit_code == 0 and (changed / "metrics.json").exists(), done.output
+    assert "scene.ply" in done.output and "mesh.obj" not in done.output  # which the command did not make
     done = octasplat("material", changed, "-o", tmp_path / "again", "--set", "roughness=1")
     assert done.exit_code == 0 and len(json.loads((tmp_path / "again" / "edits.json").read_text())) == 2
 

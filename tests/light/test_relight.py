@@ -91,12 +91,16 @@ def test_a_turned_environment_is_the_map_turned(scene, tmp_path, by, least):
         (("plain.ply", "white.hdr"), "plain.ply has no materials"),
         (("ball.ply", "ball.ply"), "HDR or EXR"),
         (("ball.ply", "missing.hdr"), "missing.hdr"),
+        (("ball.ply", "text.hdr"), "text.hdr: the environment cannot be read"),
+        (("ball.ply", "cut.hdr"), "cut.hdr is damaged"),
         (("ball.ply", "white.hdr", "other/white.exr"), "two environments"),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence(scene, tmp_path, arguments, told):
     (scene / "other").mkdir(exist_ok=True)
     write_environment(scene / "other" / "white.exr", np.full((16, 32, 3), 0.5, np.float32))
+    (scene / "text.hdr").write_text("no picture")
+    (scene / "cut.hdr").write_bytes((scene / "white.hdr").read_bytes()[:-40])
     maps = [part for name in arguments[1:] for part in ("--environment", scene / name)]
     done = relight(scene / arguments[0], *maps, "-o", tmp_path / "out", *SMALL)
     assert done.exit_code == 1
