@@ -343,6 +343,21 @@ const steps = {
         found.refused = await page.textContent("#relight .fault");
         await page.setInputFiles("#relight-file", job.map);
         await page.fill("#relight-rotation_degrees", "90");
+        // The 3D view shows it at once; the learnt light is another.
+        await page.waitForSelector("#viewer[data-ready=yes]");
+        const look = async () => {
+            await page.evaluate(() => scrollTo(0, 0));
+            await page.waitForTimeout(500);
+            return brightness(page);
+        };
+        const looks = [await look()];
+        for (const live of ["this", "learnt", ""]) {
+            await page.selectOption("#relight-live", live);
+            await page.waitForSelector(`#relight[data-live=${live || "none"}]`);
+            looks.push(await look());
+            if (job.every && live) await shot(page, `live_${live}`, false);
+        }
+        found.looks = looks.map(({ mean }) => mean);
         await page.selectOption("#relight-by", job.by);
         if (job.preview) {
             await page.click("#relight [data-do=preview]");

@@ -67,6 +67,8 @@ def test_behind_the_views_in_another_light_and_of_other_stuff(
     assert [address.split("/")[1] for _, address, *_ in found["layers"]][2:4] == ["albedo", "metallic"]
     assert {tuple(size) for _, _, *size in found["layers"]} == {(64, 48)} and found["tag"] == "Indirect light"
 
+    plain, lit, learnt, plain_again = found["looks"]
+    assert plain == plain_again and abs(lit - plain) > 1 and learnt != lit != plain
     assert found["hidden"] and found["refused"] == "Choose a file of light: HDR or EXR."
     relit, film, changed = (service.ask("GET", f"/v1/jobs/{found[k]}") for k in ("first", "second", "third"))
     assert relit["kind"] == film["kind"] == "relight" and relit["source_id"] == film["source_id"] == job

@@ -1,8 +1,9 @@
 // The form of another light on the page of a finished job with materials.
 
 import { SentFiles, fieldValues, holds, plainName, showFields } from "../form_parts.js";
-import { queueJob } from "../options.js";
+import { answer, queueJob } from "../options.js";
 import { Trials, sentences } from "../trial.js";
+import { readHdr } from "../viewer/environment.js";
 
 const PREVIEW = { samples: { "split-sum": 1, path: 4 }, side: 320 };
 const WHAT = {
@@ -56,6 +57,45 @@ async function render(options, button) {
         button.disabled = false;
     }
 }
+
+/** The file of the map that the 3D view is to show. */
+async function liveFile() {
+    const { live, map } = fieldValues(form);
+    if (live === "this" && !map) {
+        const file = form.elements.file.files[0];
+        if (!file) throw new Error("Choose a file of light: HDR.");
+        return file.arrayBuffer();
+    }
+    const path = map.slice(map.indexOf("/") + 1).split("/").map(encodeURIComponent).join("/");
+    const address = live === "learnt" ? section.dataset.learnt : `/v1/datasets/${map.slice(0, map.indexOf("/"))}/files/${path}`;
+    const response = await fetch(address);
+    if (!response.ok) await answer(response);
+    return response.arrayBuffer();
+}
+
+/** Shows the light in the 3D view: all of it, or only that it was turned. */
+async function showLive(anew) {
+    const { live, rotation_degrees } = fieldValues(form);
+    const degrees = live === "this" ? rotation_degrees : 0;
+    trials.complain("");
+    try {
+        const map = !live ? null : anew ? readHdr(await liveFile()) : undefined;
+        viewer.dispatchEvent(new CustomEvent("light", { detail: { map, degrees } }));
+        if (anew) section.dataset.live = live || "none";
+    } catch (error) {
+        form.elements.live.value = "";
+        viewer.dispatchEvent(new CustomEvent("light", { detail: { map: null, degrees: 0 } }));
+        trials.complain(sentences(error));
+    }
+}
+
+const viewer = document.getElementById("viewer");
+const offerLive = () => { form.elements.live.closest(".field").hidden = false; };
+if (viewer?.dataset.materials) offerLive();
+else viewer?.addEventListener("materials", offerLive);
+form.elements.live.addEventListener("change", () => showLive(true));
+for (const name of ["map", "file"]) form.elements[name].addEventListener("change", () => { if (form.elements.live.value === "this") showLive(true); });
+form.elements.rotation_degrees.addEventListener("input", () => { if (form.elements.live.value === "this") showLive(false); });
 
 const show = () => showFields(form, (needs) => holds(needs, fieldValues(form)));
 form.addEventListener("input", show);
