@@ -79,7 +79,6 @@ uniform mat4 cameraWorld, projectionInverse;
 uniform vec3 right, up, forward;   // of the map
 out vec4 shown;
 
-#define SPECULAR ambient
 const float PI = 3.141592653589793;
 
 vec2 placeOf(vec3 d) {
@@ -108,7 +107,7 @@ void main() {
     float cosine = -dot(d, n);
     vec2 ab = texture(table, (vec2(clamp(cosine, 1e-3, 1.0), roughness) * vec2(63.0, 31.0) + 0.5) / vec2(64.0, 32.0)).rg;
     vec3 f0 = 0.04 * (1.0 - metallic) + metallic * albedo;
-    vec3 light = SPECULAR * (f0 * ab.x + ab.y) * lobe(placeOf(d + 2.0 * cosine * n), roughness)
+    vec3 light = ambient * (f0 * ab.x + ab.y) * lobe(placeOf(d + 2.0 * cosine * n), roughness)
         + (1.0 - metallic) * albedo * ambient * texture(irradiance, placeOf(n)).rgb;
     light = clamp(light, 0.0, 1.0);
     vec3 curved = mix(1.055 * pow(max(light, 0.0031308), vec3(1.0 / 2.4)) - 0.055, 12.92 * light, vec3(lessThanEqual(light, vec3(0.0031308))));
