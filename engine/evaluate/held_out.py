@@ -1,4 +1,4 @@
-"""Renders the held-out views, measures them, and writes ``renders/``, ``metrics.json`` and the report."""
+"""Renders the held-out views, measures them, and writes their pictures, ``metrics.json`` and the report."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -10,11 +10,12 @@ import numba
 from engine.colour import composited
 from engine.evaluate.against_truth import TruthMeasures
 from engine.evaluate.gallery import ViewImages, WorstAndBest
-from engine.evaluate.layers import shown_layers
+from engine.evaluate.layers import shown_environment, shown_layers
 from engine.evaluate.report import write_report
 from engine.evaluate.truth import Truth
 from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
 from engine.events import Listener, StageProgress
+from engine.gaussians.materials import ALBEDO
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import EnvironmentMap
 from engine.light.relighting import Relighter
@@ -30,7 +31,7 @@ from engine.writing import write_json
 
 SIDE = 2
 """So many rays across a pixel, and as many down, where a shading model shades; else one at its centre."""
-RENDERS, METRICS, REPORT = "renders", "metrics.json", "report.html"
+RENDERS, LAYERS, METRICS, REPORT = "renders", "layers", "metrics.json", "report.html"
 
 
 def evaluate_held_out(
@@ -54,7 +55,8 @@ def evaluate_held_out(
     Args:
         dataset: photographs and split.
         gaussians: the scene.
-        output: folder that receives ``renders/<name>.png``, ``metrics.json`` and ``report.html``.
+        output: folder that receives ``renders/<name>.png``, ``metrics.json`` and ``report.html``, and where
+            there are materials ``layers/<layer>/<name>.png`` and ``layers/environment.png``.
         settings: where rays end, as in training.
         shading: what the scene was trained with.
         background: ``black`` or ``white``, behind renders and behind photographs with alpha.
@@ -77,8 +79,10 @@ def evaluate_held_out(
     for view, measured in _measured(
         _rendered(dataset, tracer, shading, background, measures), threads or numba.get_num_threads()
     ):
-        path = output / RENDERS / f"{names[view.name]}.png"
-        write_png(path, view.render)
+        write_png(output / RENDERS / f"{names[view.name]}.png", view.render)
+        if ALBEDO in view.layers:
+            for layer, shown in view.layers.items():
+                write_png(output / LAYERS / layer / f"{names[view.name]}.png", shown)
         rows.append(measured.metrics)
         images.offer(
             view.name,
@@ -90,6 +94,8 @@ def evaluate_held_out(
         measures.add_light(dataset, environment, relighter, tell)
     if measures is not None and (measures.rows or measures.light):
         run = {**run, "truth": measures.as_dict()}
+    if environment is not None:
+        write_png(output / LAYERS / "environment.png", shown_environment(environment.radiance_linear))
     metrics = summarise(rows).as_dict(run)
     write_json(output / METRICS, metrics)
     write_report(

@@ -23,6 +23,7 @@ from workers.cli.commands.export import export
 from workers.cli.commands.fsck import fsck
 from workers.cli.commands.import_ import import_
 from workers.cli.commands.info import info
+from workers.cli.commands.material import material
 from workers.cli.commands.merge import merge
 from workers.cli.commands.quota import quota
 from workers.cli.commands.reconstruct import reconstruct
@@ -89,7 +90,7 @@ def cli() -> None:
 
 for _command in (
     reconstruct, evaluate, info, export, import_, render, relight, stage, surface,
-    edit, deform, transform, crop, merge, clean, demo,
+    material, edit, deform, transform, crop, merge, clean, demo,
     serve, worker, token, fsck, quota, *CLIENT_COMMANDS,
 ):  # fmt: skip
     cli.add_command(_command)
