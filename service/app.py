@@ -110,7 +110,9 @@ async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
         listening = asyncio.create_task(hub.run())
         room = RoomMaker(pool, storage)
         try:
-            yield Service(settings, pool, ProcrastinateSlips(), storage, hub, room)
+            yield Service(
+                settings, pool, ProcrastinateSlips(), storage, hub, room, settings.spool(), settings.checks()
+            )
         finally:
             await room.close()
             hub.close()

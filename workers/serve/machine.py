@@ -179,6 +179,8 @@ async def _keep_database(database: EmbeddedPostgres | None) -> None:
             await asyncio.to_thread(database.start)
         except OctasplatError as error:
             logger.error("%s", error)
+        except Exception:
+            logger.exception("the database could not be started and is tried again")
 
 
 @contextlib.contextmanager

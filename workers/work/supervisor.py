@@ -208,9 +208,7 @@ class Supervisor:
             await self._verdicts.fail({"type": "time_limit", "message": message})
         elif end is End.DISK:
             taken, most = self._workspace.most_taken_bytes(), self._settings.max_workspace_bytes
-            message = (
-                f"The job's folder took {taken} bytes, and {most} are allowed; ask for fewer or smaller images."
-            )
+            message = f"The job's folder took {taken} bytes, and {most} are allowed; ask for fewer images."
             await self._verdicts.fail({"type": "disk_limit", "message": message})
         elif end is End.ROOM:
             taken = self._workspace.most_taken_bytes()
@@ -239,7 +237,7 @@ class Supervisor:
             how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
             last = f" Its last words: {child.last_words[-1]}" if child.last_words else ""
             message = f"The job's program ended {how}.{last}"
-            self._around.host.crashed(self._job.id)
+            self._around.host.crashed(self._job.id, self._job.owner)
             await self._verdicts.lose({"type": "crashed", "message": message})
 
     async def _wait_for_child(self, child: ChildProcess) -> int:
