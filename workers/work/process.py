@@ -23,6 +23,7 @@ from engine.files import writable_formats
 from engine.threads import available_threads
 from workers.parent import die_with_server
 from workers.queue.attempts import Fenced, claim
+from workers.queue.fairness import choose
 from workers.queue.limits import end_abandoned
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.queue.rescue import rescue_lost_jobs
@@ -30,13 +31,13 @@ from workers.records.database import Pool, open_pool
 from workers.records.ids import new_id
 from workers.records.migrate import migrate
 from workers.records.workers import forget_lost_workers, forget_worker, see_worker
-from workers.settings import WorkerSettings
+from workers.settings import WorkerSettings, worker_connections
 from workers.store.errors import StorageError
 from workers.store.local import LocalStorage
 from workers.store.opening import open_storage
 from workers.store.room import Room
 from workers.upkeep.collecting import collect
-from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries
+from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries, thin_progress
 from workers.upkeep.webhooks.outbox import forget_old
 from workers.upkeep.webhooks.sending import Sender
 from workers.work.chores import Chore, ChoreFailed, keep_doing
@@ -52,6 +53,7 @@ logger = logging.getLogger(__name__)
 
 SWEEP_SECONDS = 60.0
 STORE_SWEEP_SECONDS = 3600.0
+THIN_SECONDS = 600.0
 ABANDONED_SECONDS = 86_400.0
 ROOM_LOOK_SECONDS = 5.0
 EXIT_LOST_DATABASE = 69
@@ -104,7 +106,9 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         kind_modules=settings.kind_modules, rest_seconds=settings.recover_seconds,
     )  # fmt: skip
     slots = sum(queues.values())
-    async with open_pool(conninfo, max_size=6 + 4 * slots, wait_seconds=settings.stale_seconds) as pool:
+    async with open_pool(
+        conninfo, max_size=worker_connections(queues), wait_seconds=settings.stale_seconds
+    ) as pool:
         worker = _Worker(
             settings,
             pool,
@@ -157,6 +161,7 @@ class _Worker:
                 Chore(self._sweep_store, STORE_SWEEP_SECONDS),
                 Chore(self._send_webhooks, settings.poll_seconds),
                 Chore(self._forget, SWEEP_SECONDS),
+                Chore(self._thin, THIN_SECONDS),
                 Chore(self._collect, settings.collect_seconds),
                 Chore(self._openings.keep, ROOM_LOOK_SECONDS),
             )
@@ -222,8 +227,10 @@ class _Worker:
         if self._around.host.ailing is not None:
             await self._refuse(job_id, slip)
             return
-        if not await self._openings.come(job_id, slip):
+        chosen = await choose(self._pool, self._around.slips, job_id, slip)
+        if chosen is None or not await self._openings.come(*chosen):
             return
+        job_id, slip = chosen
         since = time.monotonic()
         attempt = await claim(self._pool, job_id, slip, self._name)
         if attempt is None:
@@ -300,6 +307,10 @@ class _Worker:
             hours=self._settings.absent_queue_hours,
         ):
             logger.warning("job %s waited too long in a queue that no worker takes", job_id)
+
+    async def _thin(self) -> None:
+        async with self._pool.connection() as connection:
+            await thin_progress(connection)
 
     async def _collect(self) -> None:
         try:
