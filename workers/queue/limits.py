@@ -7,7 +7,7 @@ from psycopg.rows import class_row
 from workers.queue.attempts import end_job
 from workers.queue.jobs import get_job
 from workers.queue.port import Slips
-from workers.records.database import Connection, Pool
+from workers.records.database import Connection, Pool, naming
 from workers.records.rows import TERMINAL, Job
 
 
@@ -42,8 +42,10 @@ async def end_abandoned(pool: Pool, slips: Slips, *, stale_seconds: float, hours
         return []
     async with pool.connection() as connection, connection.cursor(row_factory=class_row(Job)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM jobs WHERE state = 'queued' AND queued_at < now() - make_interval(secs => %(limit)s)
+            naming(
+                """
+            SELECT {} FROM jobs WHERE state = 'queued'
+              AND queued_at < now() - make_interval(secs => %(limit)s)
               AND NOT EXISTS (
                 SELECT 1 FROM workers WHERE jobs.queue = ANY(workers.queues)
                   AND seen_at > now() - make_interval(secs => %(stale)s))
@@ -52,6 +54,8 @@ async def end_abandoned(pool: Pool, slips: Slips, *, stale_seconds: float, hours
                   AND others.heartbeat_at > now() - make_interval(secs => %(limit)s))
             ORDER BY id LIMIT 1000
             """,
+                Job,
+            ),
             {"limit": 3600 * hours, "stale": stale_seconds},
         )
         found = await cursor.fetchall()

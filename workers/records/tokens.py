@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from psycopg.rows import class_row
 
-from workers.records.database import Connection
+from workers.records.database import Connection, naming
 from workers.records.ids import new_id
 from workers.records.rows import Token
 
@@ -38,12 +38,15 @@ async def add_token(
         raise ValueError(f"scopes are {', '.join(SCOPES)}, not {', '.join(sorted(unknown)) or 'none'}")
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
         await cursor.execute(
-            """
+            naming(
+                """
             INSERT INTO tokens (id, owner, name, sha256, scopes) VALUES (%s, %s, %s, %s, %s)
             ON CONFLICT (sha256) DO UPDATE
             SET owner = excluded.owner, name = excluded.name, scopes = excluded.scopes, revoked_at = NULL
-            RETURNING *
+            RETURNING {}
             """,
+                Token,
+            ),
             [new_id(), owner, name, hash_secret(secret), list(scopes)],
         )
         token = await cursor.fetchone()
@@ -55,10 +58,13 @@ async def find_token(connection: Connection, secret: str) -> Token | None:
     """The valid token of that secret, or None."""
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM tokens WHERE sha256 = %s AND revoked_at IS NULL
+            naming(
+                """
+            SELECT {} FROM tokens WHERE sha256 = %s AND revoked_at IS NULL
               AND (expires_at IS NULL OR expires_at > now())
             """,
+                Token,
+            ),
             [hash_secret(secret)],
         )
         return await cursor.fetchone()
@@ -67,7 +73,7 @@ async def find_token(connection: Connection, secret: str) -> Token | None:
 async def list_tokens(connection: Connection) -> list[Token]:
     """All tokens, the newest first."""
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
-        await cursor.execute("SELECT * FROM tokens ORDER BY id DESC")
+        await cursor.execute(naming("SELECT {} FROM tokens ORDER BY id DESC", Token))
         return await cursor.fetchall()
 
 
