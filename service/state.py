@@ -6,6 +6,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from service.guesses import Guesses
 from service.hub import EventHub
 from service.making_room import RoomMaker
 from service.metrics import Metrics
@@ -26,8 +27,9 @@ class Service:
         storage: the store.
         hub: tells of events.
         room: makes room in the store.
+        guesses: counts wrong tokens.
         metrics: counts what this process does.
-        has_tokens: whether anybody has a token, as of ``tokens_seen``.
+        has_tokens: whether anybody ever had a token, as of ``tokens_seen``.
         tokens_seen: monotonic time.
         draining: whether it is about to stop.
         started: monotonic time.
@@ -39,6 +41,7 @@ class Service:
     storage: Storage
     hub: EventHub
     room: RoomMaker
+    guesses: Guesses
     metrics: Metrics = field(default_factory=Metrics)
     has_tokens: bool = True
     tokens_seen: float = -1e9

@@ -75,6 +75,7 @@ class WorkerSettings(BaseSettings):
         keep_open_datasets_hours: the same for datasets that were never committed.
         keep_unused_hours: contents of the store that nothing names are removed after this time; at once, but
             for what is being stored, where room is short.
+        keep_audit_hours: how long it is kept who asked for what; 0 keeps it for ever.
         collect_seconds: how often they are looked for.
     """
 
@@ -105,6 +106,7 @@ class WorkerSettings(BaseSettings):
     keep_datasets_hours: float = Field(0.0, ge=0)
     keep_open_datasets_hours: float = Field(720.0, ge=0)
     keep_unused_hours: float = Field(24.0, gt=0)
+    keep_audit_hours: float = Field(8760.0, ge=0)
     collect_seconds: float = Field(3600.0, gt=0)
 
     @property

@@ -25,9 +25,11 @@ from workers.queue.jobs import get_job, queue_again
 from workers.queue.limits import end_abandoned
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.queue.rescue import rescue_lost_jobs
+from workers.records.audit import forget_old_entries
 from workers.records.database import Pool, open_pool
 from workers.records.ids import new_id
 from workers.records.migrate import migrate
+from workers.records.sessions import forget_old_sessions
 from workers.records.workers import forget_lost_workers, forget_worker, see_worker
 from workers.settings import WorkerSettings
 from workers.store.errors import StorageError
@@ -294,6 +296,8 @@ class _Worker:
             await forget_expired(connection)
             await forget_old(connection)
             await forget_old_keys(connection)
+            await forget_old_sessions(connection)
+            await forget_old_entries(connection, self._settings.keep_audit_hours)
         for job_id in await end_abandoned(
             self._pool,
             self._around.slips,
