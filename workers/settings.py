@@ -16,6 +16,8 @@ from workers.postgres.embedded import EmbeddedPostgres
 PREFIX = "OCTASPLAT_"
 ADDRESS_FILE = "serve.json"
 """In the data folder while ``octasplat serve`` runs: where the service is."""
+TOKEN_FILE = "token"  # noqa: S105 - a name
+"""In the data folder: the token that ``octasplat serve`` made for itself, readable by its user only."""
 
 
 S = TypeVar("S", bound="WorkerSettings")

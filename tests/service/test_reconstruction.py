@@ -44,7 +44,7 @@ class Machine:
 
     @property
     def api(self) -> Api:
-        return Api(json.loads((self.data / "serve.json").read_text())["url"])
+        return Api.local(self.data)
 
     def children(self, word: str) -> list[psutil.Process]:
         """Processes below whose command holds ``word``."""
@@ -121,7 +121,7 @@ def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None
     """The log tells what was done, also by lost attempts, and nothing names a path of the machine."""
     environment = {
         **os.environ,
-        "OCTASPLAT_SERVER": json.loads((machine.data / "serve.json").read_text())["url"],
+        "OCTASPLAT_DATA": str(machine.data),
     }
 
     def command(*arguments: str) -> str:

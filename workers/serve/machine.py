@@ -17,7 +17,8 @@ from engine.writing import write_json
 from workers.postgres.embedded import EmbeddedPostgres
 from workers.records.migrate import migrate
 from workers.serve.children import KeptChild
-from workers.settings import ADDRESS_FILE, PREFIX, WorkerSettings
+from workers.serve.own_token import keep_own_token
+from workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings
 
 logger = logging.getLogger(__name__)
 
@@ -63,6 +64,7 @@ async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -
                 await asyncio.to_thread(database.start) if database is not None else settings.conninfo()
             )
             await asyncio.to_thread(migrate, conninfo)
+            await keep_own_token(conninfo, settings.data / TOKEN_FILE)
             return await _run(plan, database, conninfo, address_file, on_ready)
         finally:
             address_file.unlink(missing_ok=True)

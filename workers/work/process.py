@@ -28,7 +28,7 @@ from workers.queue.rescue import rescue_lost_jobs
 from workers.records.audit import forget_old_entries
 from workers.records.database import Pool, open_pool
 from workers.records.ids import new_id
-from workers.records.migrate import migrate
+from workers.records.migrate import wait_for_tables
 from workers.records.sessions import forget_old_sessions
 from workers.records.workers import forget_lost_workers, forget_worker, see_worker
 from workers.settings import WorkerSettings
@@ -90,7 +90,7 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
     for module in settings.kind_modules:
         importlib.import_module(module)
     conninfo = settings.conninfo()
-    await asyncio.to_thread(migrate, conninfo)
+    await asyncio.to_thread(wait_for_tables, conninfo)
     floor_bytes = settings.floor_bytes // 4  # the rest of it is for what jobs under way have to store
     storage = await asyncio.to_thread(lambda: open_storage(settings.storage_address, floor_bytes=floor_bytes))
     room = Room(storage, settings.work_folder, settings.floor_bytes, settings.floor_bytes - floor_bytes)
