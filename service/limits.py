@@ -63,7 +63,7 @@ def ceilings_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]
     numbers = [
         demand
         for demand in kind.demands(options, ())
-        if demand.of not in ("exports", "render_pixels", "render_paths")
+        if demand.of not in ("exports", "render_pixels", "render_paths", "workspace_bytes")
     ]
     return {
         demand.path: settings.ceilings[demand.of] for demand in numbers if demand.path != "train.patch_side"

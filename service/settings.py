@@ -34,7 +34,6 @@ class ServiceSettings(WorkerSettings):
         max_upload_bytes: length of one uploaded file.
         max_archive_bytes: length of an uploaded archive.
         max_body_bytes: length of any other request.
-        quota_bytes: contents that an owner may store, unless ``octasplat quota`` says otherwise.
         quota_datasets: datasets that an owner may have.
         quota_jobs: jobs of an owner that may be queued or running.
         max_iterations: ceiling of the iterations of a training.
@@ -62,7 +61,6 @@ class ServiceSettings(WorkerSettings):
     max_upload_bytes: int = Field(4 << 30, gt=0)
     max_archive_bytes: int = Field(64 << 30, gt=0)
     max_body_bytes: int = Field(1 << 20, gt=0)
-    quota_bytes: int | None = Field(None, ge=0)
     quota_datasets: int | None = Field(None, ge=0)
     quota_jobs: int | None = Field(None, ge=0)
     max_iterations: int = Field(100_000, ge=1)
@@ -95,7 +93,8 @@ class ServiceSettings(WorkerSettings):
     @property
     def ceilings(self) -> dict[str, int]:
         """By the names of :data:`workers.work.kinds.demands.CEILINGS`."""
-        return {name: getattr(self, f"max_{name}") for name in CEILINGS}
+        found = {name: getattr(self, f"max_{name}") for name in CEILINGS}
+        return found if self.max_workspace_bytes else {**found, "workspace_bytes": 1 << 62}
 
     def upload_limits(self) -> UploadLimits:
         """What the intake takes."""

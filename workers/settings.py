@@ -64,6 +64,12 @@ class WorkerSettings(BaseSettings):
         grace_seconds: how long a program may take to write its checkpoint when its worker has to stop.
         memory_limit_bytes: a job's program that needs more is stopped; None gives each job of a worker its
             share of the machine's memory, 0 sets no limit.
+        max_workspace_bytes: a job whose folder takes more on the worker's disk fails, and one that is sure to
+            is not accepted; 0 sets no limit.
+        full_disk_seconds: a job that filled a disk itself is tried again after this time, after four times as
+            long the second time, and so on.
+        recover_seconds: how often a worker that takes no jobs, as its machine ails, looks at it again.
+        quota_bytes: contents that an owner may store, unless ``octasplat quota`` says otherwise.
         max_job_hours: a job whose program has run for so long, over all of its attempts, is ended with what
             it has finished; 0 sets no limit.
         absent_queue_hours: a job that waits so long in a queue that no worker takes fails; 0 lets it wait.
@@ -97,6 +103,10 @@ class WorkerSettings(BaseSettings):
     silent_seconds: float = Field(600.0, gt=0)
     grace_seconds: float = Field(30.0, gt=0)
     memory_limit_bytes: int | None = Field(None, ge=0)
+    max_workspace_bytes: int = Field(64 << 30, ge=0)
+    full_disk_seconds: float = Field(60.0, ge=0)
+    recover_seconds: float = Field(30.0, gt=0)
+    quota_bytes: int | None = Field(None, ge=0)
     max_job_hours: float = Field(48.0, ge=0)
     absent_queue_hours: float = Field(72.0, ge=0)
     threads: int = Field(0, ge=0)

@@ -216,7 +216,15 @@ async def retry_job(
         return await _existing(connection, job_id)
 
 
-async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_slip: bool = False) -> None:
+async def queue_again(
+    connection: Connection,
+    slips: Slips,
+    job: Job,
+    *,
+    keep_slip: bool = False,
+    wait_seconds: float = 0.0,
+    quiet: bool = False,
+) -> None:
     """Put a job back into its queue with a new slip; the caller holds the job's lock.
 
     A job that has a slip, as it was interrupted or not even begun, keeps its place: it goes before all that
@@ -227,10 +235,17 @@ async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_sl
         slips: the queue.
         job: which.
         keep_slip: the old slip is being delivered and goes by itself when that ends.
+        wait_seconds: for how long it is not taken up.
+        quiet: it never ceased to be queued, so that nobody needs to hear of it.
     """
     if job.slip is not None and not keep_slip:
         await slips.remove(connection, job.slip)
-    slip = await slips.put(connection, job.id, job.queue, job.priority, place_of=job.slip)
+    slip = await slips.put(
+        connection, job.id, job.queue, job.priority, place_of=job.slip, wait_seconds=wait_seconds
+    )
+    if quiet:
+        await connection.execute("UPDATE jobs SET slip = %s WHERE id = %s", [slip, job.id])
+        return
     await connection.execute(
         """
         UPDATE jobs SET state = 'queued', slip = %s, queued_at = now(), worker = NULL, seconds_left = NULL

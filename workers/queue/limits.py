@@ -1,6 +1,8 @@
-"""Ends of jobs that no worker brings about: how long they have run, and queues that nobody takes."""
+"""Ends of jobs before their work: how long they have run, queues that nobody takes, hosts too small."""
 
 import uuid
+from collections.abc import Mapping
+from typing import Any
 
 from psycopg.rows import class_row
 
@@ -74,3 +76,15 @@ async def end_abandoned(pool: Pool, slips: Slips, *, stale_seconds: float, hours
             await end_job(connection, now, "failed", {"type": "no_worker", "message": message})
             ended.append(job.id)
     return ended
+
+
+async def fail_unbegun(
+    connection: Connection, job_id: uuid.UUID, slip: int, error: Mapping[str, Any]
+) -> bool:
+    """Fail a job whose slip is being delivered, before any attempt; False if it has gone on without it."""
+    async with connection.transaction():
+        job = await get_job(connection, job_id, lock=True)
+        if job is None or job.state != "queued" or job.slip != slip:
+            return False
+        await end_job(connection, job, "failed", error)
+    return True

@@ -36,6 +36,7 @@ class Slips(Protocol):
         priority: int,
         *,
         place_of: int | None = None,
+        wait_seconds: float = 0.0,
     ) -> int:
         """Queue a slip for a job within the transaction of ``connection``.
 
@@ -46,6 +47,7 @@ class Slips(Protocol):
             priority: higher goes first; where it is the same, the smaller number does.
             place_of: an earlier slip of the job whose place in the queue the new one takes: before all that
                 were queued after it. None queues it last.
+            wait_seconds: with ``place_of``, for how long others go before it all the same.
 
         Returns:
             The slip's number, which no slip of this job had.
@@ -62,6 +64,10 @@ class Slips(Protocol):
 
     async def work(self, queue: str, concurrency: int, deliver: Deliver) -> None:
         """Deliver slips until :meth:`stop` is called or the database is lost; returns when all are done."""
+        ...
+
+    def pause(self) -> None:
+        """Deliver no more slips until :meth:`work` is called again."""
         ...
 
     def stop(self) -> None:

@@ -53,10 +53,11 @@ class ProcrastinateSlips:
         priority: int,
         *,
         place_of: int | None = None,
+        wait_seconds: float = 0.0,
     ) -> int:
         """Queue a slip; see the port."""
         if place_of is not None:
-            return await _put_back(connection, job_id, queue, priority, place_of)
+            return await _put_back(connection, job_id, queue, priority, place_of, wait_seconds)
         job = procrastinate.jobs.Job(
             queue=queue,
             priority=priority,
@@ -124,20 +125,32 @@ class ProcrastinateSlips:
     def stop(self) -> None:
         """Deliver no more; see the port."""
         self._stopped = True
+        self.pause()
+
+    def pause(self) -> None:
+        """Deliver no more for now; see the port."""
         for worker in self._workers:
             worker.stop()  # type: ignore[no-untyped-call]
 
 
 async def _put_back(
-    connection: Connection, job_id: uuid.UUID, queue: str, priority: int, place_of: int
+    connection: Connection, job_id: uuid.UUID, queue: str, priority: int, place_of: int, wait_seconds: float
 ) -> int:
     """Queue a slip in the place of an earlier one; Procrastinate's own way numbers them all anew."""
     cursor = await connection.execute(
         """
-        INSERT INTO procrastinate_jobs (id, queue_name, task_name, priority, args)
-        VALUES (%s, %s, %s, %s, jsonb_build_object('job_id', %s::text)) RETURNING id
+        INSERT INTO procrastinate_jobs (id, queue_name, task_name, priority, args, scheduled_at)
+        VALUES (%(id)s, %(queue)s, %(task)s, %(priority)s, jsonb_build_object('job_id', %(job)s::text),
+            CASE WHEN %(wait)s > 0 THEN now() + make_interval(secs => %(wait)s) END) RETURNING id
         """,
-        [returned_number(place_of), queue, TASK, priority, str(job_id)],
+        {
+            "id": returned_number(place_of),
+            "queue": queue,
+            "task": TASK,
+            "priority": priority,
+            "job": str(job_id),
+            "wait": wait_seconds,
+        },
     )
     row = await cursor.fetchone()
     assert row is not None

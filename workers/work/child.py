@@ -67,6 +67,8 @@ def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
             importlib.import_module(module)
         module_name, _, function = given["program"].partition(":")
         program = getattr(importlib.import_module(module_name), function)
+        if given.get("probe"):
+            return 0
         # After all imports, as pycolmap takes SIGTERM for itself.
         signal.signal(signal.SIGTERM, lambda _number, _frame: stop.set())
         lines.write({"kind": "ready"})
@@ -92,6 +94,8 @@ def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
         lines.write({"kind": "error", "type": "out_of_memory", "message": "The job ran out of memory."})
         return EXIT_REFUSED
     except Exception as error:  # noqa: BLE001 - told to the worker, which tells the user
+        if given.get("probe"):
+            sys.stderr.write(f"{type(error).__name__}: {error}\n")
         kind = NO_SPACE if lacks_room(error) else "unexpected"
         message = f"{type(error).__name__}: {error}"
         cause = "".join(traceback.format_exception(error)).splitlines()[-MAX_CAUSE_LINES:]

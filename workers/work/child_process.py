@@ -62,6 +62,7 @@ class ChildProcess:
         self.last_heard = time.monotonic()
         self.last_words: deque[str] = deque(maxlen=LAST_WORDS)
         self.error: dict[str, Any] | None = None
+        self.is_ready = False
         assert process.stdout is not None and process.stderr is not None
         self._readers = (
             asyncio.create_task(self._read(process.stdout, self._hear)),
@@ -155,6 +156,8 @@ class ChildProcess:
             return
         if not isinstance(event, dict) or not isinstance(event.get("kind"), str):
             return
+        if event["kind"] == "ready":
+            self.is_ready = True
         if event["kind"] == "error":
             self.error = {"type": str(event.get("type")), "message": str(event.get("message"))}
         self._on_event(event)

@@ -18,6 +18,7 @@ from engine.render.kept import RECORD
 from workers.queue.attempts import Result
 from workers.records.rows import Artifact, DatasetFile, Job
 from workers.store.errors import StorageError
+from workers.store.os_errors import told
 from workers.store.protocol import Storage
 from workers.store.trees import Manifest, TreeFile, fetch_tree, publish_manifest, read_manifest, store_tree
 from workers.work.media_types import media_type
@@ -86,12 +87,18 @@ class Workspace:
         self._lock: IO[bytes] | None = None
         self._dataset_lock: IO[bytes] | None = None
         self._frames: dict[str, TreeFile] = {}
+        self._most_taken = 0
 
     def open(self) -> None:
-        """Make the folder, anew if there is one of that name."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-        self.folder.mkdir(parents=True, mode=0o700)
-        self._lock = _locked(self.folder / _LOCK)
+        """Make the folder, anew if there is one of that name.
+
+        Raises:
+            StorageError: it cannot be made.
+        """
+        with told(self._root):
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self.folder.mkdir(parents=True, mode=0o700)
+            self._lock = _locked(self.folder / _LOCK)
 
     def close(self) -> None:
         """Remove the folder."""
@@ -102,6 +109,25 @@ class Workspace:
         if self._dataset_lock is not None:
             self._dataset_lock.close()
             self._dataset_lock = None
+
+    def taken_bytes(self) -> int:
+        """What the folder takes on its disk, without what it shares with the store."""
+        blocks: dict[int, int] = {}
+        for folder, names, files in os.walk(self.folder):
+            if Path(folder) == self.folder and FILES in names:
+                names.remove(FILES)
+            for name in files:
+                with contextlib.suppress(FileNotFoundError):
+                    facts = os.lstat(os.path.join(folder, name))  # noqa: PTH118 - thousands of them, each second
+                    blocks[facts.st_ino] = facts.st_blocks
+        taken = 512 * sum(blocks.values())
+        self._most_taken = max(taken, self._most_taken)
+        return taken
+
+    def most_taken_bytes(self) -> int:
+        """The most that the folder was found to take."""
+        self.taken_bytes()
+        return self._most_taken
 
     def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
         """A folder with the photographs for all attempts on this machine; its files must not be changed."""
