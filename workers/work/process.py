@@ -41,6 +41,7 @@ from workers.upkeep.webhooks.outbox import forget_old
 from workers.upkeep.webhooks.sending import send_due
 from workers.work.chores import Chore, ChoreFailed, keep_doing
 from workers.work.contact import DATABASE_ERRORS
+from workers.work.fitness import announced, unfit
 from workers.work.host import Host
 from workers.work.memory import memory_limit_bytes
 from workers.work.openings import Openings, put_off
@@ -54,6 +55,8 @@ SWEEP_SECONDS = 60.0
 STORE_SWEEP_SECONDS = 3600.0
 ABANDONED_SECONDS = 86_400.0
 ROOM_LOOK_SECONDS = 5.0
+LEFT_POLLS = 3
+"""A job that is left to workers of another version is kept from all for so many looks at the queue."""
 EXIT_LOST_DATABASE = 69
 
 
@@ -137,6 +140,7 @@ class _Worker:
         self._id = new_id()
         self._lost = False
         self._openings = Openings(name, pool, around)
+        self._left: dict[uuid.UUID, str] = {}
 
     async def run(self) -> int:
         loop = asyncio.get_running_loop()
@@ -217,6 +221,13 @@ class _Worker:
         if self._around.host.ailing is not None:
             await self._refuse(job_id, slip)
             return
+        if (why := await unfit(self._pool, job_id, self._settings.stale_seconds)) is not None:
+            if job_id not in self._left:
+                logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
+                self._left[job_id] = why
+            wait_seconds = LEFT_POLLS * self._settings.poll_seconds
+            await put_off(self._pool, self._around.slips, job_id, slip, wait_seconds)
+            return
         if not await self._openings.come(job_id, slip):
             return
         since = time.monotonic()
@@ -271,6 +282,7 @@ class _Worker:
             "memory_free_bytes": memory.available,
             "memory_limit_bytes": self._around.memory_limit_bytes,
             "ailing": self._around.host.ailing,
+            **announced(),
         }
 
     async def _rescue(self) -> None:

@@ -10,6 +10,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
+from engine import versions
 from engine.errors import ConfigError, OctasplatError
 from workers.queue.attempts import Attempt, Fenced
 from workers.queue.jobs import artifacts_of
@@ -177,6 +178,12 @@ class Supervisor:
         }
 
     async def _restore(self, checkpoint: Checkpoint) -> None:
+        if checkpoint.results != versions.RESULTS:
+            self._reporter.note(
+                "Warning: the checkpoint is of a version in which the same settings gave other results, so "
+                "the job begins anew."
+            )
+            return
         try:
             await asyncio.to_thread(self._workspace.restore, checkpoint)
         except (BlobMissing, DigestMismatch) as error:
@@ -209,7 +216,8 @@ class Supervisor:
         elif end is End.DISK:
             taken, most = self._workspace.most_taken_bytes(), self._settings.max_workspace_bytes
             message = (
-                f"The job's folder took {taken} bytes, and {most} are allowed; ask for fewer or smaller images."
+                f"The job's folder took {taken} bytes, and {most} are allowed; ask for fewer or smaller "
+                "images."
             )
             await self._verdicts.fail({"type": "disk_limit", "message": message})
         elif end is End.ROOM:
