@@ -239,8 +239,9 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
                 "lit",
                 "--wait",
             )
-            command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit", "--server", api.address)
-            lit = CliRunner().invoke(cli, [str(word) for word in command])
+            command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit")
+            environment = {"OCTASPLAT_DATA": str(machine.data)}
+            lit = CliRunner(env=environment).invoke(cli, [str(word) for word in command])
             assert lit.exit_code == 0 and "Rendered 1 image in" in lit.output, lit.output
             assert (tmp_path / "lit" / "views" / "view_000.png").is_file()
             with pytest.raises(ServiceError, match="no result nothing"):
