@@ -116,7 +116,17 @@ async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
         room = RoomMaker(pool, storage)
         try:
             guesses = Guesses(settings.wrong_token_seconds)
-            yield Service(settings, pool, ProcrastinateSlips(), storage, hub, room, guesses)
+            yield Service(
+                settings,
+                pool,
+                ProcrastinateSlips(),
+                storage,
+                hub,
+                room,
+                guesses,
+                settings.spool(),
+                settings.checks(),
+            )
         finally:
             await room.close()
             hub.close()

@@ -6,7 +6,11 @@ from pydantic import Field, IPvAnyNetwork, SecretStr
 
 from engine.errors import ConfigError
 from service.forwarding import Dialect
+from service.gate import Gate
+from service.intake.dataset import DatasetLimits
+from service.intake.model_check import ModelLimits
 from service.intake.receive import UploadLimits
+from service.intake.spool import Spool
 from workers.records.quotas import Quota
 from workers.settings import PREFIX, WorkerSettings
 from workers.work.kinds.demands import CEILINGS
@@ -33,6 +37,9 @@ class ServiceSettings(WorkerSettings):
         allowed_hosts: further names under which the service is reached while it listens at this machine only.
         max_upload_bytes: length of one uploaded file.
         max_archive_bytes: length of an uploaded archive.
+        max_spool_bytes: of all archives that are being read, on this machine's disk.
+        max_checks: datasets that are checked at once.
+        max_waiting_checks: requests that wait for their dataset to be checked; further ones are refused.
         max_body_bytes: length of any other request.
         quota_datasets: datasets that an owner may have.
         quota_jobs: jobs of an owner that may be queued or running.
@@ -60,6 +67,9 @@ class ServiceSettings(WorkerSettings):
     allowed_hosts: tuple[str, ...] = ()
     max_upload_bytes: int = Field(4 << 30, gt=0)
     max_archive_bytes: int = Field(64 << 30, gt=0)
+    max_spool_bytes: int = Field(64 << 30, gt=0)
+    max_checks: int = Field(2, gt=0)
+    max_waiting_checks: int = Field(24, ge=0)
     max_body_bytes: int = Field(1 << 20, gt=0)
     quota_datasets: int | None = Field(None, ge=0)
     quota_jobs: int | None = Field(None, ge=0)
@@ -99,6 +109,22 @@ class ServiceSettings(WorkerSettings):
     def upload_limits(self) -> UploadLimits:
         """What the intake takes."""
         return UploadLimits(max_file_bytes=self.max_upload_bytes, max_archive_bytes=self.max_archive_bytes)
+
+    def dataset_limits(self) -> DatasetLimits:
+        """What the check of a dataset may take, and see."""
+        return DatasetLimits(model=ModelLimits(hidden=self.own_folders))
+
+    def spool(self) -> Spool:
+        """Room for archives."""
+        folder = self.work_folder / "archives"
+        return Spool(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
+
+    def checks(self) -> Gate:
+        """Lets in those whose datasets are checked; half of the places are there for other owners."""
+        most = self.max_checks + self.max_waiting_checks
+        return Gate(
+            "datasets", at_once=self.max_checks, waiting=self.max_waiting_checks, of_one_owner=-(-most // 2)
+        )
 
     def check_public(self, has_token: bool) -> None:
         """Refuse to be reached from elsewhere by everybody.

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, TypeVar
+from urllib.parse import urlsplit
 
 import platformdirs
 from pydantic import AliasChoices, Field, SecretStr, ValidationError
@@ -130,6 +131,13 @@ class WorkerSettings(BaseSettings):
     def work_folder(self) -> Path:
         """Where work under way lies."""
         return (self.work or self.data / "work").absolute()
+
+    @property
+    def own_folders(self) -> tuple[Path, ...]:
+        """Folders that only the service itself may open: its data, its store and the work under way."""
+        address = urlsplit(self.storage_address)
+        store = (Path(address.path).absolute(),) if address.scheme in ("", "file") else ()
+        return (self.data.absolute(), self.work_folder, *store)
 
     @property
     def retention(self) -> Retention:

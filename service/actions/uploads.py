@@ -164,7 +164,7 @@ async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, u
         return receive_archive(
             service.storage,
             upload.body,
-            service.settings.work_folder / "archives",
+            service.spool,
             sha256=upload.sha256,
             size_bytes=upload.size_bytes,
             limits=service.settings.upload_limits(),

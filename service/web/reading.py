@@ -1,6 +1,5 @@
 """What the pages show of jobs, gathered from the tables and the store."""
 
-import asyncio
 import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from service.actions.parts import Part
 from service.auth import Principal
 from service.schemas.jobs import JobView
 from service.state import Service
+from service.threads import Threads, in_thread
 from service.web.results import METRICS, mean_psnr, read_json
 from service.web.templating import short_id
 from workers.queue import jobs as rows
@@ -152,8 +152,9 @@ async def _lines(service: Service, connection: Connection, jobs: Sequence[Job]) 
     counts = await _gaussian_counts(connection, ids)
     metrics = await _artifacts(connection, ids, METRICS)
     renders = await _artifacts(connection, ids, "renders/%.png")
-    contents = await asyncio.to_thread(
-        lambda: {job_id: read_json(service.storage, row) for job_id, row in metrics.items()}
+    contents = await in_thread(
+        Threads.DOWNLOADS,
+        lambda: {job_id: read_json(service.storage, row) for job_id, row in metrics.items()},
     )
     lines = []
     for job in jobs:

@@ -13,6 +13,9 @@ from workers.work.kinds import JobKind, register
 from workers.work.kinds.table import validated
 from workers.work.task import Task
 
+if Path(os.environ.get("XDG_CACHE_HOME", "/nowhere"), "broken").exists():
+    raise ImportError("a library is broken on this machine")
+
 
 class ToyOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")

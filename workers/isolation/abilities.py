@@ -31,7 +31,7 @@ def tell_what_lacks() -> None:
     lacking = [subject.replace("_", " ") for subject, means in abilities().items() if means is None]
     if lacking:
         logger.warning(
-            "the kernel does not take part in isolating the programs of jobs from: %s; whoever sends photographs "
-            "should be trusted, or jobs be run in containers of their own",
+            "nothing keeps the programs of jobs from these here: %s; the kernel takes no part in it, so "
+            "trust whoever sends photographs, or run workers in containers",
             ", ".join(lacking),
         )

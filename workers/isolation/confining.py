@@ -24,7 +24,7 @@ MOST_PROCESSES = 256
 """Of one job; its programs start one or two others, such as ffmpeg."""
 _MOST_THREADS = 4096
 _MEMORY_BEYOND = 4 << 30
-"""The worker stops a program that needs more memory than it may; this ends what grows faster than it looks."""
+"""The worker stops a program that needs more memory than it may; this ends what grows too fast for it."""
 _CAPSET = {"x86_64": 126, "aarch64": 91}
 _CAPABILITY_VERSION = 0x20080522
 
@@ -92,7 +92,7 @@ def _drop_capabilities() -> None:
             prctl(PR_CAPBSET_DROP, number)
         except OSError:  # there are no more, or it may not
             break
-    number = _CAPSET.get(os.uname().machine)
-    if number is not None:
+    capset = _CAPSET.get(os.uname().machine)
+    if capset is not None:
         header = _CapabilityHeader(_CAPABILITY_VERSION, 0)
-        syscall(number, ctypes.byref(header), ctypes.byref((ctypes.c_uint32 * 6)()))
+        syscall(capset, ctypes.byref(header), ctypes.byref((ctypes.c_uint32 * 6)()))

@@ -1,6 +1,6 @@
 """A filter of system calls (seccomp): no sockets, no looking into other processes, no changes of the system.
 
-https://docs.kernel.org/userspace-api/seccomp_filter.html. A filter holds for a process and all that it starts.
+https://docs.kernel.org/userspace-api/seccomp_filter.html. It holds for a process and all that it starts.
 """
 
 import ctypes

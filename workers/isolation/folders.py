@@ -1,7 +1,7 @@
 """Folders that a process cannot open any more (Landlock), and processes that it cannot signal.
 
-https://docs.kernel.org/userspace-api/landlock.html. Landlock allows what is named and nothing else, so that all
-is named that lies beside the way to what is hidden.
+https://docs.kernel.org/userspace-api/landlock.html. Landlock allows what is named and nothing else, so that
+all is named that lies beside the way to what is hidden.
 """
 
 import ctypes
@@ -73,6 +73,8 @@ def hide_folders(
         reading = _READING & rights
         for path in _beside(Path("/"), shut):
             _allow(ruleset, path, reading if elsewhere_reads_only else rights)
+        # Names can be listed everywhere, as whoever looks for modules does on the way to what is hidden.
+        _allow(ruleset, Path("/"), _READ_FOLDER)
         for path in (Path("/dev/null"), Path("/dev/zero"), Path("/dev/shm")):  # noqa: S108 - a device
             _allow(ruleset, path, rights)
         for paths, given in ((written, rights), (read, reading)):

@@ -1,4 +1,4 @@
-"""Processes that know secrets: their memory and environment are nobody's business, not even of the same user."""
+"""Processes that know secrets: no other process reads their memory, not even of the same user."""
 
 import contextlib
 import resource

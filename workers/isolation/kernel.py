@@ -19,7 +19,9 @@ def prctl(option: int, value: int = 0, pointer: object = 0) -> None:
     Raises:
         OSError: the kernel refuses, or this is not Linux.
     """
-    _called("prctl", option, ctypes.c_ulong(value), pointer, ctypes.c_ulong(0), ctypes.c_ulong(0))
+    _called(
+        ctypes.c_int, "prctl", option, ctypes.c_ulong(value), pointer, ctypes.c_ulong(0), ctypes.c_ulong(0)
+    )
 
 
 def syscall(number: int, *arguments: object) -> int:
@@ -28,14 +30,14 @@ def syscall(number: int, *arguments: object) -> int:
     Raises:
         OSError: the kernel refuses, or this is not Linux.
     """
-    return _called("syscall", ctypes.c_long(number), *arguments)
+    return _called(ctypes.c_long, "syscall", ctypes.c_long(number), *arguments)
 
 
-def _called(name: str, *arguments: object) -> int:
+def _called(kind: type[ctypes.c_int] | type[ctypes.c_long], name: str, *arguments: object) -> int:
     if not IS_LINUX:
         raise OSError(errno.ENOSYS, "this is not Linux")
     function = getattr(ctypes.CDLL(None, use_errno=True), name)
-    function.restype = ctypes.c_long
+    function.restype = kind
     result = int(function(*arguments))
     if result < 0:
         number = ctypes.get_errno()

@@ -13,7 +13,7 @@ from psycopg.types.json import Jsonb
 
 from workers.queue.port import QueueDepth, Slips
 from workers.records.database import Connection, naming
-from workers.records.errors import Conflict
+from workers.records.errors import Conflict, Missing
 from workers.records.ids import new_id
 from workers.records.journal import add_event
 from workers.records.rows import Artifact, Job
@@ -146,7 +146,7 @@ async def cancel_job(connection: Connection, slips: Slips, job_id: uuid.UUID) ->
 
     Raises:
         Conflict: it succeeded or failed already.
-        KeyError: there is no such job.
+        Missing: there is no such job.
     """
     async with connection.transaction():
         job = await _existing(connection, job_id, lock=True)
@@ -186,7 +186,7 @@ async def retry_job(
 
     Raises:
         Conflict: it is neither failed nor cancelled.
-        KeyError: there is no such job.
+        Missing: there is no such job.
     """
     async with connection.transaction():
         job = await _existing(connection, job_id, lock=True)
@@ -274,7 +274,7 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
 
     Raises:
         Conflict: it is not over, or other jobs work on its results.
-        KeyError: there is no such job.
+        Missing: there is no such job.
     """
     async with connection.transaction():
         job = await _existing(connection, job_id, lock=True)
@@ -335,5 +335,5 @@ async def running_by_queue(connection: Connection) -> dict[str, int]:
 async def _existing(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job:
     job = await get_job(connection, job_id, lock=lock)
     if job is None:
-        raise KeyError(job_id)
+        raise Missing("job")
     return job

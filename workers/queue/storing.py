@@ -5,7 +5,6 @@ transaction, which fails if the note was given up: that of a process that was si
 """
 
 import asyncio
-import contextlib
 import logging
 import uuid
 from collections.abc import AsyncIterator
@@ -24,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 SEEN_SECONDS = 10.0
 """How often whoever stores says that it still does."""
-SILENT_SECONDS = 120.0
+SILENT_SECONDS = 45.0
 """A note of which nothing was heard for so long is given up."""
 _UNREACHABLE = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, TimeoutError, OSError)
 
@@ -85,11 +84,15 @@ async def give_up_silent(connection: Connection) -> None:
 async def _say_so(pool: Pool, note: Note) -> None:
     while True:
         await asyncio.sleep(SEEN_SECONDS)
-        with contextlib.suppress(*_UNREACHABLE):
+        try:
             async with pool.connection() as connection:
                 await connection.execute(
                     "UPDATE storing SET seen_at = clock_timestamp() WHERE id = %s", [note.id]
                 )
+        except _UNREACHABLE:
+            continue
+        except Exception:
+            logger.exception("a note of what is stored was not renewed and is tried again")
 
 
 async def _remove(pool: Pool, note: Note) -> None:

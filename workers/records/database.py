@@ -1,6 +1,6 @@
 """Connections to the database."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import fields
 from functools import cache
@@ -15,6 +15,19 @@ from workers.records.errors import DatabaseError
 
 Connection = psycopg.AsyncConnection[DictRow]
 Pool = AsyncConnectionPool[Connection]
+
+STATEMENT_SECONDS = 60
+"""A statement that takes longer, as it waits for a lock or the database is overwhelmed, is given up."""
+IDLE_SECONDS = 30
+"""A transaction of which nothing is heard for so long is undone; its process is gone or frozen."""
+KEEPALIVES: Mapping[str, int] = {
+    "keepalives": 1,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 25_000,
+}
+"""So that a host that vanished is noticed within half a minute; by itself TCP takes hours."""
 
 
 @cache
@@ -42,7 +55,7 @@ async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 
     Raises:
         DatabaseError: the database cannot be reached.
     """
-    options: dict[str, Any] = {"row_factory": dict_row, "connect_timeout": 10}
+    options: dict[str, Any] = {"row_factory": dict_row, "connect_timeout": 10, **KEEPALIVES}
     pool: Pool = AsyncConnectionPool(
         conninfo,
         min_size=1,
@@ -50,6 +63,7 @@ async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 
         timeout=wait_seconds,
         open=False,
         kwargs=options,
+        configure=_bound,
         check=AsyncConnectionPool.check_connection,
         reconnect_timeout=wait_seconds,
     )
@@ -65,3 +79,21 @@ async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 
         yield pool
     finally:
         await pool.close(timeout=5)
+
+
+async def _bound(connection: Connection) -> None:
+    """Bound what others may have to wait for this connection; not by options, as a pooler refuses them."""
+    settings = {
+        "statement_timeout": f"{STATEMENT_SECONDS}s",
+        "idle_in_transaction_session_timeout": f"{IDLE_SECONDS}s",
+        # The server's own view of a client that vanished.
+        "tcp_keepalives_idle": str(KEEPALIVES["keepalives_idle"]),
+        "tcp_keepalives_interval": str(KEEPALIVES["keepalives_interval"]),
+        "tcp_keepalives_count": str(KEEPALIVES["keepalives_count"]),
+    }
+    await connection.set_autocommit(True)
+    await connection.execute(
+        "SELECT set_config(name, value, false) FROM unnest(%s::text[], %s::text[]) AS given (name, value)",
+        [list(settings), list(settings.values())],
+    )
+    await connection.set_autocommit(False)

@@ -8,10 +8,13 @@ from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
 from workers.records.database import Connection, naming
-from workers.records.errors import Conflict
+from workers.records.errors import Conflict, Missing
 from workers.records.ids import new_id
 from workers.records.rows import Dataset, DatasetFile, DatasetHolds
 from workers.records.sizes import Sizes
+
+CHECK_LOST_SECONDS = 60
+"""A validation of which nothing was heard for so long counts no more; its process is gone."""
 
 
 async def create_dataset(
@@ -68,7 +71,7 @@ async def put_file(
 
     Raises:
         Conflict: the dataset takes no files any more.
-        KeyError: there is no such dataset.
+        Missing: there is no such dataset.
     """
     async with connection.transaction():
         await _open_dataset(connection, dataset_id)
@@ -92,7 +95,7 @@ async def remove_file(connection: Connection, dataset_id: uuid.UUID, path: str) 
 
     Raises:
         Conflict: the dataset does not change any more.
-        KeyError: there is no such dataset.
+        Missing: there is no such dataset.
     """
     async with connection.transaction():
         await _open_dataset(connection, dataset_id)
@@ -150,12 +153,12 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
 
     Raises:
         Conflict: it is being validated already.
-        KeyError: there is no such dataset.
+        Missing: there is no such dataset.
     """
     async with connection.transaction():
         dataset = await get_dataset(connection, dataset_id, lock=True)
         if dataset is None:
-            raise KeyError(dataset_id)
+            raise Missing("dataset")
         if dataset.state == "checking" and not await _check_was_lost(connection, dataset_id):
             raise Conflict("The dataset is being checked already; ask again in a moment.")
         if dataset.state != "committed":
@@ -164,6 +167,13 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
                 [dataset_id],
             )
         return dataset
+
+
+async def renew_check(connection: Connection, dataset_id: uuid.UUID) -> None:
+    """Say that a dataset is still being validated."""
+    await connection.execute(
+        "UPDATE datasets SET used_at = now() WHERE id = %s AND state = 'checking'", [dataset_id]
+    )
 
 
 async def end_check(
@@ -175,7 +185,11 @@ async def end_check(
     photographs: int = 0,
     facts: Mapping[str, Any] | None = None,
 ) -> Dataset:
-    """Commit a dataset that was found sound, or open it again for better files."""
+    """Commit a dataset that was found sound, or open it again for better files.
+
+    Raises:
+        Missing: there is no such dataset any more.
+    """
     await connection.execute(
         """
         UPDATE datasets SET state = CASE WHEN %(sound)s THEN 'committed' ELSE 'open' END,
@@ -192,7 +206,8 @@ async def end_check(
         },
     )
     dataset = await get_dataset(connection, dataset_id)
-    assert dataset is not None
+    if dataset is None:
+        raise Missing("dataset")
     return dataset
 
 
@@ -210,7 +225,7 @@ async def change_dataset(
     )
     dataset = await get_dataset(connection, dataset_id)
     if dataset is None:
-        raise KeyError(dataset_id)
+        raise Missing("dataset")
     return dataset
 
 
@@ -218,12 +233,15 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
     """Forget a dataset that no job needs; its blobs stay until they are swept.
 
     Raises:
-        Conflict: jobs were made from it.
-        KeyError: there is no such dataset.
+        Conflict: jobs were made from it, or it is being validated.
+        Missing: there is no such dataset.
     """
     async with connection.transaction():
-        if await get_dataset(connection, dataset_id, lock=True) is None:
-            raise KeyError(dataset_id)
+        dataset = await get_dataset(connection, dataset_id, lock=True)
+        if dataset is None:
+            raise Missing("dataset")
+        if dataset.state == "checking" and not await _check_was_lost(connection, dataset_id):
+            raise Conflict("The dataset is being checked; delete it when that is done.")
         cursor = await connection.execute(
             "SELECT count(*) AS n FROM jobs WHERE %s IN (dataset_id, files_id)", [dataset_id]
         )
@@ -234,9 +252,10 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
 
 
 async def _check_was_lost(connection: Connection, dataset_id: uuid.UUID) -> bool:
-    """Whether a check began so long ago that whoever made it must have gone."""
+    """Whether whoever checks was not heard of for so long that it must have gone."""
     cursor = await connection.execute(
-        "SELECT used_at < now() - interval '15 minutes' AS lost FROM datasets WHERE id = %s", [dataset_id]
+        "SELECT used_at < now() - make_interval(secs => %s) AS lost FROM datasets WHERE id = %s",
+        [CHECK_LOST_SECONDS, dataset_id],
     )
     row = await cursor.fetchone()
     return bool(row and row["lost"])
@@ -245,7 +264,7 @@ async def _check_was_lost(connection: Connection, dataset_id: uuid.UUID) -> bool
 async def _open_dataset(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
     dataset = await get_dataset(connection, dataset_id, lock=True)
     if dataset is None:
-        raise KeyError(dataset_id)
+        raise Missing("dataset")
     if dataset.state != "open":
         raise Conflict(f"The dataset is {dataset.state}, so its files do not change; make a new dataset.")
     return dataset

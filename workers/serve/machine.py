@@ -14,6 +14,8 @@ from engine.errors import OctasplatError, OutputError
 from engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
 from engine.isolated_python import python_command
 from engine.writing import write_json
+from workers.isolation.abilities import tell_what_lacks
+from workers.isolation.hiding import hide_memory
 from workers.postgres.embedded import EmbeddedPostgres
 from workers.records.migrate import migrate
 from workers.serve.children import KeptChild
@@ -56,6 +58,8 @@ async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -
     Raises:
         OctasplatError: something cannot be started.
     """
+    hide_memory()
+    tell_what_lacks()
     settings = plan.settings
     with _alone(settings.data) as address_file:
         database = EmbeddedPostgres(settings.data.absolute()) if settings.database_url is None else None
@@ -181,6 +185,8 @@ async def _keep_database(database: EmbeddedPostgres | None) -> None:
             await asyncio.to_thread(database.start)
         except OctasplatError as error:
             logger.error("%s", error)
+        except Exception:
+            logger.exception("the database could not be started and is tried again")
 
 
 @contextlib.contextmanager

@@ -28,6 +28,8 @@ AT_ONCE_SECONDS = 3.0
 CLOCK_SECONDS = 60.0
 """By how much the clocks of the store and the database may differ."""
 _SETTLED_SECONDS = 2.0
+COLLECT_SECONDS = 3600
+"""After so long others may collect although somebody still does."""
 INSTALLATION = "installation"
 _RESULTS = re.compile(r"results/([0-9a-f-]{36})/\d+")
 
@@ -103,6 +105,8 @@ async def _turn(pool: Pool, storage: Storage, every_seconds: float) -> AsyncIter
             logger.warning("the store is another database's, so nothing in it is collected")
             yield False
             return
+        # Nobody waits for this row; who finds it locked leaves the collecting to others.
+        await connection.execute(f"SET LOCAL idle_in_transaction_session_timeout = '{COLLECT_SECONDS}s'")
         yield True
         await connection.execute("UPDATE installation SET collected_at = clock_timestamp()")
 
@@ -128,6 +132,7 @@ async def _collect(pool: Pool, storage: Storage, unused_seconds: float, replaced
             )
             replaced = {row["sha256"] for row in await cursor.fetchall()}
         named |= await _published(connection, storage, entered)
+        await connection.commit()  # what follows may take long
         removed = await asyncio.to_thread(
             collect_unused,
             storage,
@@ -155,6 +160,7 @@ async def _collect_at_once(pool: Pool, storage: Storage) -> Collected:
             began_unix = await _oldest_unix(connection)
             named, entered = await _named(connection)
         named |= await _published(connection, storage, entered)
+        await connection.commit()
         limit_unix = min(now - _SETTLED_SECONDS, began_unix)
         removed = await asyncio.to_thread(remove_unchanged, storage, found, named, before_unix=limit_unix)
     _tell_of(removed)

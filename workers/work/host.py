@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from engine.isolated_python import python_command
-from workers.store.errors import StorageError
+from workers.store.errors import StorageError, StorageFull
 from workers.store.os_errors import told
 from workers.store.protocol import Storage
 from workers.work.child_process import child_environment
@@ -19,10 +19,9 @@ from workers.work.child_process import child_environment
 logger = logging.getLogger(__name__)
 
 PROBE_SECONDS = 120.0
-CRASHES = 3
-"""So many jobs one after another whose programs crash are taken for a fault of the machine."""
-FIRST_REST_SECONDS = 30.0
-LONGEST_REST_SECONDS = 600.0
+CRASHES, OWNERS = 3, 2
+"""So many jobs in a row, of so many owners, whose programs crash are taken for a fault of the machine; one
+owner alone cannot bring that about."""
 
 
 class Host:
@@ -33,35 +32,39 @@ class Host:
         work: folder of the work under way.
         storage: the store.
         kind_modules: further modules that a job's process imports.
+        rest_seconds: for how long it takes no jobs after many have crashed.
     """
 
-    def __init__(self, name: str, work: Path, storage: Storage, kind_modules: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        name: str,
+        work: Path,
+        storage: Storage,
+        *,
+        kind_modules: Sequence[str] = (),
+        rest_seconds: float = 30.0,
+    ) -> None:
         self._name = name
         self._work = work
         self._storage = storage
         self._kind_modules = tuple(kind_modules)
-        self._crashed: set[uuid.UUID] = set()
-        self._rest_seconds = FIRST_REST_SECONDS
+        self._crashed: dict[uuid.UUID, str] = {}
+        self._rest_seconds = rest_seconds
         self._rested_at = 0.0
         self._program: str | None = None
         self.ailing: str | None = None
         self.changed = asyncio.Event()
 
-    def crashed(self, job_id: uuid.UUID) -> None:
+    def crashed(self, job_id: uuid.UUID, owner: str) -> None:
         """The program of a job ended as no program should."""
-        self._crashed.add(job_id)
-        if len(self._crashed) >= CRASHES:
+        self._crashed[job_id] = owner
+        if len(self._crashed) >= CRASHES and len(set(self._crashed.values())) >= OWNERS:
             self._rested_at = time.monotonic() + self._rest_seconds
-            self.fail(
-                f"the programs of {len(self._crashed)} jobs crashed one after another; it rests for "
-                f"{self._rest_seconds:g} s"
-            )
-            self._rest_seconds = min(LONGEST_REST_SECONDS, 2 * self._rest_seconds)
+            self.fail(f"the programs of {len(self._crashed)} jobs, of several owners, crashed in a row")
 
     def worked(self) -> None:
         """A job came to its end here."""
         self._crashed.clear()
-        self._rest_seconds = FIRST_REST_SECONDS
 
     def fail(self, why: str) -> None:
         """Take no jobs until :meth:`recover` finds nothing any more."""
@@ -74,6 +77,8 @@ class Host:
         """What is wrong with the folder of the work, in a sentence, or None; to be asked before every job."""
         try:
             await asyncio.to_thread(self._try_folder)
+        except StorageFull:
+            return None  # which is looked after where room is
         except StorageError as error:
             return str(error)
         return None
@@ -144,7 +149,11 @@ class Host:
         }
         try:
             async with asyncio.timeout(PROBE_SECONDS):
-                _, said = await process.communicate(json.dumps(task).encode() + b"\n")
+                assert process.stdin is not None and process.stderr is not None
+                process.stdin.write(json.dumps(task).encode() + b"\n")
+                said = await process.stderr.read()  # it takes the end of its stdin for that of its worker
+                await process.wait()
+                process.stdin.close()
         except TimeoutError:
             process.kill()
             return f"A job's program was not ready after {PROBE_SECONDS:g} s."

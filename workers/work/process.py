@@ -8,9 +8,11 @@ import os
 import platform
 import signal
 import socket
+import tempfile
 import time
 import uuid
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -19,6 +21,8 @@ from procrastinate.exceptions import ConnectorException
 import engine
 from engine.files import writable_formats
 from engine.threads import available_threads
+from workers.isolation.abilities import abilities, tell_what_lacks
+from workers.isolation.hiding import hide_memory
 from workers.parent import die_with_server
 from workers.queue.attempts import Fenced, claim
 from workers.queue.limits import end_abandoned
@@ -47,7 +51,7 @@ from workers.work.memory import memory_limit_bytes
 from workers.work.openings import Openings, put_off
 from workers.work.supervisor import Supervisor
 from workers.work.surroundings import LostDatabase, Surroundings
-from workers.work.workspace import sweep_workspaces
+from workers.work.workspace import sweep_temporary, sweep_workspaces
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +92,9 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         DatabaseError: the database cannot be reached or is of another version.
         StorageError: the store cannot be used.
     """
-    die_with_server()
+    hide_memory()
+    if not die_with_server():
+        tell_what_lacks()
     settings.checked()
     for module in settings.kind_modules:
         importlib.import_module(module)
@@ -102,7 +108,10 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         above_bytes=settings.floor_bytes - floor_bytes, reserve_bytes=floor_bytes,
         store_folder=storage.root if isinstance(storage, LocalStorage) else None,
     )  # fmt: skip
-    host = Host(name, settings.work_folder, storage, settings.kind_modules)
+    host = Host(
+        name, settings.work_folder, storage,
+        kind_modules=settings.kind_modules, rest_seconds=settings.recover_seconds,
+    )  # fmt: skip
     slots = sum(queues.values())
     async with open_pool(conninfo, max_size=6 + 4 * slots, wait_seconds=settings.stale_seconds) as pool:
         worker = _Worker(
@@ -282,6 +291,7 @@ class _Worker:
             "memory_free_bytes": memory.available,
             "memory_limit_bytes": self._around.memory_limit_bytes,
             "ailing": self._around.host.ailing,
+            "isolation": abilities(),
             **announced(),
         }
 
@@ -323,6 +333,7 @@ class _Worker:
 
     async def _sweep(self) -> None:
         await asyncio.to_thread(sweep_workspaces, self._settings.work_folder)
+        await asyncio.to_thread(sweep_temporary, Path(tempfile.gettempdir()), ABANDONED_SECONDS)
 
     async def _sweep_store(self) -> None:
         """Remove what killed uploads left in the store; no upload takes a day."""

@@ -179,6 +179,8 @@ class Reporter:
                 return
             except _IGNORED as error:
                 logger.info("progress of job %s was not written: %s", self._attempt.job.id, error)
+            except Exception:
+                logger.exception("progress of job %s was not written", self._attempt.job.id)
 
     async def _flush(self) -> None:
         progress, self._progress = self._progress, None
@@ -199,6 +201,8 @@ class Reporter:
                 await self._keep()
             except Fenced:
                 return
+            except Exception:
+                logger.exception("a checkpoint of job %s was not kept", self._attempt.job.id)
 
     async def _keep(self) -> None:
         """Store the newest checkpoint and picture, if there are new ones."""

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import shutil
+import stat
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -317,6 +318,27 @@ def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(folder, ignore_errors=True)
             removed += 1
+    return removed
+
+
+def sweep_temporary(folder: Path, older_than_seconds: float) -> int:
+    """Remove folders that killed checks of COLMAP models have left among the temporary files of this machine.
+
+    Args:
+        folder: of temporary files.
+        older_than_seconds: what was changed since may be in use.
+
+    Returns:
+        Number of folders removed.
+    """
+    removed = 0
+    for left in folder.glob("octasplat-model-????????"):
+        with contextlib.suppress(OSError):
+            facts = left.lstat()
+            old = time.time() - facts.st_mtime > older_than_seconds
+            if stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.geteuid() and old:
+                shutil.rmtree(left, ignore_errors=True)
+                removed += 1
     return removed
 
 

@@ -11,6 +11,7 @@ from psycopg.types.json import Jsonb
 
 from engine.errors import OctasplatError
 from workers.records.database import Connection, naming
+from workers.records.errors import Missing
 from workers.records.ids import new_id
 
 EventName = Literal[
@@ -181,7 +182,7 @@ async def change_endpoint(
     """Change what is given; None leaves a value as it is.
 
     Raises:
-        KeyError: there is no such endpoint.
+        Missing: there is no such endpoint.
     """
     await connection.execute(
         """
@@ -200,7 +201,7 @@ async def change_endpoint(
     )
     endpoint = await get_endpoint(connection, endpoint_id)
     if endpoint is None:
-        raise KeyError(endpoint_id)
+        raise Missing("webhook")
     return endpoint
 
 
@@ -263,7 +264,7 @@ async def send_again(connection: Connection, delivery_id: uuid.UUID) -> Delivery
     """Put a message into the queue once more, with all its tries; its id and body stay.
 
     Raises:
-        KeyError: there is no such message.
+        Missing: there is no such message.
     """
     async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
@@ -278,5 +279,5 @@ async def send_again(connection: Connection, delivery_id: uuid.UUID) -> Delivery
         )
         delivery = await cursor.fetchone()
     if delivery is None:
-        raise KeyError(delivery_id)
+        raise Missing("message")
     return delivery
