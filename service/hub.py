@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Iterator
 
 import psycopg
+from psycopg.conninfo import make_conninfo
 
 from workers.records.database import KEEPALIVES
 from workers.records.journal import CHANNEL
@@ -71,7 +72,7 @@ class EventHub:
 
     async def _listen_once(self) -> None:
         connection = await psycopg.AsyncConnection.connect(
-            self._conninfo, autocommit=True, connect_timeout=10, **KEEPALIVES
+            make_conninfo(self._conninfo, **KEEPALIVES), autocommit=True, connect_timeout=10
         )
         async with connection:
             await connection.execute(f"LISTEN {CHANNEL}")

@@ -42,7 +42,7 @@ from workers.store.room import Room
 from workers.upkeep.collecting import collect
 from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries
 from workers.upkeep.webhooks.outbox import forget_old
-from workers.upkeep.webhooks.sending import send_due
+from workers.upkeep.webhooks.sending import Sender
 from workers.work.chores import Chore, ChoreFailed, keep_doing
 from workers.work.contact import DATABASE_ERRORS
 from workers.work.fitness import announced, unfit
@@ -150,6 +150,7 @@ class _Worker:
         self._lost = False
         self._openings = Openings(name, pool, around)
         self._left: dict[uuid.UUID, str] = {}
+        self._sender = Sender(pool, settings.webhook_hosts)
 
     async def run(self) -> int:
         loop = asyncio.get_running_loop()
@@ -179,6 +180,7 @@ class _Worker:
             for outcome in await asyncio.gather(*chores, return_exceptions=True):
                 if isinstance(outcome, ChoreFailed):
                     logger.error("worker %s ends, as %s", self._name, outcome)
+            await self._sender.close()
         if self._lost:
             return EXIT_LOST_DATABASE
         with contextlib.suppress(*DATABASE_ERRORS):
@@ -301,7 +303,7 @@ class _Worker:
             await forget_lost_workers(connection, max(60.0, 3 * self._settings.stale_seconds))
 
     async def _send_webhooks(self) -> None:
-        await send_due(self._pool, self._settings.webhook_hosts)
+        await self._sender.begin()
 
     async def _forget(self) -> None:
         """Let go of what is older than it is to be kept."""
