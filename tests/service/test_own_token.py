@@ -51,8 +51,12 @@ def test_serve_keeps_a_token_for_its_user(short_root: Path) -> None:
             assert anybody.get(link).status_code == 200  # which sets the cookie
             assert anybody.get("/v1/jobs").status_code == 200
             assert httpx.get(link).status_code == 403
+            made = octasplat(data, "token", "create", "ann", "--days", "2").stdout.strip()
+            newest = api.get("/v1/audit", limit=1)["entries"][0]
+            assert (newest["action"], newest["address"]) == ("token create", "command line")
             tokens = octasplat(data, "token", "list").stdout
-            assert "octasplat serve on" in tokens and secret not in tokens
+            assert "octasplat serve on" in tokens and "until" in tokens
+            assert secret not in tokens and made not in tokens
     finally:
         process.terminate()
         assert process.wait(60) == 0
