@@ -60,7 +60,7 @@ async def delete_token(token_id: uuid.UUID, _who: Admin, service: ServiceDep) ->
     await tokens.revoke_token(service, token_id)
 
 
-@router.post("/sign-in-links", status_code=201, responses=problems())
+@router.post("/sign-in-links", status_code=201, responses=problems(409))
 async def make_link(who: Writer, service: ServiceDep) -> SignInLink:
     """Make a link that signs a browser in with your token, once, within five minutes."""
     return await tokens.make_link(service, who)
