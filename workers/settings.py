@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, TypeVar
+from urllib.parse import urlsplit
 
 import platformdirs
 from pydantic import AliasChoices, Field, SecretStr, ValidationError
@@ -16,6 +17,8 @@ from workers.postgres.embedded import EmbeddedPostgres
 PREFIX = "OCTASPLAT_"
 ADDRESS_FILE = "serve.json"
 """In the data folder while ``octasplat serve`` runs: where the service is."""
+TOKEN_FILE = "token"  # noqa: S105 - a name
+"""In the data folder: the token that ``octasplat serve`` made for itself, readable by its user only."""
 
 
 S = TypeVar("S", bound="WorkerSettings")
@@ -82,6 +85,7 @@ class WorkerSettings(BaseSettings):
         keep_open_datasets_hours: the same for datasets that were never committed.
         keep_unused_hours: contents of the store that nothing names are removed after this time; at once, but
             for what is being stored, where room is short.
+        keep_audit_hours: how long it is kept who asked for what; 0 keeps it for ever.
         collect_seconds: how often they are looked for.
     """
 
@@ -117,6 +121,7 @@ class WorkerSettings(BaseSettings):
     keep_datasets_hours: float = Field(0.0, ge=0)
     keep_open_datasets_hours: float = Field(720.0, ge=0)
     keep_unused_hours: float = Field(24.0, gt=0)
+    keep_audit_hours: float = Field(8760.0, ge=0)
     collect_seconds: float = Field(3600.0, gt=0)
 
     @property
@@ -128,6 +133,13 @@ class WorkerSettings(BaseSettings):
     def work_folder(self) -> Path:
         """Where work under way lies."""
         return (self.work or self.data / "work").absolute()
+
+    @property
+    def own_folders(self) -> tuple[Path, ...]:
+        """Folders that only the service itself may open: its data, its store and the work under way."""
+        address = urlsplit(self.storage_address)
+        store = (Path(address.path).absolute(),) if address.scheme in ("", "file") else ()
+        return (self.data.absolute(), self.work_folder, *store)
 
     @property
     def retention(self) -> Retention:

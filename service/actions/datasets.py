@@ -121,7 +121,8 @@ async def _check(service: Service, dataset_id: uuid.UUID) -> Dataset:
         if before.holds == "files":
             summary = check_inputs(known)
         else:
-            summary = await in_thread(Threads.CHECKS, check_dataset, service.storage, known)
+            limits = service.settings.dataset_limits()
+            summary = await in_thread(Threads.CHECKS, check_dataset, service.storage, known, limits)
     finally:
         renewing.cancel()
         # Whatever happens, the dataset must not stay closed.

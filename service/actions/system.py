@@ -11,6 +11,7 @@ from service.problems import not_found
 from service.schemas.system import FormatView, InfoView, KindView, QueueList, QueueView, WorkerView
 from service.state import Service
 from service.threads import Threads, in_thread
+from workers.isolation.abilities import abilities
 from workers.queue.jobs import queue_depths, running_by_queue
 from workers.queue.numbers import read_numbers
 from workers.records.migrate import missing_steps
@@ -53,6 +54,7 @@ def describe(service: Service, who: Principal) -> InfoView:
         needs_token=service.has_tokens or not service.settings.is_private,
         owner=who.owner,
         scopes=sorted(who.scopes),
+        isolation=abilities(),
     )
 
 

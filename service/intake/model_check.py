@@ -35,11 +35,13 @@ class ModelLimits:
             the machine's memory, but 2 GiB at least and 6 GiB at most.
         seconds: time.
         max_model_bytes: length of the model's files together.
+        hidden: folders that the child cannot open.
     """
 
     memory_bytes: int = field(default_factory=lambda: min(6 << 30, max(2 << 30, total_bytes() // 4)))
     seconds: int = 120
     max_model_bytes: int = 4 << 30
+    hidden: tuple[Path, ...] = ()
 
 
 def check_model(
@@ -76,6 +78,7 @@ def check_model(
             min_views=MIN_VIEWS,
             memory_bytes=limits.memory_bytes,
             cpu_seconds=limits.seconds,
+            hidden=limits.hidden,
         )
         return _ask(request, limits)
 

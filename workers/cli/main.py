@@ -25,6 +25,8 @@ from workers.cli.commands.fsck import fsck
 from workers.cli.commands.import_ import import_
 from workers.cli.commands.info import info
 from workers.cli.commands.merge import merge
+from workers.cli.commands.migrate import migrate
+from workers.cli.commands.open import open_page
 from workers.cli.commands.quota import quota
 from workers.cli.commands.reconstruct import reconstruct
 from workers.cli.commands.relight import relight
@@ -91,7 +93,7 @@ def cli() -> None:
 for _command in (
     reconstruct, evaluate, info, export, import_, render, relight, stage, surface,
     edit, deform, transform, crop, merge, clean, demo, backup, restore,
-    serve, worker, token, fsck, quota, *CLIENT_COMMANDS,
+    serve, worker, open_page, token, fsck, quota, migrate, *CLIENT_COMMANDS,
 ):  # fmt: skip
     cli.add_command(_command)
 

@@ -10,7 +10,7 @@ from psycopg.rows import class_row
 
 from workers.queue.jobs import get_job, queue_again
 from workers.queue.port import Slips
-from workers.records.database import Connection, Pool
+from workers.records.database import Connection, Pool, naming
 from workers.records.rows import Job
 
 _TRIED = 30
@@ -51,9 +51,8 @@ async def _fairest(connection: Connection, slips: Slips, job: Job) -> Job | None
         if row["id"] == job.id:
             return None
         async with connection.cursor(row_factory=class_row(Job)) as locking:
-            await locking.execute(
-                "SELECT * FROM jobs WHERE id = %s AND state = 'queued' FOR UPDATE SKIP LOCKED", [row["id"]]
-            )
+            query = "SELECT {} FROM jobs WHERE id = %s AND state = 'queued' FOR UPDATE SKIP LOCKED"
+            await locking.execute(naming(query, Job), [row["id"]])
             other = await locking.fetchone()
         if other is not None and other.slip is not None and await slips.take(connection, other.slip):
             return other

@@ -12,7 +12,7 @@ from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
 from workers.queue.port import QueueDepth, Slips
-from workers.records.database import Connection
+from workers.records.database import Connection, naming
 from workers.records.errors import Conflict, Missing
 from workers.records.ids import new_id
 from workers.records.journal import add_event
@@ -66,12 +66,12 @@ async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
 
 async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job | None:
     """The job of that id, or None; with ``lock`` nobody else changes it until the transaction ends."""
-    query = "SELECT * FROM jobs WHERE id = %s FOR UPDATE" if lock else "SELECT * FROM jobs WHERE id = %s"
+    query = "SELECT {} FROM jobs WHERE id = %s FOR UPDATE" if lock else "SELECT {} FROM jobs WHERE id = %s"
     if lock:  # for all it knows the database would wait hours for a host that vanished
         limit = "SELECT set_config('idle_in_transaction_session_timeout', %s, true)"
         await connection.execute(limit, [f"{LOCK_SECONDS}s"])
     async with connection.cursor(row_factory=class_row(Job)) as cursor:
-        await cursor.execute(query, [job_id])
+        await cursor.execute(naming(query, Job), [job_id])
         return await cursor.fetchone()
 
 
@@ -100,8 +100,9 @@ async def list_jobs(
     """
     async with connection.cursor(row_factory=class_row(Job)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM jobs
+            naming(
+                """
+            SELECT {} FROM jobs
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
               AND (cardinality(%(states)s::text[]) = 0 OR state = ANY(%(states)s))
               AND (%(kind)s::text IS NULL OR kind = %(kind)s)
@@ -110,6 +111,8 @@ async def list_jobs(
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
+                Job,
+            ),
             {
                 "owner": owner,
                 "states": list(states),
@@ -304,14 +307,18 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
 async def artifacts_of(connection: Connection, job_id: uuid.UUID) -> list[Artifact]:
     """The results of a job, by name."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
-        await cursor.execute("SELECT * FROM artifacts WHERE job_id = %s ORDER BY name", [job_id])
+        await cursor.execute(
+            naming("SELECT {} FROM artifacts WHERE job_id = %s ORDER BY name", Artifact), [job_id]
+        )
         return await cursor.fetchall()
 
 
 async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> Artifact | None:
     """One result of a job, or None."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
-        await cursor.execute("SELECT * FROM artifacts WHERE job_id = %s AND name = %s", [job_id, name])
+        await cursor.execute(
+            naming("SELECT {} FROM artifacts WHERE job_id = %s AND name = %s", Artifact), [job_id, name]
+        )
         return await cursor.fetchone()
 
 

@@ -2,9 +2,12 @@
 
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from typing import Any
+from dataclasses import fields
+from functools import cache
+from typing import Any, LiteralString
 
 import psycopg
+from psycopg import sql
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import AsyncConnectionPool
 
@@ -25,6 +28,19 @@ KEEPALIVES: Mapping[str, int] = {
     "tcp_user_timeout": 25_000,
 }
 """So that a host that vanished is noticed within half a minute; by itself TCP takes hours."""
+
+
+@cache
+def naming(query: LiteralString, row: type[Any]) -> sql.Composed:
+    """A query with the columns that a row has in the place of its braces.
+
+    They are named, as the next version's tables, with which this one goes on for a while, may have more.
+
+    Args:
+        query: with ``{}`` where the columns belong.
+        row: a dataclass whose fields are named as the columns.
+    """
+    return sql.SQL(query).format(sql.SQL(", ").join(sql.Identifier(field.name) for field in fields(row)))
 
 
 @asynccontextmanager

@@ -7,7 +7,7 @@ from typing import Any
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from workers.records.database import Connection
+from workers.records.database import Connection, naming
 from workers.records.errors import Conflict, Missing
 from workers.records.ids import new_id
 from workers.records.rows import Dataset, DatasetFile, DatasetHolds
@@ -33,9 +33,9 @@ async def create_dataset(
 
 async def get_dataset(connection: Connection, dataset_id: uuid.UUID, *, lock: bool = False) -> Dataset | None:
     """The dataset of that id, or None."""
-    query = "SELECT * FROM datasets WHERE id = %s"
+    query = "SELECT {} FROM datasets WHERE id = %s"
     async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
-        await cursor.execute(f"{query} FOR UPDATE" if lock else query, [dataset_id])
+        await cursor.execute(naming(f"{query} FOR UPDATE" if lock else query, Dataset), [dataset_id])
         return await cursor.fetchone()
 
 
@@ -45,12 +45,15 @@ async def list_datasets(
     """Datasets, the newest first; ``owner`` None takes everybody's."""
     async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM datasets
+            naming(
+                """
+            SELECT {} FROM datasets
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
+                Dataset,
+            ),
             {"owner": owner, "before": before, "limit": limit},
         )
         return await cursor.fetchall()
@@ -106,7 +109,8 @@ async def get_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> 
     """One file of a dataset, or None."""
     async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
         await cursor.execute(
-            "SELECT * FROM dataset_files WHERE dataset_id = %s AND path = %s", [dataset_id, path]
+            naming("SELECT {} FROM dataset_files WHERE dataset_id = %s AND path = %s", DatasetFile),
+            [dataset_id, path],
         )
         return await cursor.fetchone()
 
@@ -117,10 +121,13 @@ async def files_of(
     """Files of a dataset by path; those after the path ``after``, at most ``limit``."""
     async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM dataset_files WHERE dataset_id = %s AND path COLLATE "C" > %s
+            naming(
+                """
+            SELECT {} FROM dataset_files WHERE dataset_id = %s AND path COLLATE "C" > %s
             ORDER BY path COLLATE "C" LIMIT %s
             """,
+                DatasetFile,
+            ),
             [dataset_id, after, limit],
         )
         return await cursor.fetchall()

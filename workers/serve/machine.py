@@ -14,10 +14,13 @@ from engine.errors import OctasplatError, OutputError
 from engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
 from engine.isolated_python import python_command
 from engine.writing import write_json
+from workers.isolation.abilities import tell_what_lacks
+from workers.isolation.hiding import hide_memory
 from workers.postgres.embedded import LEAST_CONNECTIONS, EmbeddedPostgres
 from workers.records.migrate import migrate
 from workers.serve.children import KeptChild
-from workers.settings import ADDRESS_FILE, PREFIX, WorkerSettings, worker_connections
+from workers.serve.own_token import keep_own_token
+from workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings, worker_connections
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +59,8 @@ async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -
     Raises:
         OctasplatError: something cannot be started.
     """
+    hide_memory()
+    tell_what_lacks()
     settings = plan.settings
     with hold_data(settings.data) as address_file:
         database = (
@@ -68,6 +73,7 @@ async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -
                 await asyncio.to_thread(database.start) if database is not None else settings.conninfo()
             )
             await asyncio.to_thread(migrate, conninfo)
+            await keep_own_token(conninfo, settings.data / TOKEN_FILE)
             return await _run(plan, database, conninfo, address_file, on_ready)
         finally:
             address_file.unlink(missing_ok=True)

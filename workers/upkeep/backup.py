@@ -33,7 +33,7 @@ from workers.store.trees import read_manifest
 
 FORMAT = 1
 RECORD, TABLES, STORE = "backup.json", "tables-", "store"
-_LEFT_OUT = ("schema_steps", "workers", "storing")
+_LEFT_OUT = ("schema_steps", "schema_reach", "workers", "storing")
 _CONTENTS = """
     SELECT sha256 FROM dataset_files UNION SELECT sha256 FROM artifacts
     UNION SELECT file->>'sha256' FROM jobs, jsonb_array_elements(checkpoint->'files') AS file

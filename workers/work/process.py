@@ -21,15 +21,19 @@ from procrastinate.exceptions import ConnectorException
 import engine
 from engine.files import writable_formats
 from engine.threads import available_threads
+from workers.isolation.abilities import abilities, tell_what_lacks
+from workers.isolation.hiding import hide_memory
 from workers.parent import die_with_server
 from workers.queue.attempts import Fenced, claim
 from workers.queue.fairness import choose
 from workers.queue.limits import end_abandoned
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.queue.rescue import rescue_lost_jobs
+from workers.records.audit import forget_old_entries
 from workers.records.database import Pool, open_pool
 from workers.records.ids import new_id
-from workers.records.migrate import migrate
+from workers.records.migrate import wait_for_tables
+from workers.records.sessions import forget_old_sessions
 from workers.records.workers import forget_lost_workers, forget_worker, see_worker
 from workers.settings import WorkerSettings, worker_connections
 from workers.store.errors import StorageError
@@ -42,6 +46,7 @@ from workers.upkeep.webhooks.outbox import forget_old
 from workers.upkeep.webhooks.sending import Sender
 from workers.work.chores import Chore, ChoreFailed, keep_doing
 from workers.work.contact import DATABASE_ERRORS
+from workers.work.fitness import announced, unfit
 from workers.work.host import Host
 from workers.work.memory import memory_limit_bytes
 from workers.work.openings import Openings, put_off
@@ -56,6 +61,8 @@ STORE_SWEEP_SECONDS = 3600.0
 THIN_SECONDS = 600.0
 ABANDONED_SECONDS = 86_400.0
 ROOM_LOOK_SECONDS = 5.0
+LEFT_POLLS = 3
+"""A job that is left to workers of another version is kept from all for so many looks at the queue."""
 EXIT_LOST_DATABASE = 69
 
 
@@ -87,12 +94,14 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         DatabaseError: the database cannot be reached or is of another version.
         StorageError: the store cannot be used.
     """
-    die_with_server()
+    hide_memory()
+    if not die_with_server():
+        tell_what_lacks()
     settings.checked()
     for module in settings.kind_modules:
         importlib.import_module(module)
     conninfo = settings.conninfo()
-    await asyncio.to_thread(migrate, conninfo)
+    await asyncio.to_thread(wait_for_tables, conninfo)
     floor_bytes = settings.floor_bytes // 4  # the rest of it is for what jobs under way have to store
     storage = await asyncio.to_thread(lambda: open_storage(settings.storage_address, floor_bytes=floor_bytes))
     name = name or f"{socket.gethostname()}-{os.getpid()}"
@@ -144,6 +153,7 @@ class _Worker:
         self._id = new_id()
         self._lost = False
         self._openings = Openings(name, pool, around)
+        self._left: dict[uuid.UUID, str] = {}
         self._sender = Sender(pool, settings.webhook_hosts)
 
     async def run(self) -> int:
@@ -228,9 +238,18 @@ class _Worker:
             await self._refuse(job_id, slip)
             return
         chosen = await choose(self._pool, self._around.slips, job_id, slip)
-        if chosen is None or not await self._openings.come(*chosen):
+        if chosen is None:
             return
         job_id, slip = chosen
+        if (why := await unfit(self._pool, job_id, self._settings.stale_seconds)) is not None:
+            if job_id not in self._left:
+                logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
+                self._left[job_id] = why
+            wait_seconds = LEFT_POLLS * self._settings.poll_seconds
+            await put_off(self._pool, self._around.slips, job_id, slip, wait_seconds)
+            return
+        if not await self._openings.come(job_id, slip):
+            return
         since = time.monotonic()
         attempt = await claim(self._pool, job_id, slip, self._name)
         if attempt is None:
@@ -283,6 +302,8 @@ class _Worker:
             "memory_free_bytes": memory.available,
             "memory_limit_bytes": self._around.memory_limit_bytes,
             "ailing": self._around.host.ailing,
+            "isolation": abilities(),
+            **announced(),
         }
 
     async def _rescue(self) -> None:
@@ -300,6 +321,8 @@ class _Worker:
             await forget_expired(connection)
             await forget_old(connection)
             await forget_old_keys(connection)
+            await forget_old_sessions(connection)
+            await forget_old_entries(connection, self._settings.keep_audit_hours)
         for job_id in await end_abandoned(
             self._pool,
             self._around.slips,

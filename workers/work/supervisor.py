@@ -10,7 +10,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
+from engine import versions
 from engine.errors import ConfigError, OctasplatError
+from workers.isolation.confining import MOST_PROCESSES
 from workers.queue.attempts import Attempt, Fenced
 from workers.queue.jobs import artifacts_of
 from workers.queue.limits import seconds_spent
@@ -44,6 +46,7 @@ class End(Enum):
     SILENT = "its program said nothing for too long"
     TIME = "it ran for longer than allowed"
     MEMORY = "its program needed more memory than allowed"
+    PROCESSES = "it started more processes than allowed"
     DISK = "its folder took more than allowed"
     ROOM = "it took room that is reserved"
 
@@ -174,9 +177,17 @@ class Supervisor:
             "scene": str(scene) if scene else None,
             "title": title,
             "threads": settings.threads,
+            "hidden": [str(folder) for folder in settings.own_folders],
+            "memory_limit_bytes": self._around.memory_limit_bytes,
         }
 
     async def _restore(self, checkpoint: Checkpoint) -> None:
+        if checkpoint.results != versions.RESULTS:
+            self._reporter.note(
+                "Warning: the checkpoint is of a version in which the same settings gave other results, so "
+                "the job begins anew."
+            )
+            return
         try:
             await asyncio.to_thread(self._workspace.restore, checkpoint)
         except (BlobMissing, DigestMismatch) as error:
@@ -206,6 +217,9 @@ class Supervisor:
                 "iterations or rays, or retry it, which goes on from its checkpoint."
             )
             await self._verdicts.fail({"type": "time_limit", "message": message})
+        elif end is End.PROCESSES:
+            message = f"The job's program started more than {MOST_PROCESSES} others and was stopped."
+            await self._verdicts.fail({"type": "process_limit", "message": message})
         elif end is End.DISK:
             taken, most = self._workspace.most_taken_bytes(), self._settings.max_workspace_bytes
             message = f"The job's folder took {taken} bytes, and {most} are allowed; ask for fewer images."
@@ -290,6 +304,8 @@ class Supervisor:
             limit = self._around.memory_limit_bytes
             if limit is not None and await loop.run_in_executor(_EYE, child.memory_bytes) > limit:
                 self._stop(End.MEMORY)
+            if await loop.run_in_executor(_EYE, child.process_count) > MOST_PROCESSES:
+                self._stop(End.PROCESSES)
             await self._watch_disk()
 
     async def _watch_disk(self) -> None:

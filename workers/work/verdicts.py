@@ -119,7 +119,7 @@ class Verdicts:
         found = await self._around.host.examine(self._program)
         if found is None:
             error = {"type": "crashed", "message": what}
-            await self._said(lambda: self._attempt.lose(self._around.slips, error))
+            await self.let_go(error)
         else:
             await self.hand_back(f"The worker's machine is at fault, which takes no jobs for now: {found}")
 

@@ -11,10 +11,11 @@ import stat
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from engine import versions
 from engine.render.kept import RECORD
 from workers.queue.attempts import Result
 from workers.records.rows import Artifact, DatasetFile, Job
@@ -41,12 +42,22 @@ MAX_METRICS_BYTES = 16 << 20
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a later attempt goes on from, as the job's row keeps it."""
+    """What a later attempt goes on from, as the job's row keeps it.
+
+    Attributes:
+        attempt: that made it.
+        stage: of the work.
+        step: of the stage.
+        files: what is needed.
+        results: what the same settings gave in the version that made it, see
+            :data:`engine.versions.RESULTS`; versions that did not say so gave the first.
+    """
 
     attempt: int
     stage: str
     step: int
     files: tuple[TreeFile, ...]
+    results: int = field(default_factory=lambda: versions.RESULTS)
 
     def as_row(self) -> dict[str, Any]:
         """As JSON values."""
@@ -55,13 +66,14 @@ class Checkpoint:
             "stage": self.stage,
             "step": self.step,
             "files": [file.model_dump() for file in self.files],
+            "results": self.results,
         }
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> "Checkpoint":
         """From JSON values."""
         files = tuple(TreeFile.model_validate(file) for file in row["files"])
-        return cls(row["attempt"], row["stage"], row["step"], files)
+        return cls(row["attempt"], row["stage"], row["step"], files, row.get("results", 1))
 
     def is_beyond(self, other: "Checkpoint | None") -> bool:
         """Whether the work is further than at ``other``."""
