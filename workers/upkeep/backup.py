@@ -87,7 +87,7 @@ def back_up(
         steps = [name for (name,) in connection.execute(
             "SELECT name FROM schema_steps WHERE component = %s ORDER BY name", [OURS]
         )]  # fmt: skip
-        sequences = dict(connection.execute(
+        sequences: dict[str, int] = dict(connection.execute(
             "SELECT sequencename, last_value FROM pg_sequences "
             "WHERE schemaname = current_schema() AND last_value IS NOT NULL"
         ).fetchall())  # fmt: skip
