@@ -12,6 +12,7 @@ import engine
 from engine.errors import OctasplatError
 from service.auditing import AuditTrail
 from service.forwarding import ProxyHeaders
+from service.gate import Gate
 from service.guards import BodyGuard, HostGuard, OriginGuard, SafeHeaders
 from service.guesses import Guesses
 from service.hub import EventHub
@@ -125,13 +126,19 @@ async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
                 room,
                 guesses,
                 settings.spool(),
-                settings.checks(),
+                _checks(settings),
             )
         finally:
             await room.close()
             hub.close()
             listening.cancel()
             await asyncio.gather(listening, return_exceptions=True)
+
+
+def _checks(settings: ServiceSettings) -> Gate:
+    """Lets in those whose datasets are checked; half of the places are there for other owners."""
+    at_once, waiting = settings.max_checks, settings.max_waiting_checks
+    return Gate("datasets", at_once=at_once, waiting=waiting, of_one_owner=-(-(at_once + waiting) // 2))
 
 
 def _describe_problems(app: FastAPI) -> None:

@@ -6,7 +6,6 @@ from pydantic import Field, IPvAnyNetwork, SecretStr
 
 from engine.errors import ConfigError
 from service.forwarding import Dialect
-from service.gate import Gate
 from service.intake.dataset import DatasetLimits
 from service.intake.model_check import ModelLimits
 from service.intake.receive import UploadLimits
@@ -116,13 +115,6 @@ class ServiceSettings(WorkerSettings):
         """Room for archives."""
         folder = self.work_folder / "archives"
         return Spool(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
-
-    def checks(self) -> Gate:
-        """Lets in those whose datasets are checked; half of the places are there for other owners."""
-        most = self.max_checks + self.max_waiting_checks
-        return Gate(
-            "datasets", at_once=self.max_checks, waiting=self.max_waiting_checks, of_one_owner=-(-most // 2)
-        )
 
     def check_public(self, has_token: bool) -> None:
         """Refuse to be reached from elsewhere by everybody.

@@ -30,8 +30,6 @@ class ToyOptions(BaseModel):
     hog_bytes: int = 0
     fill_bytes: int = 0
     """Written to its folder at the beginning of every attempt."""
-    disk_bytes: int = 0
-    """What it is estimated to need."""
     result_bytes: int = 0
     log_lines: int = 0
     hold_at: int | None = None
