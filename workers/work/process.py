@@ -165,7 +165,7 @@ class _Worker:
         chores = [
             asyncio.create_task(keep_doing(chore))
             for chore in (
-                Chore(self._say_alive, settings.heartbeat_seconds, settings.stale_seconds),
+                Chore(self._say_alive, settings.heartbeat_seconds, max(60.0, settings.stale_seconds)),
                 Chore(self._rescue, settings.rescue_seconds),
                 Chore(self._sweep, SWEEP_SECONDS),
                 Chore(self._sweep_store, STORE_SWEEP_SECONDS),
