@@ -49,37 +49,40 @@ def export_losses(gaussians: FlatGaussians, path: Path, format: str | None = Non
     return tuple(lines)
 
 
-def check_surface_path(path: Path, *, textured: bool) -> None:
+def check_surface_path(path: Path, *, textured: bool, lit: bool = False) -> None:
     """Refuse names that no writer takes, before the long work.
 
     Raises:
-        ConfigError: the suffix is unknown, or cannot hold a texture.
+        ConfigError: the suffix is unknown, or cannot hold a texture or materials.
     """
-    _surface_writer(path, textured)
+    _surface_writer(path, textured, lit)
 
 
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     """Write ``mesh`` as GLB, PLY or OBJ, as its suffix says, and return every file written, ``path`` first.
 
     GLB: unlit, the colours being those of the photographs with their light; normals are there for who wants
-    to light it anew. Its root node turns COLMAP's frame to glTF's. PLY and OBJ keep the world frame. OBJ
+    to light it anew. Its root node turns COLMAP's frame to glTF's. With materials it is lit, and the node
+    turns the light's up to glTF's. PLY and OBJ keep the world frame. OBJ
     with vertex colours writes them behind the positions; with a texture, an MTL and a PNG lie beside it.
 
     Raises:
         ConfigError: the suffix does not fit.
         SceneFileError: the file cannot be written.
     """
-    writer = _surface_writer(path, textured=mesh.texture_srgb is not None)
+    writer = _surface_writer(path, mesh.texture_srgb is not None, mesh.materials is not None)
     try:
         return writer.write(mesh, path)
     except OSError as error:
         raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
 
 
-def _surface_writer(path: Path, textured: bool) -> SurfaceWriter:
+def _surface_writer(path: Path, textured: bool, lit: bool) -> SurfaceWriter:
     writer = surface_writer_for(path)
     if writer is None:
         raise ConfigError(f"{path}: a surface is written as {surface_suffixes()}; name one of these.")
+    if lit and not writer.lit:
+        raise ConfigError(f"{path}: materials are written as .glb; name one, or leave the materials out.")
     if textured and not writer.textured:
         raise ConfigError(f"{path}: a PLY holds no texture; name a .glb or .obj, or leave the texture out.")
     return writer

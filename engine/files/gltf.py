@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike
 
 from engine.errors import SceneFileError
 from engine.gaussians.channels import column_names
-from engine.gaussians.frames import rotation_matrices
+from engine.gaussians.frames import quaternions, rotation_matrices
 from engine.writing import replacing
 
 MAX_BYTES = 2**32 - 1
@@ -145,6 +145,18 @@ def _node_matrix(node: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     return matrix
 
 
+def light_turn(light_frame: Float64[np.ndarray, "3 3"]) -> list[float]:
+    """The rotation of a root node (x, y, z, w) for what is lit.
+
+    It brings the light's up to y and its forward to x, which is how viewers and Blender lay environments.
+
+    Args:
+        light_frame: right, up and forward of the light, as rows in the world.
+    """
+    w, x, y, z = quaternions(light_frame[None, [2, 1, 0]])[0].tolist()
+    return [x, y, z, w]
+
+
 def padded(length: int) -> int:
     """``length`` rounded up to the four bytes to which a GLB aligns everything."""
     return -(-length // 4) * 4
@@ -177,11 +189,14 @@ class ChannelAttribute:
     width: int
 
 
-def channel_attributes(widths: Mapping[str, int]) -> tuple[ChannelAttribute, ...]:
-    """The attributes that hold channels: a vector for up to four numbers, else one scalar a number."""
+def channel_attributes(widths: Mapping[str, int], widest: int = 4) -> tuple[ChannelAttribute, ...]:
+    """The attributes that hold channels: a vector for up to ``widest`` numbers, else one scalar a number.
+
+    Meshes have scalars alone: Blender 5 opens none whose own attributes differ in width.
+    """
     found: list[ChannelAttribute] = []
     for name, width in widths.items():
-        if width <= max(WIDTHS.values()):
+        if width <= widest:
             found.append(ChannelAttribute(f"_{name.upper()}", name, slice(0, width), width))
         else:
             found += [

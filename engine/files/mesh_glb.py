@@ -7,6 +7,11 @@ coarse in the dark. Vertices stay in the world frame of COLMAP (y down, z forwar
 root node brings them to glTF's (y up). The scene is cut into spatial chunks, each with its own node, because
 viewers sort transparent objects, not triangles.
 
+The lit variant has the base colour of the materials in place of the colour, normals, and second texture
+coordinates that look metallic and roughness up in an image which holds all pairs: so every Gaussian has its
+own, to 8 bits, though glTF has one material for all. Light falls on it as viewers lay it, so its root node
+turns the light's up to y; it carries no ids, as it is not what edits come from.
+
 The opaque variant needs no sorting: alpha is cut at a threshold (``alphaMode`` MASK), and each octagon
 shrinks to the ellipse that is left of it.
 """
@@ -17,10 +22,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int, Int32
+from jaxtyping import Float32, Int, Int32, UInt8
 
 from engine.colour import srgb_to_linear
-from engine.errors import SceneFileError
+from engine.errors import ConfigError, SceneFileError
 from engine.files import gltf
 from engine.files.glb_materials import glb_materials, texture_frame
 from engine.files.gltf import GlbFile, channel_attributes, padded, write_glb
@@ -30,7 +35,13 @@ from engine.files.octagon_soup import OctagonBatch, OctagonSoup
 from engine.files.options import ExportOptions
 from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
 from engine.files.spatial import kd_chunks
-from engine.files.textures import png_bytes, white_with_alpha_png
+from engine.files.textures import (
+    material_ramp_png,
+    material_ramp_uv,
+    png_bytes,
+    white_with_alpha_png,
+)
+from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, has_materials
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import SIDES, octagon_triangles
 from engine.surface.mesh import TriangleMesh
@@ -39,6 +50,12 @@ COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_me
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}
 ATTRIBUTE_WIDTHS = {"uv": 2, "normal": 3, "colour": 3}
 UNLIT = "KHR_materials_unlit"
+SAMPLER = {
+    "magFilter": gltf.LINEAR,
+    "minFilter": gltf.LINEAR_MIPMAP_LINEAR,
+    "wrapS": gltf.CLAMP_TO_EDGE,
+    "wrapT": gltf.CLAMP_TO_EDGE,
+}
 
 Chunks = list[Int[np.ndarray, "_"]]
 
@@ -153,31 +170,42 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     A scene for which one file is too small goes into ``path``, ``<stem>.part2.glb`` and so on, by chunks.
 
     Raises:
+        ConfigError: the octagons are to be lit and have no materials.
         SceneFileError: nothing to write, or a chunk that is larger than the 4 GiB that a GLB can hold.
         OSError: a file cannot be written.
     """
+    ramp = b""
+    if options.light_up is not None:
+        if not has_materials(gaussians):
+            raise ConfigError(f"{path}: not written, as the scene has no materials to be lit by.")
+        options, ramp = options.model_copy(update={"ids": False}), material_ramp_png()
     soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
     png = white_with_alpha_png(options.texture_size, options.q)
-    parts = _parts(soup, path, len(png), options)
+    parts = _parts(soup, path, (len(png), len(ramp)), options)
     paths = [path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, len(parts) + 1))]
     for part_path, (layout, chunks) in zip(paths, parts, strict=True):
         bounds: list[Bounds] = []
-        data = _octagon_data(layout, soup, chunks, png, options.ids, bounds)
+        data = _octagon_data(layout, soup, chunks, (png, ramp), options, bounds)
         write_glb(part_path, layout.json_room, layout.length, data, lambda: layout.json(bounds))  # noqa: B023
     return tuple(paths)
 
 
 def _parts(
-    soup: OctagonSoup, path: Path, png_size: int, options: ExportOptions
+    soup: OctagonSoup, path: Path, png_sizes: tuple[int, int], options: ExportOptions
 ) -> list[tuple[GlbLayout, Chunks]]:
     """The fewest files that hold all chunks; neighbouring chunks stay together."""
     chunks = kd_chunks(soup.means_world, options.chunks)
-    channels = channel_attributes(soup.channel_widths)
+    channels = channel_attributes(soup.channel_widths, widest=1)
     for count in range(1, len(chunks) + 1):
         bounds = np.linspace(0, len(chunks), count + 1).astype(int).tolist()
         groups = [chunks[start:end] for start, end in itertools.pairwise(bounds)]
         parts = [
-            (GlbLayout([len(chunk) for chunk in group], png_size, options, extras, channels), group)
+            (
+                GlbLayout(
+                    [len(chunk) for chunk in group], png_sizes[0], options, extras, channels, png_sizes[1]
+                ),
+                group,
+            )
             for group, extras in zip(groups, _extras(soup, options, count), strict=True)
         ]
         if all(layout.total <= gltf.MAX_BYTES for layout, _ in parts):
@@ -197,29 +225,40 @@ def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[
 
 
 def _octagon_data(
-    layout: GlbLayout, soup: OctagonSoup, chunks: Chunks, png: bytes, ids: bool, bounds: list[Bounds]
+    layout: GlbLayout,
+    soup: OctagonSoup,
+    chunks: Chunks,
+    images: tuple[bytes, bytes],
+    options: ExportOptions,
+    bounds: list[Bounds],
 ) -> Iterator[bytes]:
     """The binary part in the order of the layout; adds the bounds of each chunk to ``bounds``."""
-    yield png.ljust(padded(len(png)), b"\0")
+    fall_off, ramp = images
+    yield fall_off.ljust(padded(len(fall_off)), b"\0")
     yield octagon_triangles(layout.largest).astype("<u4").tobytes()
-    if ids:
+    if options.ids:
         yield np.tile(np.arange(SIDES, dtype="<f4"), layout.largest).tobytes()
+    yield ramp.ljust(padded(len(ramp)), b"\0")
     for chunk in chunks:
         batch = soup.batch(chunk)
-        yield from _chunk_data(batch, ids)
+        yield from _chunk_data(batch, options)
         corners = batch.corners_world.reshape(-1, 3)
         bounds.append((corners.min(axis=0).tolist(), corners.max(axis=0).tolist()))
 
 
-def _chunk_data(batch: OctagonBatch, ids: bool) -> Iterator[bytes]:
+def _chunk_data(batch: OctagonBatch, options: ExportOptions) -> Iterator[bytes]:
     """The attributes of one chunk, in the order of the layout; all are multiples of four bytes."""
+    lit = options.light_up is not None
     yield batch.corners_world.astype("<f4").tobytes()
-    rgba = np.concatenate([srgb_to_linear(batch.rgb_srgb), batch.opacities[:, None]], axis=1)
-    yield _per_corner(rgba).tobytes()
+    rgb = np.clip(batch.channels[ALBEDO], 0.0, 1.0) if lit else srgb_to_linear(batch.rgb_srgb)
+    yield _per_corner(np.concatenate([rgb, batch.opacities[:, None]], axis=1)).tobytes()
     yield batch.uv.astype("<f4").tobytes()
-    if ids:
+    if lit:
+        yield _per_corner(batch.normals_world).tobytes()
+        yield _per_corner(material_ramp_uv(batch.channels[METALLIC], batch.channels[ROUGHNESS])).tobytes()
+    if options.ids:
         yield _per_corner(batch.ids[:, None]).tobytes()
-    for attribute in channel_attributes(batch.channels.widths):
+    for attribute in channel_attributes(batch.channels.widths, widest=1):
         yield _per_corner(batch.channels[attribute.channel][:, attribute.part]).tobytes()
 
 
@@ -228,66 +267,58 @@ def _per_corner(values: Float32[np.ndarray, "n c"] | Int[np.ndarray, "n c"]) -> 
 
 
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
-    """Write a surface, unlit, with normals, and with a texture or the colours of its vertices.
+    """Write a surface with normals and with a texture or the colours of its vertices.
+
+    Unlit, unless it has materials: then these are textures beside the base colour's, tangents say how its
+    normals lie, and the root node turns the light's up to y and its forward to x, which is how environments
+    lie in glTF's viewers and in Blender.
 
     Raises:
         SceneFileError: more than the 4 GiB that a GLB can hold.
         OSError: the file cannot be written.
     """
     attributes = {"POSITION": mesh.vertices_world, "NORMAL": mesh.vertex_normals()}
+    data = _SurfaceData()
     shading: dict[str, object] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material: dict[str, object] = {"name": "surface", "pbrMetallicRoughness": shading, "doubleSided": True}
+    node: dict[str, object] = {"name": "surface", "rotation": gltf.HALF_TURN_ABOUT_X, "mesh": 0}
     document: dict[str, object] = {
         "asset": {"version": "2.0", "generator": "octasplat"},
-        "extensionsUsed": [UNLIT],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "surface", "rotation": gltf.HALF_TURN_ABOUT_X, "mesh": 0}],
-        "materials": [
-            {
-                "name": "surface",
-                "pbrMetallicRoughness": shading,
-                "extensions": {UNLIT: {}},
-                "doubleSided": True,
-            }
-        ],
+        "nodes": [node],
+        "materials": [material],
     }
-    data: list[bytes] = []
-    views: list[dict[str, object]] = []
-
-    def add(piece: bytes, target: int | None = None) -> int:
-        """Add a buffer view and return its number."""
-        views.append({"buffer": 0, "byteOffset": sum(map(len, data)), "byteLength": len(piece)})
-        if target is not None:
-            views[-1]["target"] = target
-        data.append(piece.ljust(padded(len(piece)), b"\0"))
-        return len(views) - 1
-
+    if mesh.materials is None:
+        document["extensionsUsed"] = [UNLIT]
+        material["extensions"] = {UNLIT: {}}
+    else:
+        attributes["TANGENT"] = mesh.materials.tangents
+        node["rotation"] = gltf.light_turn(mesh.materials.light_frame)
     if mesh.texture_srgb is not None and mesh.uv is not None:
         attributes["TEXCOORD_0"] = mesh.uv
-        sampler = {
-            "magFilter": gltf.LINEAR,
-            "minFilter": gltf.LINEAR_MIPMAP_LINEAR,
-            "wrapS": gltf.CLAMP_TO_EDGE,
-            "wrapT": gltf.CLAMP_TO_EDGE,
-        }
-        image = {"name": "surface", "mimeType": "image/png", "bufferView": add(png_bytes(mesh.texture_srgb))}
-        document |= {"textures": [{"sampler": 0, "source": 0}], "samplers": [sampler], "images": [image]}
-        shading["baseColorTexture"] = {"index": 0}
+        shading["baseColorTexture"] = data.texture("surface", mesh.texture_srgb)
+        if mesh.materials is not None:
+            shading["metallicFactor"] = 1.0
+            packed = data.texture("materials", mesh.materials.occlusion_roughness_metallic)
+            shading["metallicRoughnessTexture"] = packed
+            material["occlusionTexture"] = packed
+            material["normalTexture"] = data.texture("normals", mesh.materials.normals)
+        document |= {"textures": data.textures, "samplers": [SAMPLER], "images": data.images}
     elif mesh.rgb_srgb is not None:
         attributes["COLOR_0"] = srgb_to_linear(mesh.rgb_srgb)
     accessors: list[dict[str, object]] = []
     used: dict[str, int] = {}
     for semantic, values in attributes.items():
-        view = add(np.ascontiguousarray(values, "<f4").tobytes(), gltf.ARRAY_BUFFER)
+        view = data.add(np.ascontiguousarray(values, "<f4").tobytes(), gltf.ARRAY_BUFFER)
         used[semantic] = len(accessors)
         accessors.append(gltf.accessor(view, gltf.FLOAT, len(values), gltf.vector_type(values.shape[1])))
     accessors[0] |= {
         "min": mesh.vertices_world.min(axis=0).tolist(),
         "max": mesh.vertices_world.max(axis=0).tolist(),
     }
-    view = add(mesh.faces.astype("<u4").tobytes(), gltf.ELEMENT_ARRAY_BUFFER)
+    view = data.add(mesh.faces.astype("<u4").tobytes(), gltf.ELEMENT_ARRAY_BUFFER)
     accessors.append(gltf.accessor(view, gltf.UNSIGNED_INT, mesh.faces.size, "SCALAR"))
-    length = sum(map(len, data))
     document |= {
         "meshes": [
             {
@@ -296,16 +327,51 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
             }
         ],
         "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": length}],
+        "bufferViews": data.views,
+        "buffers": [{"byteLength": data.length}],
     }
     text = gltf.json_bytes(document)
     room = padded(len(text))
-    if gltf.glb_bytes(room, length) > gltf.MAX_BYTES:
+    if gltf.glb_bytes(room, data.length) > gltf.MAX_BYTES:
         advice = "Decimate it with --max-triangles, or name a .ply."
-        raise gltf.too_large(path, "the surface needs", gltf.glb_bytes(room, length), advice)
-    write_glb(path, room, length, data, lambda: text)
+        raise gltf.too_large(path, "the surface needs", gltf.glb_bytes(room, data.length), advice)
+    write_glb(path, room, data.length, data.pieces, lambda: text)
     return (path,)
+
+
+class _SurfaceData:
+    """The binary part of a surface as it grows, and what the document says of it.
+
+    Attributes:
+        pieces: in the order of the file.
+        length: bytes of all pieces.
+        views: of the buffer.
+        textures: of the document.
+        images: likewise.
+    """
+
+    def __init__(self) -> None:
+        self.pieces: list[bytes] = []
+        self.length = 0
+        self.views: list[dict[str, object]] = []
+        self.textures: list[dict[str, object]] = []
+        self.images: list[dict[str, object]] = []
+
+    def add(self, piece: bytes, target: int | None = None) -> int:
+        """Add a buffer view and return its number."""
+        self.views.append({"buffer": 0, "byteOffset": self.length, "byteLength": len(piece)})
+        if target is not None:
+            self.views[-1]["target"] = target
+        self.pieces.append(piece.ljust(padded(len(piece)), b"\0"))
+        self.length += len(self.pieces[-1])
+        return len(self.views) - 1
+
+    def texture(self, name: str, pixels: UInt8[np.ndarray, "h w 3"]) -> dict[str, object]:
+        """Add an image and return how a material names it."""
+        view = self.add(png_bytes(pixels))
+        self.images.append({"name": name, "mimeType": "image/png", "bufferView": view})
+        self.textures.append({"sampler": 0, "source": len(self.images) - 1})
+        return {"index": len(self.textures) - 1}
 
 
 register(
@@ -318,4 +384,4 @@ register(
     )
 )
 register(MeshReader("glb", ("*.glb",), read, read_looks))
-register(SurfaceWriter("glb", ("*.glb",), write_surface, textured=True))
+register(SurfaceWriter("glb", ("*.glb",), write_surface, textured=True, lit=True))

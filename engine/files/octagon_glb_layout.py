@@ -17,11 +17,13 @@ from engine.files.gltf import (
     accessor,
     glb_bytes,
     json_bytes,
+    light_turn,
     padded,
     vector_type,
 )
 from engine.files.options import ExportOptions
 from engine.gaussians.octagon import FAN, SIDES
+from engine.shading.environment_frame import environment_frame
 
 OPAQUE_CUTOFF = 0.2
 """``opaque``: a pixel is drawn where opacity times fall-off reaches this; best of 0.03 to 0.6 on a
@@ -46,6 +48,8 @@ class Attribute:
 
 OWN_ATTRIBUTES = (Attribute("POSITION", 3), Attribute("COLOR_0", 4), Attribute("TEXCOORD_0", 2))
 GID = Attribute("_GID", 1)
+LIT_ATTRIBUTES = (Attribute("NORMAL", 3), Attribute("TEXCOORD_1", 2))
+"""Where light is to fall: the second coordinates look metallic and roughness up."""
 CORNER = Attribute("_CORNER", 1)
 
 
@@ -67,13 +71,18 @@ class GlbLayout:
         options: ExportOptions,
         extras: object,
         channels: Sequence[ChannelAttribute] = (),
+        ramp_size: int = 0,
     ) -> None:
-        """Plan a file of chunks of so many octagons; ``extras`` goes into the JSON's ``asset``."""
+        """Plan a file of chunks of so many octagons; ``extras`` goes into the JSON's ``asset``.
+
+        Of what is lit, ``ramp_size`` is the size of the image that materials are looked up in.
+        """
         self._chunk_sizes = chunk_sizes
         self._options = options
         self._extras = extras
         self._attributes = (
             *OWN_ATTRIBUTES,
+            *(LIT_ATTRIBUTES if options.light_up is not None else ()),
             *((GID,) if options.ids else ()),
             *(Attribute(channel.semantic, channel.width) for channel in channels),
         )
@@ -84,6 +93,8 @@ class GlbLayout:
         self._add_view(self.largest * len(FAN) * 3 * 4, target=ELEMENT_ARRAY_BUFFER)
         if options.ids:
             self._add_view(self.largest * SIDES * 4, target=ARRAY_BUFFER, byteStride=4)
+        if options.light_up is not None:
+            self._add_view(ramp_size)
         self._shared_views = len(self._views)
         for size in chunk_sizes:
             for attribute in self._attributes:
@@ -118,41 +129,48 @@ class GlbLayout:
                 {"primitives": [{"attributes": used, "indices": len(accessors) - 1, "material": 0}]}
             )
         chunks = range(len(self._chunk_sizes))
+        lit = self._options.light_up is not None
+        turn = light_turn(environment_frame(np.array(self._options.light_up))) if lit else HALF_TURN_ABOUT_X
+        images = [{"name": "radial_alpha", "mimeType": "image/png", "bufferView": 0}]
+        if lit:
+            ramp = {"name": "materials", "mimeType": "image/png", "bufferView": self._shared_views - 1}
+            images.append(ramp)
         nodes: list[dict[str, object]] = [
-            {"name": "octasplat", "rotation": HALF_TURN_ABOUT_X, "children": [1 + chunk for chunk in chunks]},
+            {"name": "octasplat", "rotation": turn, "children": [1 + chunk for chunk in chunks]},
             *({"name": f"octagons_{chunk:02d}", "mesh": chunk} for chunk in chunks),
         ]
         return {
             "asset": {"version": "2.0", "generator": "octasplat", "extras": self._extras},
-            "extensionsUsed": ["KHR_materials_unlit"],
+            **({} if lit else {"extensionsUsed": ["KHR_materials_unlit"]}),
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": nodes,
             "meshes": meshes,
-            "materials": [_material(self._options.opaque)],
-            "textures": [{"sampler": 0, "source": 0}],
+            "materials": [_material(self._options.opaque, lit)],
+            "textures": [{"sampler": 0, "source": number} for number in range(len(images))],
             "samplers": [
                 {"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
             ],
-            "images": [{"name": "radial_alpha", "mimeType": "image/png", "bufferView": 0}],
+            "images": images,
             "accessors": accessors,
             "bufferViews": self._views,
             "buffers": [{"byteLength": self.length}],
         }
 
 
-def _material(opaque: bool) -> dict[str, object]:
+def _material(opaque: bool, lit: bool) -> dict[str, object]:
     transparency: dict[str, object] = {"alphaMode": "BLEND"}
     if opaque:
         transparency = {"alphaMode": "MASK", "alphaCutoff": OPAQUE_CUTOFF}
+    shading: dict[str, object] = {"baseColorTexture": {"index": 0}}
+    if lit:
+        shading["metallicRoughnessTexture"] = {"index": 1, "texCoord": 1}
+    else:
+        shading |= {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     return {
         "name": "octagons",
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": 0},
-            "metallicFactor": 0.0,
-            "roughnessFactor": 1.0,
-        },
-        "extensions": {"KHR_materials_unlit": {}},
+        "pbrMetallicRoughness": shading,
+        **({} if lit else {"extensions": {"KHR_materials_unlit": {}}}),
         **transparency,
         "doubleSided": True,
     }

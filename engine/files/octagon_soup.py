@@ -31,6 +31,7 @@ class OctagonBatch:
         rgb_srgb: colour of the constant harmonic in [0, 1], display values.
         opacities: in (0, 1].
         radii: corner radii in standard deviations.
+        normals_world: unit normals, from where the corners run anticlockwise.
         channels: what else is known of the Gaussians.
     """
 
@@ -40,6 +41,7 @@ class OctagonBatch:
     rgb_srgb: Float32[np.ndarray, "n 3"]
     opacities: Float32[np.ndarray, " n"]
     radii: Float32[np.ndarray, " n"]
+    normals_world: Float32[np.ndarray, "n 3"]
     channels: Channels
 
 
@@ -116,7 +118,14 @@ class OctagonSoup:
         rgb = np.clip(part.base_rgb_srgb, 0.0, 1.0)
         channels = {name: array[ids] for name, array in self._gaussians.channels.items()}
         return OctagonBatch(
-            ids, corners, uv.astype(np.float32), rgb, self._opacities[ids], radii, Channels(channels)
+            ids,
+            corners,
+            uv.astype(np.float32),
+            rgb,
+            self._opacities[ids],
+            radii,
+            np.ascontiguousarray(part.rotations[:, :, 0]),
+            Channels(channels),
         )
 
     def batches(self) -> Iterator[OctagonBatch]:

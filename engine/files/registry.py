@@ -91,11 +91,13 @@ class SurfaceWriter(Entry):
         patterns: file names that it takes.
         write: writes the surface and returns every file written, the path itself first.
         textured: whether it can hold a texture.
+        lit: whether it can hold materials.
     """
 
     noun: ClassVar[str] = "surface"
     write: Callable[[TriangleMesh, Path], tuple[Path, ...]]
     textured: bool
+    lit: bool = False
 
 
 _TABLE = FormatTable(__name__.rpartition(".")[0])

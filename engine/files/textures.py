@@ -6,9 +6,11 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from engine.colour import to_bytes
+
+RAMP_SIDE = 256
 
 
 def radial_alpha(size: int, q: float) -> Float64[np.ndarray, "s s"]:
@@ -28,6 +30,22 @@ def white_with_alpha_png(size: int, q: float) -> bytes:
 def grey_png(size: int, q: float) -> bytes:
     """The fall-off as a grey image, as MTL's ``map_d`` wants it (it takes the luminance)."""
     return _png(to_bytes(radial_alpha(size, q))[..., None], colour_type=0)
+
+
+def material_ramp_png() -> bytes:
+    """Metallic in blue along u and roughness in green along v, each step of 8 bits one pixel; red is full."""
+    steps = np.arange(RAMP_SIDE, dtype=np.uint8)
+    pixels = np.full((RAMP_SIDE, RAMP_SIDE, 3), 255, np.uint8)
+    pixels[..., 1], pixels[..., 2] = steps[:, None], steps
+    return _png(pixels, colour_type=2)
+
+
+def material_ramp_uv(
+    metallic: Float32[np.ndarray, "n 1"], roughness: Float32[np.ndarray, "n 1"]
+) -> Float32[np.ndarray, "n 2"]:
+    """Where the ramp has these values, between its pixels too."""
+    both = np.clip(np.concatenate([metallic, roughness], axis=1), 0.0, 1.0)
+    return ((both * (RAMP_SIDE - 1) + 0.5) / RAMP_SIDE).astype(np.float32)
 
 
 def png_bytes(rgb_srgb: UInt8[np.ndarray, "h w 3"]) -> bytes:

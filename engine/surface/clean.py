@@ -1,7 +1,7 @@
 """Small parts removed, and decimation."""
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int32
+from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -12,13 +12,19 @@ UNTANGLING_ROUNDS = 5
 
 
 def face_components(mesh: TriangleMesh) -> Int32[np.ndarray, " m"]:
-    """The number of the connected part that each triangle belongs to; parts touch at vertices."""
-    a, b, c = mesh.faces.T
-    rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
-    count = len(mesh.vertices_world)
-    graph = coo_matrix((np.ones(len(rows), np.uint8), (rows, columns)), shape=(count, count))
+    """The number of the connected part that each triangle belongs to.
+
+    Parts hang together at edges: where two only touch at a vertex, they are two.
+    """
+    count = len(mesh.faces)
+    edges = np.sort(directed_edges(mesh.faces).astype(np.int64), axis=1)
+    keys = edges[:, 0] * (int(mesh.faces.max(initial=0)) + 1) + edges[:, 1]
+    order = np.argsort(keys, kind="stable")
+    same = keys[order[1:]] == keys[order[:-1]]
+    one, two = order[1:][same] // 3, order[:-1][same] // 3
+    graph = coo_matrix((np.ones(len(one), np.uint8), (one, two)), shape=(count, count))
     _, part = connected_components(graph, directed=False)
-    return part[a].astype(np.int32)
+    return part.astype(np.int32)
 
 
 def keep_large_components(
@@ -60,7 +66,7 @@ def decimate(mesh: TriangleMesh, max_triangles: int) -> TriangleMesh:
 def _untangled(mesh: TriangleMesh, *, closed: bool) -> TriangleMesh:
     """The mesh without triangles at edges that are crowded or twisted; what that opens is closed again.
 
-    Collapsing edges now and then folds a thin part onto itself.
+    Collapsing edges now and then folds a thin part onto itself, down to two triangles back to back.
     """
     for _ in range(UNTANGLING_ROUNDS):
         mesh = mesh.select_faces(_simple(mesh.faces))
@@ -72,12 +78,19 @@ def _untangled(mesh: TriangleMesh, *, closed: bool) -> TriangleMesh:
 
 
 def _simple(faces: Int32[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
-    """Which triangles have three corners, and edges with at most one other triangle that winds alike."""
+    """Which triangles have three corners that no other has, and edges along which no other winds alike."""
     edges = directed_edges(faces).astype(np.int64)
     size = int(faces.max(initial=0)) + 1
-    _, place, uses = np.unique(edges[:, 0] * size + edges[:, 1], return_inverse=True, return_counts=True)
     # An edge used twice in one direction is crowded or twisted.
-    alone = (uses[place.reshape(-1)] == 1).reshape(-1, 3).all(axis=1)
-    distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    result: np.ndarray = alone & distinct
+    alone = _once(edges[:, 0] * size + edges[:, 1]).reshape(-1, 3).all(axis=1)
+    low, middle, high = np.sort(faces.astype(np.int64), axis=1).T
+    distinct = (low < middle) & (middle < high)
+    _, pair = np.unique(low * size + middle, return_inverse=True)
+    result: np.ndarray = alone & distinct & _once(pair.reshape(-1) * size + high)
     return result
+
+
+def _once(keys: Int64[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+    """Which keys are there once."""
+    _, place, uses = np.unique(keys, return_inverse=True, return_counts=True)
+    return np.asarray(uses[place.reshape(-1)] == 1)

@@ -1,6 +1,7 @@
-"""Colours of surface points, as the cameras that see them best see them."""
+"""Colours and materials of surface points, as the cameras that see them best see them."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -9,18 +10,36 @@ from engine.rays import RayBatch
 from engine.render.cameras import RenderCamera
 from engine.surface.mesh import TriangleMesh
 from engine.surface.occlusion import Occluder
-from engine.trace.protocol import Tracer
+from engine.trace.protocol import Tracer, TraceResult
 
 Progress = Callable[[int, int], None]
 BEST_VIEWS = 3
 POINTS_AT_ONCE = 1 << 15
 MIN_COSINE = 0.1
-UNSEEN_RGB_SRGB = 0.5
+UNSEEN = 0.5
 MIN_ALPHA = 0.25
 """Rays that the scene covers less than this say nothing of its colour."""
 
 
-def bake_colours(
+@dataclass(frozen=True)
+class Look:
+    """What is wanted of rays.
+
+    Attributes:
+        width: how many numbers.
+        read: takes them from a trace; what shows through the scene is none of it. Rays that met nothing may
+            give anything.
+    """
+
+    width: int
+    read: Callable[[TraceResult], Float32[np.ndarray, "r c"]]
+
+
+COLOURS = Look(3, lambda seen: np.clip(seen.rgb_srgb / seen.alpha[:, None], 0.0, 1.0))
+"""Display values."""
+
+
+def bake(
     points_world: Float32[np.ndarray, "n 3"],
     normals_world: Float32[np.ndarray, "n 3"],
     mesh: TriangleMesh,
@@ -28,36 +47,40 @@ def bake_colours(
     tracer: Tracer,
     tolerance: float,
     progress: Progress = lambda _done, _total: None,
-) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    look: Look = COLOURS,
+) -> tuple[Float32[np.ndarray, "n c"], Bool[np.ndarray, " n"]]:
     """Trace the scene along the rays from the best cameras to points on its surface.
 
     The best cameras of a point are those that have it in their image, unhidden by the mesh, and look at it
-    most squarely and from nearby. Their colours are averaged with the squares of that measure as weights.
+    most squarely and from nearby. What they see is averaged with the squares of that measure as weights.
 
     Args:
-        points_world: where colours are wanted.
+        points_world: where something is to be known.
         normals_world: unit normals there, outwards.
         mesh: the surface, which hides points from cameras.
         cameras: candidates.
         tracer: with the scene built.
         tolerance: surface this near to a point (world units) does not hide it.
         progress: told (points done, points in all).
+        look: what; display colours unless something else is asked for.
 
     Returns:
-        Display colours, grey where no camera sees the point, and whether one does.
+        The means, 0.5 where no camera sees the point, and whether one does.
     """
     occluder = Occluder(mesh)
-    rgb_srgb = np.full((len(points_world), 3), UNSEEN_RGB_SRGB, np.float32)
-    seen = np.zeros(len(points_world), dtype=bool)
+    means: list[np.ndarray] = []
+    seen: list[np.ndarray] = []
     progress(0, len(points_world))
     for start in range(0, len(points_world), POINTS_AT_ONCE):
         part = slice(start, start + POINTS_AT_ONCE)
         choice, weights = _best_cameras(
             points_world[part].astype(np.float64), normals_world[part], cameras, occluder, tolerance
         )
-        rgb_srgb[part], seen[part] = _mean_colours(points_world[part], choice, weights, cameras, tracer)
+        mean, met = _means(points_world[part], choice, weights, cameras, tracer, look)
+        means.append(mean)
+        seen.append(met)
         progress(min(start + POINTS_AT_ONCE, len(points_world)), len(points_world))
-    return rgb_srgb, seen
+    return np.concatenate(means), np.concatenate(seen)
 
 
 def _best_cameras(
@@ -92,16 +115,17 @@ def _best_cameras(
     return choice, weights
 
 
-def _mean_colours(
+def _means(
     points: Float32[np.ndarray, "n 3"],
     choice: np.ndarray,
     weights: Float32[np.ndarray, "n k"],
     cameras: Sequence[RenderCamera],
     tracer: Tracer,
-) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
+    look: Look,
+) -> tuple[Float32[np.ndarray, "n c"], Bool[np.ndarray, " n"]]:
     centres = np.stack([camera.centre_world for camera in cameras]).astype(np.float32)
     near_world = np.array([camera.near_world for camera in cameras], np.float32)
-    total = np.zeros((len(points), 3))
+    total = np.zeros((len(points), look.width))
     sums = np.zeros(len(points))
     for k in range(choice.shape[1]):
         used = np.flatnonzero(weights[:, k] > 0)
@@ -113,13 +137,13 @@ def _mean_colours(
         way = points[used] - origins
         directions = way / np.linalg.norm(way, axis=1, keepdims=True)
         traced = tracer.trace(RayBatch(origins, directions, near_world[choice[used, k]]))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            values = look.read(traced)
         solid = traced.alpha >= MIN_ALPHA
-        # What shows through the scene is not its colour.
-        rgb = traced.rgb_srgb[solid] / traced.alpha[solid, None]
         weight = weights[used[solid], k].astype(np.float64) ** 2
-        total[used[solid]] += weight[:, None] * np.clip(rgb, 0.0, 1.0)
+        total[used[solid]] += weight[:, None] * values[solid]
         sums[used[solid]] += weight
     seen = sums > 0
-    mean = np.full((len(points), 3), UNSEEN_RGB_SRGB)
+    mean = np.full(total.shape, UNSEEN)
     mean[seen] = total[seen] / sums[seen, None]
     return mean.astype(np.float32), seen

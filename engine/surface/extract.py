@@ -5,21 +5,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 from scipy.spatial import cKDTree
 
+from engine.colour import to_bytes
 from engine.events import Listener, ignore
 from engine.render.cameras import RenderCamera
 from engine.stages import counted_stage, stopping
 from engine.surface.clean import decimate, keep_large_components
-from engine.surface.colours import bake_colours
+from engine.surface.colours import COLOURS, bake
 from engine.surface.depth import render_depth_maps
 from engine.surface.holes import fill_holes
 from engine.surface.marching import surface_of
+from engine.surface.materials import MATERIALS, with_materials
 from engine.surface.mesh import EdgeReport, TriangleMesh, edge_report
 from engine.surface.options import SurfaceOptions
 from engine.surface.region import Region, choose_region, focus
-from engine.surface.texture import lay_out, with_texture
+from engine.surface.texture import TextureLayout, lay_out
 from engine.surface.volume import BYTES_PER_BLOCK, Volume, fuse
 from engine.trace.protocol import Tracer
 
@@ -54,6 +56,7 @@ def extract_surface(
     options: SurfaceOptions,
     *,
     scratch: Path,
+    light_frame: Float64[np.ndarray, "3 3"] | None = None,
     listener: Listener = ignore,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> ExtractedSurface:
@@ -64,6 +67,9 @@ def extract_surface(
         cameras: where depth and colours are rendered from.
         options: all settings.
         scratch: folder for a temporary file of 8 bytes for every pixel of the depth maps.
+        light_frame: bake materials, which the tracer then has as its first features
+            (:func:`engine.surface.materials.material_features`), for light with these rows right, up and
+            forward in the world; None bakes colours. Needs a texture.
         listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``unwrapping`` (with a texture) and
             ``colouring``.
         should_stop: asked now and then.
@@ -87,41 +93,55 @@ def extract_surface(
         mesh = surface_of(volume, options.min_weight)
         volume, found = None, len(mesh.faces)
         progress(1, 4)
-        mesh = keep_large_components(mesh, keep=options.keep_components, min_share=options.min_component)
+        mesh = _large_parts(mesh, options)
         progress(2, 4)
         max_rim = None if options.fill_holes is None else options.fill_holes * region.voxel_world
         mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
         progress(3, 4)
         if options.max_triangles is not None:
-            mesh = decimate(mesh, options.max_triangles)
+            # Thin parts may come apart.
+            mesh = _large_parts(decimate(mesh, options.max_triangles), options)
         progress(4, 4)
     edges = edge_report(mesh.faces)
     tolerance = TOLERANCE_VOXELS * region.voxel_world
-    layout = None
-    if options.texture_side is not None:
+    if options.texture_side is None:
+        assert light_frame is None, "materials need a texture"
+        with counted_stage("colouring", tell, 0) as progress:
+            normals = mesh.vertex_normals()
+            rgb, seen = bake(mesh.vertices_world, normals, mesh, cameras, tracer, tolerance, progress)
+            mesh = replace(mesh, rgb_srgb=_spread(mesh.vertices_world, rgb, seen))
+    else:
         with counted_stage("unwrapping", tell, 0):
             layout = lay_out(mesh, options.texture_side)
-    with counted_stage("colouring", tell, 0) as progress:
-        if layout is None or options.texture_side is None:
-            normals = mesh.vertex_normals()
-            rgb, seen = bake_colours(mesh.vertices_world, normals, mesh, cameras, tracer, tolerance, progress)
-            mesh = replace(mesh, rgb_srgb=_spread(mesh.vertices_world, rgb, seen))
-        else:
-            rgb, seen = bake_colours(
-                layout.points_world, layout.normals_world, mesh, cameras, tracer, tolerance, progress
-            )
-            rgb = _spread(layout.points_world, rgb, seen)
-            mesh = with_texture(layout, rgb, options.texture_side)
+        with counted_stage("colouring", tell, 0) as progress:
+            points, look = layout.points_world, COLOURS if light_frame is None else MATERIALS
+            baked, seen = bake(points, layout.normals_world, mesh, cameras, tracer, tolerance, progress, look)
+            mesh = _textured(layout, _spread(points, baked, seen), seen, light_frame)
     return ExtractedSurface(mesh, region, volume_bytes, found, closed, edges)
 
 
+def _large_parts(mesh: TriangleMesh, options: SurfaceOptions) -> TriangleMesh:
+    return keep_large_components(mesh, keep=options.keep_components, min_share=options.min_component)
+
+
+def _textured(
+    layout: TextureLayout,
+    baked: Float32[np.ndarray, "n c"],
+    seen: Bool[np.ndarray, " n"],
+    light_frame: Float64[np.ndarray, "3 3"] | None,
+) -> TriangleMesh:
+    if light_frame is not None:
+        return with_materials(layout, baked, seen, light_frame)
+    return replace(layout.mesh, texture_srgb=to_bytes(layout.image(baked)))
+
+
 def _spread(
-    points: Float32[np.ndarray, "n 3"], rgb: Float32[np.ndarray, "n 3"], seen: Bool[np.ndarray, " n"]
-) -> Float32[np.ndarray, "n 3"]:
-    """Colours with those of points that nobody sees taken from the nearest that somebody does."""
+    points: Float32[np.ndarray, "n 3"], baked: Float32[np.ndarray, "n c"], seen: Bool[np.ndarray, " n"]
+) -> Float32[np.ndarray, "n c"]:
+    """What was baked, with that of points that nobody sees taken from the nearest that somebody does."""
     if seen.all() or not seen.any():
-        return rgb
+        return baked
     _, nearest = cKDTree(points[seen]).query(points[~seen])
-    filled = rgb.copy()
-    filled[~seen] = rgb[seen][nearest]
+    filled = baked.copy()
+    filled[~seen] = baked[seen][nearest]
     return filled

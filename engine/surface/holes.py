@@ -3,7 +3,7 @@
 import heapq
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 
 from engine.surface.mesh import TriangleMesh, directed_edges
 
@@ -52,9 +52,9 @@ def rims(faces: Int32[np.ndarray, "m 3"]) -> list[Rim]:
 def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh, int]:
     """Close the holes whose rim is no longer than ``max_rim`` (world units; None closes all).
 
-    A hole is closed by cutting off its sharpest corner again and again; where that would draw an edge that
-    the mesh has already, by a fan around a new vertex in its middle. The winding is that of the mesh around
-    it. To be done before colours are baked.
+    A hole is closed by cutting off its sharpest corner again and again; where that would draw an edge or a
+    triangle that the mesh has already, by a fan around a new vertex in its middle. The winding is that of the
+    mesh around it. To be done before colours are baked.
 
     Returns:
         The mesh, and the number of holes closed.
@@ -62,7 +62,9 @@ def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh,
     points = mesh.vertices_world.astype(np.float64)
     edges = np.sort(directed_edges(mesh.faces).astype(np.int64), axis=1)
     count = len(points)
-    taken = set((edges[:, 0] * count + edges[:, 1]).tolist())
+    keys = edges[:, 0] * count + edges[:, 1]
+    taken = set(keys.tolist())
+    lonely = _lonely(mesh.faces, keys)
     new_points: list[Float64[np.ndarray, 3]] = []
     new_faces: list[tuple[int, int, int]] = []
     closed = 0
@@ -72,7 +74,7 @@ def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh,
         if max_rim is not None and length > max_rim:
             continue
         closed += 1
-        patch = _cut_ears(rim, points, taken, count)
+        patch = None if frozenset(rim) in lonely else _cut_ears(rim, points, taken, count)
         if patch is None:
             middle = count + len(new_points)
             new_points.append(corners.mean(axis=0))
@@ -83,6 +85,13 @@ def fill_holes(mesh: TriangleMesh, max_rim: float | None) -> tuple[TriangleMesh,
     added: Float32[np.ndarray, "k 3"] = np.array(new_points, np.float32).reshape(-1, 3)
     faces = np.concatenate([mesh.faces, np.array(new_faces, np.int32).reshape(-1, 3)])
     return TriangleMesh(np.concatenate([mesh.vertices_world, added]), faces), closed
+
+
+def _lonely(faces: Int32[np.ndarray, "m 3"], edge_keys: Int64[np.ndarray, " e"]) -> set[frozenset[int]]:
+    """The corners of triangles without neighbours: their own rims, which their like would close."""
+    _, place, uses = np.unique(edge_keys, return_inverse=True, return_counts=True)
+    alone = (uses[place.reshape(-1)] == 1).reshape(-1, 3).all(axis=1)
+    return {frozenset(face) for face in faces[alone].tolist()}
 
 
 def _cut_ears(

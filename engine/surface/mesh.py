@@ -7,6 +7,25 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 
 @dataclass(frozen=True)
+class MaterialMaps:
+    """What a surface to be lit has beside its base colour: images that lie as its texture does.
+
+    Attributes:
+        occlusion_roughness_metallic: in red the share of the light from all around that arrives, roughness
+            in green, metallic in blue, each as it means.
+        normals: (n + 1) / 2 of unit normals along the tangent, the bitangent and the normal of the surface.
+        tangents: of the vertices: unit vectors in the world along which u grows, and the side (1 or -1) of
+            normal x tangent on which the bitangent lies, which points up in the image.
+        light_frame: right, up and forward of the light around it, as rows in the world.
+    """
+
+    occlusion_roughness_metallic: UInt8[np.ndarray, "h w 3"]
+    normals: UInt8[np.ndarray, "h w 3"]
+    tangents: Float32[np.ndarray, "n 4"]
+    light_frame: Float64[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True)
 class TriangleMesh:
     """Triangles in the world frame; corners run anticlockwise as seen from outside.
 
@@ -16,7 +35,10 @@ class TriangleMesh:
         rgb_srgb: display colours of the vertices in [0, 1]; None before they are baked.
         uv: texture coordinates of the vertices, (0, 0) at the upper left of the image as in glTF; None
             without a texture.
-        texture_srgb: the texture's display values; None without one.
+        texture_srgb: the texture's display values; None without one. With materials, the base colour's.
+        normals_world: unit normals of the vertices where they are not those of the triangles around them, as
+            at the seams of a mesh that was cut open; None elsewhere.
+        materials: how it is to be lit; None where its colours have their light in them.
     """
 
     vertices_world: Float32[np.ndarray, "n 3"]
@@ -24,6 +46,8 @@ class TriangleMesh:
     rgb_srgb: Float32[np.ndarray, "n 3"] | None = None
     uv: Float32[np.ndarray, "n 2"] | None = None
     texture_srgb: UInt8[np.ndarray, "h w 3"] | None = None
+    normals_world: Float32[np.ndarray, "n 3"] | None = None
+    materials: MaterialMaps | None = None
 
     @property
     def face_corners_world(self) -> Float64[np.ndarray, "m 3 3"]:
@@ -38,7 +62,12 @@ class TriangleMesh:
         return np.asarray(0.5 * np.linalg.norm(across, axis=1))
 
     def vertex_normals(self) -> Float32[np.ndarray, "n 3"]:
-        """Area-weighted unit normals, outwards; (0, 0, 1) where a vertex has no triangle with an area."""
+        """The normals given, or area-weighted unit normals, outwards.
+
+        (0, 0, 1) where a vertex has no triangle with an area.
+        """
+        if self.normals_world is not None:
+            return self.normals_world
         corners = self.face_corners_world
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         sums = np.stack(
@@ -55,7 +84,7 @@ class TriangleMesh:
         return unit.astype(np.float32)
 
     def select_faces(self, index: Bool[np.ndarray, " m"] | Int64[np.ndarray, " k"]) -> "TriangleMesh":
-        """The triangles at ``index`` and the vertices that these use."""
+        """The triangles at ``index`` and the vertices that these use; of a mesh without materials."""
         faces = self.faces[index]
         used = np.zeros(len(self.vertices_world), dtype=bool)
         used[faces.reshape(-1)] = True
@@ -66,6 +95,7 @@ class TriangleMesh:
             faces=new_index[faces].astype(np.int32),
             rgb_srgb=None if self.rgb_srgb is None else self.rgb_srgb[used],
             uv=None if self.uv is None else self.uv[used],
+            normals_world=None if self.normals_world is None else self.normals_world[used],
         )
 
 

@@ -8,12 +8,13 @@ import OpenImageIO as oiio
 import pytest
 
 from engine.colour import srgb_to_linear
-from engine.errors import SceneFileError
+from engine.errors import ConfigError, SceneFileError
 from engine.files import ExportOptions, export_scene, gltf
 from engine.files.octagon_glb_layout import OPAQUE_CUTOFF
 from engine.files.spatial import kd_chunks
 from engine.files.textures import radial_alpha
 from engine.gaussians.frames import rotation_matrices
+from engine.gaussians.materials import MATERIAL_WIDTHS
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii
 
@@ -256,6 +257,52 @@ def test_channels_are_attributes_of_every_corner(make_scene: Make, tmp_path: Pat
     assert len(glb.primitives()) == 2
     for primitive in glb.primitives():
         ids = primitive["_GID"].astype(np.int64)
-        np.testing.assert_array_equal(primitive["_ALBEDO"], albedo[ids])
-        for place in range(5):
-            np.testing.assert_array_equal(primitive[f"_SPECTRUM_{place}"], spectrum[ids, place])
+        for name, values in (("_ALBEDO", albedo), ("_SPECTRUM", spectrum)):
+            for place in range(values.shape[1]):
+                np.testing.assert_array_equal(primitive[f"{name}_{place}"], values[ids, place])
+
+
+def test_lit_octagons_have_their_own_materials(make_scene: Make, tmp_path: Path) -> None:
+    count = 300
+    random = np.random.default_rng(1)
+    channels = {name: random.random((count, k), np.float32) for name, k in MATERIAL_WIDTHS.items()}
+    scene = make_scene(count).with_channels(channels)
+    export_scene(scene, tmp_path / "a.glb", ExportOptions(chunks=1, light_up=(0.0, 0.0, 1.0)))
+    glb = Glb(tmp_path / "a.glb")
+    (arrays,) = glb.primitives()
+    ids = np.flatnonzero(octagon_radii(scene.opacities) > 0)
+    (each,) = kd_chunks(scene.means_world[ids], 1)
+    of = np.repeat(ids[each], 8)
+    np.testing.assert_array_equal(arrays["COLOR_0"][:, :3], channels["albedo"][of])
+    # As a viewer looks it up: between the pixels' middles of an image of all pairs.
+    (material,) = glb.json["materials"]
+    look_up = material["pbrMetallicRoughness"]["metallicRoughnessTexture"]
+    assert look_up["texCoord"] == 1
+    (tmp_path / "ramp.png").write_bytes(glb.view(glb.json["images"][look_up["index"]]["bufferView"]))
+    ramp = oiio.ImageBuf(str(tmp_path / "ramp.png")).get_pixels(oiio.UINT8)
+    at = arrays["TEXCOORD_1"] * 256 - 0.5
+    low = np.minimum(at.astype(int), 254)
+    share = at - low
+    metallic, roughness = (
+        (1 - s) * ramp[low[:, 1], low[:, 0], band] + s * ramp[low[:, 1] + 1, low[:, 0] + 1, band]
+        for s, band in ((share[:, 0], 2), (share[:, 1], 1))
+    )
+    np.testing.assert_allclose(metallic / 255, channels["metallic"][of, 0], atol=1e-4)
+    np.testing.assert_allclose(roughness / 255, channels["roughness"][of, 0], atol=1e-4)
+    # Normals point to where the corners run anticlockwise.
+    normals = rotation_matrices(scene.quats_wxyz)[of][:, :, 0]
+    np.testing.assert_allclose(arrays["NORMAL"], normals, atol=1e-6)
+    corners = arrays["POSITION"].reshape(-1, 8, 3).astype(np.float64)
+    wound = np.cross(corners[:, 2] - corners[:, 0], corners[:, 4] - corners[:, 0])
+    assert ((wound * normals[::8]).sum(axis=1) > 0).all()
+    assert "extensions" not in material and "_GID" not in arrays
+    # The light's up, z, becomes y.
+    x, y, z, w = glb.json["nodes"][0]["rotation"]
+    turn = rotation_matrices(np.array([[w, x, y, z]]))[0]
+    np.testing.assert_allclose(turn @ [0, 0, 1], [0, 1, 0], atol=1e-12)
+
+
+def test_octagons_without_materials_cannot_be_lit(make_scene: Make, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="has no materials"):
+        export_scene(make_scene(5), tmp_path / "a.glb", ExportOptions(light_up=(0.0, 0.0, 1.0)))
+    assert list(tmp_path.iterdir()) == []

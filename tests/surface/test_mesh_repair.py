@@ -1,8 +1,11 @@
 """Components, holes and decimation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
+from scipy.ndimage import gaussian_filter
 from surface_shapes import sphere, volume_of
 
 from engine.surface.clean import decimate, face_components, keep_large_components
@@ -112,6 +115,40 @@ def test_thin_parts_do_not_come_out_tangled():
         small = decimate(whole, count)
         assert edge_report(small.faces).watertight, count
         assert len(small.faces) <= count + 10
+
+
+def torn(seed: int) -> TriangleMesh:
+    """A ball of noise in which not every voxel was seen: its parts touch at corners, and holes abound."""
+    random = np.random.default_rng(seed)
+    noise = gaussian_filter(random.standard_normal((32, 32, 32)), 1.0)
+    noise *= 5 / noise.std()
+    whole = volume_of(lambda p: sphere(p) + noise[tuple(np.clip((p + 16).astype(int), 0, 31).T)], 4)
+    weights = (random.random(whole.weights.shape) > 0.03).astype(np.float32)
+    return surface_of(replace(whole, weights=weights), 0.5)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_one_closed_part_is_one_closed_part_without_anything_twice(seed):
+    whole = torn(seed)
+    one, closed = fill_holes(keep_large_components(whole, keep=1), None)
+    assert closed > 100
+    small = keep_large_components(decimate(one, 3000), keep=1)
+    every, _ = fill_holes(whole, None)
+    for mesh, parts in ((one, 1), (small, 1), (every, None)):
+        as_theirs = trimesh.Trimesh(mesh.vertices_world, mesh.faces, process=False)
+        assert as_theirs.is_watertight and as_theirs.is_winding_consistent
+        assert edge_report(mesh.faces).watertight
+        assert as_theirs.unique_faces().all()
+        if parts is not None:
+            assert as_theirs.body_count == parts
+            assert len(face_components(mesh)) == len(mesh.faces) and face_components(mesh).max() == parts - 1
+
+
+def test_a_lone_triangle_is_closed_by_more_than_itself():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    filled, closed = fill_holes(TriangleMesh(corners, np.array([[0, 1, 2]], np.int32)), None)
+    assert closed == 1 and edge_report(filled.faces).watertight
+    assert len(np.unique(np.sort(filled.faces, axis=1), axis=0)) == len(filled.faces) == 4
 
 
 def test_normals_point_outwards():

@@ -132,6 +132,8 @@ def test_an_obj_keeps_order_six_decimals_colours_and_texture_coordinates(
 
 
 def test_a_glb_keeps_ids_and_exact_positions(scene: FlatGaussians, tmp_path: Path) -> None:
+    albedo = np.random.default_rng(0).random((COUNT, 3), np.float32)
+    scene = scene.with_channels({"albedo": albedo, "metallic": albedo[:, :1]})  # of several widths
     export_scene(scene, tmp_path / "a.glb", ExportOptions(chunks=2))
     run_blender(SCRIPTS / "round_trip.py", tmp_path / "a.glb", tmp_path / "b.glb")
     corners_world = octagon_corners_world(scene, octagon_radii(scene.opacities))
@@ -140,6 +142,8 @@ def test_a_glb_keeps_ids_and_exact_positions(scene: FlatGaussians, tmp_path: Pat
         gid, corner = attributes["_GID"].astype(int), attributes["_CORNER"].astype(int)
         seen[gid, corner] += 1
         np.testing.assert_array_equal(attributes["POSITION"], corners_world[gid, corner])
+        np.testing.assert_array_equal(attributes["_METALLIC"], albedo[gid, 0])
+        np.testing.assert_array_equal(attributes["_ALBEDO_2"], albedo[gid, 2])
     np.testing.assert_array_equal(
         seen, np.broadcast_to(octagon_radii(scene.opacities)[:, None] > 0, seen.shape)
     )

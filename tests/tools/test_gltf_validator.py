@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from engine.files import ExportOptions, export_scene
+from engine.gaussians.materials import MATERIAL_WIDTHS
 from engine.gaussians.model import FlatGaussians
 
 pytestmark = pytest.mark.tools
 
 
-@pytest.mark.parametrize("settings", [{}, {"ids": False}, {"opaque": True}, {"chunks": 1}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"ids": False}, {"opaque": True}, {"chunks": 1}, {"light_up": (0, 0, 1)}]
+)
 @pytest.mark.parametrize("count", [1, 3, 5001])
 def test_the_khronos_validator_finds_nothing_wrong(
     validate_glb: Callable[[Path], dict[str, Any]], tmp_path: Path, count: int, settings: dict[str, Any]
@@ -24,6 +27,10 @@ def test_the_khronos_validator_finds_nothing_wrong(
     scene = FlatGaussians(
         normal(count, 3), normal(count, 4), normal(count, 2) - 3, normal(count) + 5, normal(count, 1, 3)
     )
+    if "light_up" in settings:
+        scene = scene.with_channels(
+            {name: np.full((count, k), 0.5, np.float32) for name, k in MATERIAL_WIDTHS.items()}
+        )
     export_scene(scene, tmp_path / "scene.glb", ExportOptions(texture_size=64, **settings))
     report = validate_glb(tmp_path / "scene.glb")
     issues = report["issues"]

@@ -1,6 +1,8 @@
 """What ``octasplat surface`` does once its options are understood."""
 
+import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,36 +14,54 @@ from engine.config import read_config
 from engine.errors import ConfigError, OutputError
 from engine.files import check_surface_path, write_surface
 from engine.files.gaussian_ply import read_near_world
+from engine.gaussians.materials import require_materials
 from engine.gaussians.model import FlatGaussians
 from engine.render.cameras import RenderCamera
-from engine.run_folder import CONFIG, SCENE, is_run, run_viewpoints
+from engine.run_folder import CONFIG, ENVIRONMENT, SCENE, is_run, run_viewpoints
 from engine.scene import load_scene
+from engine.shading.environment_frame import environment_frame
 from engine.surface.cameras import cameras_around, photograph_cameras
 from engine.surface.extract import ExtractedSurface, extract_surface
+from engine.surface.materials import material_features
 from engine.surface.options import SurfaceOptions
 from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
+from engine.writing import replacing
 from workers.cli.progress import show_progress
 from workers.cli.scene_files import open_scene
+from workers.rendering.cameras import light_up
+
+MATERIAL_DEFAULTS = {"texture_side": 1024, "max_triangles": 60_000}
+"""With materials, where nothing else is said."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a surface is wanted of, and where.
+
+    Attributes:
+        source: folder of a run, or a file of Gaussians.
+        output: the mesh's file.
+        scene: folder of photographs, see the command.
+        materials: whether it is to be lit.
+        up: the axis that then points up; None for that of the run.
+    """
+
+    source: Path
+    output: Path
+    scene: Path | None
+    materials: bool = False
+    up: str | None = None
 
 
 def run_surface(
-    source: Path,
-    output: Path,
-    given: dict[str, Any],
-    scene: Path | None,
-    *,
-    threads: int,
-    quiet: bool,
-    should_stop: Callable[[], bool],
+    asked: Asked, given: dict[str, Any], *, threads: int, quiet: bool, should_stop: Callable[[], bool]
 ) -> None:
     """Extract a surface and write it.
 
     Args:
-        source: folder of a run, or a file of Gaussians.
-        output: the mesh's file.
+        asked: of what, and where.
         given: fields of :class:`SurfaceOptions`.
-        scene: folder of photographs, see the command.
         threads: for everything; 0 means all cores.
         quiet: show warnings only.
         should_stop: asked now and then.
@@ -50,28 +70,64 @@ def run_surface(
         OctasplatError: something cannot be read, found or written.
         Cancelled: stopped as asked.
     """
+    source, output = asked.source, asked.output
     try:
-        options = SurfaceOptions.model_validate(given)
+        options = SurfaceOptions.model_validate(MATERIAL_DEFAULTS | given if asked.materials else given)
     except ValidationError as error:
         raise ConfigError(f"{error.errors()[0]['msg'].removeprefix('Value error, ')}.") from None
-    check_surface_path(output, textured=options.texture_side is not None)
+    check_surface_path(output, textured=options.texture_side is not None, lit=asked.materials)
     gaussians = _read_gaussians(source, quiet)
-    cameras, settings = _cameras(source, scene, gaussians, options)
+    features, frame, light = None, None, None
+    if asked.materials:
+        require_materials(gaussians, source / SCENE if is_run(source) else source)
+        features, frame = material_features(gaussians), environment_frame(light_up(source, asked.up))
+        light = _light_to_copy(source, output)
+    cameras, settings = _cameras(source, asked.scene, gaussians, options)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{output.parent} cannot be made ({error.strerror or error}).") from None
     tracer = make_tracer(settings, threads=threads, build_quality=2)
-    tracer.build(gaussians)
+    tracer.build(gaussians, features)
     with show_progress(quiet=quiet, should_stop=should_stop) as listener:
         extracted = extract_surface(
-            tracer, cameras, options, scratch=output.parent, listener=listener, should_stop=should_stop
-        )
+            tracer, cameras, options,
+            scratch=output.parent, light_frame=frame, listener=listener, should_stop=should_stop,
+        )  # fmt: skip
     files = write_surface(extracted.mesh, output)
+    if light is not None:
+        files = (*files, _copied(light, output.with_name(ENVIRONMENT)))
     if not quiet:
         click.echo(_summary(extracted))
         for path in files:
             click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")
+
+
+def _light_to_copy(source: Path, output: Path) -> Path | None:
+    """The run's environment, if it has one that is not beside the output already.
+
+    Raises:
+        OutputError: there is another one.
+    """
+    light, place = source / ENVIRONMENT, output.with_name(ENVIRONMENT)
+    if not (is_run(source) and light.exists()):
+        return None
+    if not place.exists():
+        return light
+    if place.samefile(light) or place.read_bytes() == light.read_bytes():
+        return None
+    raise OutputError(
+        f"{place} is another environment than that of {source}; remove it, or name a file elsewhere."
+    )
+
+
+def _copied(light: Path, place: Path) -> Path:
+    try:
+        with replacing(place) as temporary:
+            shutil.copyfile(light, temporary)
+    except OSError as error:
+        raise OutputError(f"{place} cannot be written ({error.strerror or error}).") from None
+    return place
 
 
 def _read_gaussians(source: Path, quiet: bool) -> FlatGaussians:

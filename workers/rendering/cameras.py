@@ -1,11 +1,13 @@
 """Cameras as the options of ``octasplat render`` or of a job say: a turntable, or a single one."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from engine.config import read_config
 from engine.gaussians.model import FlatGaussians
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.jobs import (
@@ -17,6 +19,7 @@ from engine.render.jobs import (
     turntable_cameras,
 )
 from engine.render.paths import Turntable, look_at
+from engine.run_folder import CONFIG, is_run
 from engine.scene.model import Viewpoints
 
 DEFAULT_FPS = 30.0
@@ -70,6 +73,21 @@ def _table(
     distance = options.get("distance") or float(np.hypot(table.radius, table.height))
     angle = np.arctan2(table.height, table.radius) if elevation is None else np.radians(elevation)
     return replace(table, radius=float(distance * np.cos(angle)), height=float(distance * np.sin(angle)))
+
+
+def light_up(source: Path, name: str | None) -> Float64[np.ndarray, "3"]:
+    """The direction in the world that is up for the light on a scene with materials.
+
+    Args:
+        source: folder of a run, or a file of Gaussians.
+        name: the axis that the user says; None for that of the run, or -y.
+
+    Raises:
+        ConfigError: the run's settings cannot be read.
+    """
+    if name is None and is_run(source) and (source / CONFIG).exists():
+        return np.array(read_config(source / CONFIG).train.materials.up_world, np.float64)
+    return axis_named(name or "-y")
 
 
 def axis_named(name: str) -> Float64[np.ndarray, "3"]:

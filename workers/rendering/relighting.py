@@ -26,7 +26,7 @@ from engine.render.renderer import background_colour
 from engine.run_folder import CONFIG, SCENE, is_run
 from engine.scene import load_scene
 from engine.shading.material_settings import MaterialSettings
-from workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
+from workers.rendering.cameras import DEFAULT_FPS, cameras_of_options, light_up
 from workers.rendering.views import Keeping, Series, Source, check_one_file, read_source, run_shots
 
 _FRESH = Keeping()
@@ -66,9 +66,7 @@ def relight_files(
     ply = options["source"] / SCENE if is_run(options["source"]) else options["source"]
     require_materials(source.gaussians, ply)
     learnt = read_config(options["source"] / CONFIG).train.materials if is_run(options["source"]) else None
-    up = axis_named(options["up"] or "-y")
-    if learnt is not None and options["up"] is None:
-        up = np.array(learnt.up_world, np.float64)
+    up = light_up(options["source"], options["up"])
     shots, fps = _shots(mode, options, source)
     paint = _Paint(
         _relighter(options, source, learnt),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from workers.cli.camera_options import AXES
 from workers.cli.options import quiet_option
 
 if TYPE_CHECKING:
@@ -59,6 +60,16 @@ class _ExportCommand(click.Command):
     help="GLB: cut alpha at a threshold instead of blending, for programs that cannot sort.",
 )
 @click.option(
+    "--materials",
+    is_flag=True,
+    help="GLB: base colour, metallic and roughness instead of colours that have their light in them.",
+)
+@click.option(
+    "--up",
+    type=click.Choice(AXES),
+    help="--materials: the axis that points up.  [default: the run's, of a file -y]",
+)
+@click.option(
     "--chunks",
     type=click.IntRange(1, 4096),
     default=64,
@@ -90,6 +101,8 @@ def export(
     sh_pad: int | None,
     spz_version: str,
     opaque: bool,
+    materials: bool,
+    up: str | None,
     chunks: int,
     texture_size: int,
     no_ids: bool,
@@ -101,16 +114,27 @@ def export(
     OUT's name says the format, unless --format does; the formats are listed below. Where two take a name, as
     *.ply and *.mesh.ply do, the longer pattern wins.
     """
+    if up and not materials:
+        raise click.UsageError("--up goes with --materials.")
     from engine.files import ExportOptions, export_scene, exporter_for
+    from engine.gaussians.materials import require_materials
     from engine.gaussians.octagon import CHI2_2_99
     from workers.cli.scene_files import open_scene, warn_of_losses
     from workers.cli.signals import orderly_termination
+    from workers.rendering.cameras import light_up
 
     exporter = exporter_for(target, format_name)  # complain before the long work
     if opaque and exporter.name != "glb":
         raise click.UsageError(f"--opaque is for GLB; {target} is written as {exporter.name}.")
+    if materials and exporter.name != "glb":
+        raise click.UsageError(f"--materials is for octagon GLB; {target} is written as {exporter.name}.")
     chosen = _colour(colour, source)
     gaussians = open_scene(source, quiet=quiet)
+    light = None
+    if materials:
+        require_materials(gaussians, source)
+        x, y, z = light_up(source, up).tolist()
+        light = (x, y, z)
     options = ExportOptions(
         q=CHI2_2_99 if q is None else q,
         min_opacity=min_opacity,
@@ -119,11 +143,13 @@ def export(
         chunks=chunks,
         texture_size=texture_size,
         ids=not no_ids,
+        light_up=light,
         spz_version=4 if spz_version == "4" else 3,
     )
-    warn_of_losses(gaussians, target, exporter.name)
+    if not materials:
+        warn_of_losses(gaussians, target, exporter.name)
     with orderly_termination():
-        if not exporter.holds_harmonics:
+        if not (exporter.holds_harmonics or materials):
             gaussians = _one_colour(gaussians, source, chosen)
         files = export_scene(gaussians, target, options, exporter.name)
     for path in () if quiet else files:

@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from workers.cli.camera_options import AXES
 from workers.cli.options import quiet_option, threads_option
 
 
@@ -83,6 +84,15 @@ def _box(_context: click.Context, _parameter: click.Parameter, value: str | None
     "--texture", "texture_side", type=click.IntRange(64, 16384), metavar="PX",
     help="Colours in a square texture of this side instead of in the vertices; .glb and .obj.",
 )  # fmt: skip
+@click.option(
+    "--materials",
+    is_flag=True,
+    help="Base colour, metallic, roughness and normals in textures, to be lit; .glb.",
+)
+@click.option(
+    "--up", type=click.Choice(AXES),
+    help="--materials: the axis that points up.  [default: the run's, of a file -y]",
+)  # fmt: skip
 @click.option("--max-memory", "max_memory_gb", type=float, metavar="GB", help="For the volume.  [default: 4]")
 @click.option(
     "--scene",
@@ -91,20 +101,37 @@ def _box(_context: click.Context, _parameter: click.Parameter, value: str | None
 )
 @threads_option
 @quiet_option
-def surface(source: Path, output: Path, scene: Path | None, threads: int, quiet: bool, **given: Any) -> None:
+def surface(
+    source: Path,
+    output: Path,
+    scene: Path | None,
+    materials: bool,
+    up: str | None,
+    threads: int,
+    quiet: bool,
+    **given: Any,
+) -> None:
     """Mesh IN, the folder of a run or a file of Gaussians, into one surface of coloured triangles.
 
     Depth is rendered from where the photographs were taken; for a file without --scene, from cameras all
     around, which suits an object but no room. The result lies in the frame of the scene.
+
+    --materials takes 60,000 triangles and a texture of 1,024 pixels where nothing else is said. Of a run,
+    environment.hdr goes beside the file.
     """
+    if up and not materials:
+        raise click.UsageError("--up goes with --materials.")
     from engine.errors import Cancelled
     from workers.cli.signals import Stopped, stop_on_signals
-    from workers.cli.surfacing import run_surface
+    from workers.cli.surfacing import Asked, run_surface
 
     # None means "all" for the holes, and the default for everything else.
     options = {name: value for name, value in given.items() if value is not None or name == "fill_holes"}
     with stop_on_signals() as should_stop:
         try:
-            run_surface(source, output, options, scene, threads=threads, quiet=quiet, should_stop=should_stop)
+            run_surface(
+                Asked(source, output, scene, materials=materials, up=up),
+                options, threads=threads, quiet=quiet, should_stop=should_stop,
+            )  # fmt: skip
         except Cancelled as error:
             raise Stopped(str(error), should_stop.exit_code) from None
