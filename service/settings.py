@@ -53,7 +53,6 @@ class ServiceSettings(WorkerSettings):
         max_priority: highest priority that whoever is no administrator may give.
         ping_seconds: how often a quiet stream of events gives a sign of life.
         max_streams: streams of events at once.
-        pool_size: connections to the database.
     """
 
     host: str = "127.0.0.1"
@@ -83,7 +82,6 @@ class ServiceSettings(WorkerSettings):
     max_priority: int = Field(10, ge=-100, le=100)
     ping_seconds: float = Field(15.0, gt=0)
     max_streams: int = Field(500, gt=0)
-    pool_size: int = Field(12, gt=1)
 
     @property
     def is_private(self) -> bool:

@@ -75,6 +75,7 @@ class WorkerSettings(BaseSettings):
             it has finished; 0 sets no limit.
         absent_queue_hours: a job that waits so long in a queue that no worker takes fails; 0 lets it wait.
         threads: of one job's program; 0 takes all cores.
+        pool_size: connections of a front end to the database.
         listen: hear of new jobs at once; False behind a pooler in transaction mode.
         kind_modules: further modules that register kinds of jobs.
         webhook_hosts: hosts of an inner network that webhooks may be sent to, also without TLS.
@@ -111,6 +112,7 @@ class WorkerSettings(BaseSettings):
     max_job_hours: float = Field(48.0, ge=0)
     absent_queue_hours: float = Field(72.0, ge=0)
     threads: int = Field(0, ge=0)
+    pool_size: int = Field(12, gt=1)
     listen: bool = True
     kind_modules: tuple[str, ...] = ()
     webhook_hosts: tuple[str, ...] = ()
@@ -172,6 +174,11 @@ class WorkerSettings(BaseSettings):
                 "would be taken from live workers."
             )
         return self
+
+
+def worker_connections(queues: Mapping[str, int]) -> int:
+    """The most connections of a worker that takes so many jobs at once from these queues."""
+    return 6 + 4 * sum(queues.values())
 
 
 def load_settings(model: type[S], *, data: Path | None = None, **changes: object) -> S:

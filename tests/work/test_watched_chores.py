@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import psycopg
@@ -67,6 +68,28 @@ def test_a_chore_that_failed_is_done_again_and_one_that_never_works_ends_the_wor
     assert worker.wait(PATIENCE_SECONDS) == 69, bench.worker_logs()
     assert "failed 10 times in a row" in log.read_text()
     assert (bench.job(job).state, bench.job(job).rescues) == ("queued", 0)
+
+
+def test_progress_takes_bounded_room(bench: Bench) -> None:
+    job = bench.submit(options=bench.held(steps=40))
+    with psycopg.connect(bench.conninfo) as connection:
+        connection.execute(
+            """
+            INSERT INTO job_events (job_id, attempt, kind, data)
+            SELECT %s, 1, 'progress', jsonb_build_object('step', n) FROM generate_series(1, 5000) AS n
+            """,
+            [job],
+        )
+        connection.execute(
+            "UPDATE jobs SET state = 'failed', slip = NULL, finished_at = now() WHERE id = %s", [job]
+        )
+    bench.worker(queues="")
+    deadline = time.monotonic() + PATIENCE_SECONDS
+    while len(kept := [e.data["step"] for e in bench.events(job) if e.kind == "progress"]) > 2000:
+        assert time.monotonic() < deadline, bench.worker_logs()
+        time.sleep(0.1)
+    assert len(kept) >= 1000 and (kept[0], kept[-1]) == (1, 5000)
+    assert max(later - earlier for earlier, later in pairwise(kept)) <= 5
 
 
 def test_who_freezes_within_a_transaction_keeps_nobody_waiting(conninfo: str) -> None:

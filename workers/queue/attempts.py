@@ -247,6 +247,13 @@ async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attemp
             """,
             [worker, job_id],
         )
+        await connection.execute(
+            """
+            INSERT INTO owner_turns (owner, queue) VALUES (%s, %s)
+            ON CONFLICT (owner, queue) DO UPDATE SET turn_at = clock_timestamp()
+            """,
+            [job.owner, job.queue],
+        )
         await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
         await trim_log(connection, job_id, KEPT_LOG_LINES)
         await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1} on {worker}"])

@@ -127,15 +127,25 @@ async def list_jobs(
 
 
 async def queue_position(connection: Connection, job: Job) -> int | None:
-    """How many jobs go before a queued job in its queue; None for any other."""
+    """How many jobs go before a queued job in its queue, if owners take turns; None for any other."""
     if job.state != "queued":
         return None
     cursor = await connection.execute(
         """
-        SELECT count(*) AS ahead FROM jobs
-        WHERE state = 'queued' AND queue = %s AND (priority > %s OR priority = %s AND slip < %s)
+        WITH waiting AS (
+            SELECT owner, priority, slip FROM jobs WHERE state = 'queued' AND queue = %(queue)s
+        ), own AS (
+            SELECT count(*) AS n FROM waiting
+            WHERE owner = %(owner)s AND priority = %(priority)s AND slip < %(slip)s
+        )
+        SELECT (SELECT count(*) FROM waiting WHERE priority > %(priority)s) + own.n + (
+            SELECT coalesce(sum(least(n, own.n + 1)), 0) FROM (
+                SELECT count(*) AS n FROM waiting
+                WHERE owner <> %(owner)s AND priority = %(priority)s AND slip < %(slip)s GROUP BY owner
+            ) AS others
+        ) AS ahead FROM own
         """,
-        [job.queue, job.priority, job.priority, job.slip],
+        {"queue": job.queue, "owner": job.owner, "priority": job.priority, "slip": job.slip},
     )
     row = await cursor.fetchone()
     return int(row["ahead"]) if row else 0

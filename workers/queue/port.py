@@ -58,6 +58,10 @@ class Slips(Protocol):
         """Take a slip away, whether it waits or its worker was lost; harmless if it is gone."""
         ...
 
+    async def take(self, connection: Connection, slip: int) -> bool:
+        """Take away a slip that could be delivered now; False if it is with somebody, or is yet to wait."""
+        ...
+
     async def lost(self, connection: Connection) -> Sequence[uuid.UUID]:
         """Jobs that say they are queued although no slip of theirs waits or is with a live worker."""
         ...

@@ -74,6 +74,20 @@ class ProcrastinateSlips:
         """Take a slip away; see the port."""
         await connection.execute("DELETE FROM procrastinate_jobs WHERE id = %s", [slip])
 
+    async def take(self, connection: Connection, slip: int) -> bool:
+        """Take away a slip that waits; see the port."""
+        cursor = await connection.execute(
+            """
+            DELETE FROM procrastinate_jobs WHERE id = (
+                SELECT id FROM procrastinate_jobs
+                WHERE id = %s AND status = 'todo' AND (scheduled_at IS NULL OR scheduled_at <= now())
+                FOR UPDATE SKIP LOCKED
+            )
+            """,
+            [slip],
+        )
+        return cursor.rowcount > 0
+
     async def lost(self, connection: Connection) -> Sequence[uuid.UUID]:
         """Queued jobs without a living slip; see the port."""
         cursor = await connection.execute(

@@ -16,16 +16,17 @@ from engine.isolated_python import python_command
 from engine.writing import write_json
 from workers.isolation.abilities import tell_what_lacks
 from workers.isolation.hiding import hide_memory
-from workers.postgres.embedded import EmbeddedPostgres
+from workers.postgres.embedded import LEAST_CONNECTIONS, EmbeddedPostgres
 from workers.records.migrate import migrate
 from workers.serve.children import KeptChild
 from workers.serve.own_token import keep_own_token
-from workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings
+from workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings, worker_connections
 
 logger = logging.getLogger(__name__)
 
 READY_SECONDS = 180.0
 LOOK_SECONDS = 1.0
+SPARE_CONNECTIONS = 40
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,11 @@ async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -
     tell_what_lacks()
     settings = plan.settings
     with _alone(settings.data) as address_file:
-        database = EmbeddedPostgres(settings.data.absolute()) if settings.database_url is None else None
+        database = (
+            EmbeddedPostgres(settings.data.absolute(), connections_needed(plan))
+            if settings.database_url is None
+            else None
+        )
         try:
             conninfo = (
                 await asyncio.to_thread(database.start) if database is not None else settings.conninfo()
@@ -74,6 +79,13 @@ async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -
             address_file.unlink(missing_ok=True)
             if database is not None:
                 await asyncio.to_thread(database.stop)
+
+
+def connections_needed(plan: Plan) -> int:
+    """What the processes of this machine may use, and some for commands and workers elsewhere."""
+    front = plan.settings.pool_size + 1
+    workers = [worker_connections({}), *([worker_connections(plan.queues)] if plan.queues else [])]
+    return max(LEAST_CONNECTIONS, front + sum(workers) + SPARE_CONNECTIONS)
 
 
 async def _run(
@@ -178,6 +190,7 @@ async def _keep_database(database: EmbeddedPostgres | None) -> None:
     """Start the private database again whenever it ends."""
     while database is not None:
         await asyncio.sleep(LOOK_SECONDS)
+        await asyncio.to_thread(database.rotate_log)
         if await asyncio.to_thread(database.is_alive):
             continue
         logger.warning("the database ended; starting it again")

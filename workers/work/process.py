@@ -25,6 +25,7 @@ from workers.isolation.abilities import abilities, tell_what_lacks
 from workers.isolation.hiding import hide_memory
 from workers.parent import die_with_server
 from workers.queue.attempts import Fenced, claim
+from workers.queue.fairness import choose
 from workers.queue.limits import end_abandoned
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.queue.rescue import rescue_lost_jobs
@@ -34,13 +35,13 @@ from workers.records.ids import new_id
 from workers.records.migrate import wait_for_tables
 from workers.records.sessions import forget_old_sessions
 from workers.records.workers import forget_lost_workers, forget_worker, see_worker
-from workers.settings import WorkerSettings
+from workers.settings import WorkerSettings, worker_connections
 from workers.store.errors import StorageError
 from workers.store.local import LocalStorage
 from workers.store.opening import open_storage
 from workers.store.room import Room
 from workers.upkeep.collecting import collect
-from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries
+from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries, thin_progress
 from workers.upkeep.webhooks.outbox import forget_old
 from workers.upkeep.webhooks.sending import Sender
 from workers.work.chores import Chore, ChoreFailed, keep_doing
@@ -57,6 +58,7 @@ logger = logging.getLogger(__name__)
 
 SWEEP_SECONDS = 60.0
 STORE_SWEEP_SECONDS = 3600.0
+THIN_SECONDS = 600.0
 ABANDONED_SECONDS = 86_400.0
 ROOM_LOOK_SECONDS = 5.0
 LEFT_POLLS = 3
@@ -113,7 +115,9 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         kind_modules=settings.kind_modules, rest_seconds=settings.recover_seconds,
     )  # fmt: skip
     slots = sum(queues.values())
-    async with open_pool(conninfo, max_size=6 + 4 * slots, wait_seconds=settings.stale_seconds) as pool:
+    async with open_pool(
+        conninfo, max_size=worker_connections(queues), wait_seconds=settings.stale_seconds
+    ) as pool:
         worker = _Worker(
             settings,
             pool,
@@ -149,7 +153,7 @@ class _Worker:
         self._id = new_id()
         self._lost = False
         self._openings = Openings(name, pool, around)
-        self._left: dict[uuid.UUID, str] = {}
+        self._left: set[uuid.UUID] = set()
         self._sender = Sender(pool, settings.webhook_hosts)
 
     async def run(self) -> int:
@@ -167,6 +171,7 @@ class _Worker:
                 Chore(self._sweep_store, STORE_SWEEP_SECONDS),
                 Chore(self._send_webhooks, settings.poll_seconds),
                 Chore(self._forget, SWEEP_SECONDS),
+                Chore(self._thin, THIN_SECONDS),
                 Chore(self._collect, settings.collect_seconds),
                 Chore(self._openings.keep, ROOM_LOOK_SECONDS),
             )
@@ -232,15 +237,10 @@ class _Worker:
         if self._around.host.ailing is not None:
             await self._refuse(job_id, slip)
             return
-        if (why := await unfit(self._pool, job_id, self._settings.stale_seconds)) is not None:
-            if job_id not in self._left:
-                logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
-                self._left[job_id] = why
-            wait_seconds = LEFT_POLLS * self._settings.poll_seconds
-            await put_off(self._pool, self._around.slips, job_id, slip, wait_seconds)
+        chosen = await choose(self._pool, self._around.slips, job_id, slip)
+        if chosen is None or await self._leaves(*chosen) or not await self._openings.come(*chosen):
             return
-        if not await self._openings.come(job_id, slip):
-            return
+        job_id, slip = chosen
         since = time.monotonic()
         attempt = await claim(self._pool, job_id, slip, self._name)
         if attempt is None:
@@ -257,6 +257,18 @@ class _Worker:
             self._around.host.fail(f"it cannot look after jobs ({type(error).__name__}: {error})")
             with contextlib.suppress(Fenced, *DATABASE_ERRORS):
                 await attempt.hand_back(self._around.slips, "its worker failed")
+
+    async def _leaves(self, job_id: uuid.UUID, slip: int) -> bool:
+        """Whether a job was left to workers of another version."""
+        why = await unfit(self._pool, job_id, self._settings.stale_seconds)
+        if why is None:
+            return False
+        if job_id not in self._left:
+            logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
+            self._left.add(job_id)
+        wait_seconds = LEFT_POLLS * self._settings.poll_seconds
+        await put_off(self._pool, self._around.slips, job_id, slip, wait_seconds)
+        return True
 
     async def _refuse(self, job_id: uuid.UUID, slip: int) -> None:
         """Leave a job to other workers whose slip came too late to this one."""
@@ -321,6 +333,10 @@ class _Worker:
             hours=self._settings.absent_queue_hours,
         ):
             logger.warning("job %s waited too long in a queue that no worker takes", job_id)
+
+    async def _thin(self) -> None:
+        async with self._pool.connection() as connection:
+            await thin_progress(connection)
 
     async def _collect(self) -> None:
         try:
