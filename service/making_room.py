@@ -52,7 +52,7 @@ class RoomMaker:
             await self._make()
             await in_thread(Threads.UPLOADS, self._storage.ensure_room, size_bytes or 0)
         try:
-            async with storing(self._pool) as note:
+            async with storing(self._pool, self._storage) as note:
                 yield note
         except StorageFull:  # only now, as nothing goes while it is being stored; the next try may fit
             self._short = True

@@ -12,6 +12,7 @@ import click
 
 import engine
 from engine.errors import OctasplatError
+from workers.cli.commands.backup import backup, restore
 from workers.cli.commands.clean import clean
 from workers.cli.commands.client import COMMANDS as CLIENT_COMMANDS
 from workers.cli.commands.crop import crop
@@ -91,7 +92,7 @@ def cli() -> None:
 
 for _command in (
     reconstruct, evaluate, info, export, import_, render, relight, stage, surface,
-    edit, deform, transform, crop, merge, clean, demo,
+    edit, deform, transform, crop, merge, clean, demo, backup, restore,
     serve, worker, open_page, token, fsck, quota, migrate, *CLIENT_COMMANDS,
 ):  # fmt: skip
     cli.add_command(_command)

@@ -117,7 +117,7 @@ class Attempt:
         """
         async with self._fenced() as (connection, job):
             if note is not None:
-                await note.confirm(connection)
+                await note.confirm(connection, {file["sha256"] for file in manifest["files"]})
             await connection.execute(
                 """
                 UPDATE jobs SET checkpoint = %s, rescues = CASE WHEN %s THEN 0 ELSE rescues END WHERE id = %s
@@ -132,7 +132,7 @@ class Attempt:
         """Record the newest preview picture: ``sha256``, ``step`` and ``view``; ``note`` as above."""
         async with self._fenced() as (connection, job):
             if note is not None:
-                await note.confirm(connection)
+                await note.confirm(connection, [preview["sha256"]])
             await connection.execute(
                 "UPDATE jobs SET preview = %s WHERE id = %s", [Jsonb(dict(preview)), job.id]
             )
@@ -303,7 +303,7 @@ async def _show(
 ) -> None:
     """Put results into the place of earlier ones; the one place where they become visible."""
     if note is not None:
-        await note.confirm(connection)
+        await note.confirm(connection, {result.sha256 for result in results})
     async with connection.cursor() as cursor:
         await cursor.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
         await cursor.executemany(

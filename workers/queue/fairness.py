@@ -51,10 +51,8 @@ async def _fairest(connection: Connection, slips: Slips, job: Job) -> Job | None
         if row["id"] == job.id:
             return None
         async with connection.cursor(row_factory=class_row(Job)) as locking:
-            await locking.execute(
-                naming("SELECT {} FROM jobs WHERE id = %s AND state = 'queued' FOR UPDATE SKIP LOCKED", Job),
-                [row["id"]],
-            )
+            query = "SELECT {} FROM jobs WHERE id = %s AND state = 'queued' FOR UPDATE SKIP LOCKED"
+            await locking.execute(naming(query, Job), [row["id"]])
             other = await locking.fetchone()
         if other is not None and other.slip is not None and await slips.take(connection, other.slip):
             return other

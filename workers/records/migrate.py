@@ -6,7 +6,7 @@ end and write what they know. What they can no longer read or write raises :data
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -52,8 +52,12 @@ class Step:
     sql: str
 
 
-def migrate(conninfo: str) -> tuple[str, ...]:
+def migrate(conninfo: str, only: Collection[str] | None = None) -> tuple[str, ...]:
     """Apply every step that the database lacks; others who start meanwhile wait.
+
+    Args:
+        conninfo: how to connect.
+        only: of our own steps only those of these names.
 
     Returns:
         Names of the steps applied; none where a newer version made the tables, which this one may use.
@@ -67,7 +71,7 @@ def migrate(conninfo: str) -> tuple[str, ...]:
                 major = connection.info.server_version // 10000
                 raise DatabaseError(f"The database is Postgres {major}; Postgres 14 or newer is needed.")
             connection.execute("SELECT pg_advisory_lock(%s)", [_LOCK])
-            return tuple(_apply_missing(connection))
+            return tuple(_apply_missing(connection, only))
     except psycopg.OperationalError as error:
         raise _unreachable(error) from None
     except psycopg.Error as error:
@@ -116,7 +120,7 @@ def _steps(component: str, folder: Traversable) -> Iterator[Step]:
             yield Step(component, file.name, file.read_text(encoding="utf-8"))
 
 
-def _apply_missing(connection: psycopg.Connection) -> Iterator[str]:
+def _apply_missing(connection: psycopg.Connection, only: Collection[str] | None) -> Iterator[str]:
     connection.execute(_VERSIONS)
     rows = connection.execute("SELECT component, name FROM schema_steps").fetchall()
     applied = {(str(component), str(name)) for component, name in rows}
@@ -127,7 +131,8 @@ def _apply_missing(connection: psycopg.Connection) -> Iterator[str]:
         yield from _begin_queue(connection)
         steps = tuple(step for step in steps if step.component != QUEUE)
     for step in steps:
-        if (step.component, step.name) not in applied:
+        left_out = only is not None and step.component == OURS and step.name not in only
+        if (step.component, step.name) not in applied and not left_out:
             with connection.transaction():
                 connection.execute(step.sql)
                 _record(connection, step)

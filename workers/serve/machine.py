@@ -62,7 +62,7 @@ async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -
     hide_memory()
     tell_what_lacks()
     settings = plan.settings
-    with _alone(settings.data) as address_file:
+    with hold_data(settings.data) as address_file:
         database = (
             EmbeddedPostgres(settings.data.absolute(), connections_needed(plan))
             if settings.database_url is None
@@ -203,7 +203,7 @@ async def _keep_database(database: EmbeddedPostgres | None) -> None:
 
 
 @contextlib.contextmanager
-def _alone(data: Path) -> Iterator[Path]:
+def hold_data(data: Path) -> Iterator[Path]:
     """Hold the data folder; yields the path of the file that says where the service is.
 
     Raises:

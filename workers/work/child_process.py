@@ -19,8 +19,6 @@ from engine.isolated_python import python_command
 
 MAX_LINE_BYTES = 1 << 20
 LAST_WORDS = 20
-TEMPORARY = "tmp"
-"""Folder of the temporary files of a job's process, in the attempt's own."""
 _READ_BYTES = 1 << 16
 _PASSED_ON = re.compile(
     r"PATH|HOME|USER|LOGNAME|SHELL|LANG|LC_\w+|TZ|TMPDIR|TEMP|TMP|VIRTUAL_ENV|LD_LIBRARY_PATH|"
@@ -79,17 +77,13 @@ class ChildProcess:
         on_log: Callable[[str], None],
     ) -> "ChildProcess":
         """Start a child with its task, see :mod:`workers.work.child`."""
-        # What it leaves there goes with its folder, and counts as what that takes.
-        temporary = Path(task["folder"], TEMPORARY)
-        temporary.mkdir(exist_ok=True)
-        environment = {**_absolute(child_environment(os.environ)), "TMPDIR": str(temporary)}
         process = await asyncio.create_subprocess_exec(
             *python_command("workers.work.child", further_modules=task["kind_modules"]),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
             start_new_session=True,
-            env=environment,
+            env=_absolute(child_environment(os.environ)),
             cwd=task["folder"],
             limit=MAX_LINE_BYTES,
         )

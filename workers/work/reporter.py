@@ -212,7 +212,7 @@ class Reporter:
             if wanted is not None:
                 await self._keep_checkpoint(*wanted)
             if preview is not None:
-                async with storing(self._attempt.pool) as note:
+                async with storing(self._attempt.pool, self._workspace.storage) as note:
                     sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN}/{preview['path']}")
                     row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
                     await self._attempt.keep_preview(row, note)
@@ -227,7 +227,7 @@ class Reporter:
     async def _keep_checkpoint(self, stage: str, step: int) -> None:
         if not self._keeps:
             return
-        async with storing(self._attempt.pool) as note:
+        async with storing(self._attempt.pool, self._workspace.storage) as note:
             checkpoint = await asyncio.to_thread(self._workspace.keep, stage, step)
             if checkpoint is None:
                 return

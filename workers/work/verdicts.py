@@ -119,7 +119,7 @@ class Verdicts:
         found = await self._around.host.examine(self._program)
         if found is None:
             error = {"type": "crashed", "message": what}
-            await self._said(lambda: self._attempt.lose(self._around.slips, error))
+            await self.let_go(error)
         else:
             await self.hand_back(f"The worker's machine is at fault, which takes no jobs for now: {found}")
 
@@ -155,10 +155,10 @@ class Verdicts:
         """Store the results and publish their manifest."""
         while True:
             try:
-                async with storing(self._attempt.pool) as note:
+                async with storing(self._attempt.pool, self._around.storage) as note:
                     manifest = await asyncio.to_thread(self._workspace.store_results)
                     async with self._attempt.pool.connection() as connection:
-                        await note.confirm(connection)
+                        await note.confirm(connection, {file.sha256 for file in manifest.files})
                         return await asyncio.to_thread(self._workspace.publish, manifest)
             except DATABASE_ERRORS as error:
                 await self._pause(error)
@@ -167,7 +167,7 @@ class Verdicts:
         """Store what a program has finished and say so."""
         while True:
             try:
-                async with storing(self._attempt.pool) as note:
+                async with storing(self._attempt.pool, self._around.storage) as note:
                     results = await asyncio.to_thread(self._workspace.store_partial_results)
                     await say(results, note)
                     return

@@ -95,7 +95,7 @@ class Workspace:
     def __init__(self, root: Path, job: Job, storage: Storage) -> None:
         self._root = root
         self._job = job
-        self._storage = storage
+        self.storage = storage
         self.folder = root / "attempts" / f"{job.id}.{job.attempt}"
         self._lock: IO[bytes] | None = None
         self._dataset_lock: IO[bytes] | None = None
@@ -150,7 +150,7 @@ class Workspace:
         if not place.exists():
             partial = folder / f".{uuid.uuid4().hex}.partial"
             try:
-                fetch_tree(self._storage, _tree(files), partial)
+                fetch_tree(self.storage, _tree(files), partial)
                 with contextlib.suppress(OSError):  # another attempt was faster
                     partial.rename(place)
             finally:
@@ -160,7 +160,7 @@ class Workspace:
 
     def fetch_files(self, files: Sequence[DatasetFile]) -> None:
         """Files that the options name; they must not be changed."""
-        fetch_tree(self._storage, _tree(files), self.folder / FILES)
+        fetch_tree(self.storage, _tree(files), self.folder / FILES)
 
     def fetch_source(self, artifacts: Sequence[Artifact], wanted: Sequence[str]) -> None:
         """Results of the source job into the run folder."""
@@ -174,7 +174,7 @@ class Workspace:
             for a in artifacts
             if a.name.startswith(f"{POSES}/")
         ]
-        fetch_tree(self._storage, [*tree, *poses], self.folder / RUN, writable=True)
+        fetch_tree(self.storage, [*tree, *poses], self.folder / RUN, writable=True)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Put back what an earlier attempt kept.
@@ -182,7 +182,7 @@ class Workspace:
         Raises:
             StorageError: some of it is gone or damaged.
         """
-        fetch_tree(self._storage, checkpoint.files, self.folder, writable=True)
+        fetch_tree(self.storage, checkpoint.files, self.folder, writable=True)
 
     def discard_run(self) -> None:
         """Forget what was restored."""
@@ -208,28 +208,28 @@ class Workspace:
     def store_results(self) -> Manifest:
         """Store the results, which belong to nothing yet."""
         return store_tree(
-            self._storage,
+            self.storage,
             self.folder / RESULTS,
             about={"job": str(self._job.id), "attempt": self._job.attempt, "kind": self._job.kind},
         )
 
     def publish(self, manifest: Manifest) -> list[Result]:
         """Publish the manifest of the stored results; the job's row makes them visible."""
-        if not publish_manifest(self._storage, _document(self._job, self._job.attempt), manifest):
+        if not publish_manifest(self.storage, _document(self._job, self._job.attempt), manifest):
             raise StorageError("Another result was published for this attempt; ask for a retry.")
         return _results(manifest)
 
     def store_partial_results(self) -> list[Result]:
         """Store what results there are of a program that failed; its job's row shows them, nothing else."""
         folder = self.folder / RESULTS
-        return _results(store_tree(self._storage, folder)) if folder.is_dir() else []
+        return _results(store_tree(self.storage, folder)) if folder.is_dir() else []
 
     def measured_psnr(self, results: Sequence[Result]) -> float | None:
         """Mean PSNR over the held-out views, dB, as the results say; None if they do not."""
         for result in results:
             if result.name == METRICS and result.size_bytes <= MAX_METRICS_BYTES:
                 try:
-                    mean = json.loads(b"".join(self._storage.read(result.sha256)))["mean"]["psnr"]
+                    mean = json.loads(b"".join(self.storage.read(result.sha256)))["mean"]["psnr"]
                 except (StorageError, ValueError, TypeError, KeyError):
                     return None
                 return float(mean) if isinstance(mean, int | float) and math.isfinite(mean) else None
@@ -238,19 +238,19 @@ class Workspace:
     def published_before(self) -> list[Result] | None:
         """Results that an earlier attempt published without getting to say so."""
         for attempt in range(self._job.attempt - 1, self._job.fresh_after, -1):
-            manifest = read_manifest(self._storage, _document(self._job, attempt))
+            manifest = read_manifest(self.storage, _document(self._job, attempt))
             if manifest is not None:
                 return _results(manifest)
         return None
 
     def store_file(self, name: str) -> str:
         """Store one file of the folder and return its digest."""
-        return store_tree(self._storage, self.folder, [name]).files[0].sha256
+        return store_tree(self.storage, self.folder, [name]).files[0].sha256
 
     def _stored(self, names: Sequence[str]) -> tuple[TreeFile, ...]:
         """Store files; finished frames never change, so that each of them is read once."""
         new = [name for name in names if name not in self._frames]
-        files = {file.path: file for file in store_tree(self._storage, self.folder, new).files}
+        files = {file.path: file for file in store_tree(self.storage, self.folder, new).files}
         found = tuple(self._frames.get(name) or files[name] for name in names)
         record = f"{RUN}/{FRAMES}/{RECORD}"
         self._frames |= {n: f for n, f in files.items() if n.startswith(f"{RUN}/{FRAMES}/") and n != record}
