@@ -20,7 +20,7 @@ _NOT_TOLD = frozenset({"GET", "HEAD", "OPTIONS", "TRACE", "PUT"})
 
 
 class AuditTrail:
-    """Writes down who asked for a change, and what came of it.
+    """Writes down who asked for a change, if that is known, and what came of it.
 
     Args:
         app: behind it.
@@ -41,6 +41,8 @@ class AuditTrail:
             nonlocal told
             if told or (scope["method"] in _NOT_TOLD and not state.get("is_change")):
                 return
+            if state.get("who") is None:  # or whoever comes could fill the table
+                return
             told = True
             await _write(scope, status, headers.get("location"))
 
@@ -58,14 +60,14 @@ class AuditTrail:
 
 async def _write(scope: Scope, status: int, location: str | None) -> None:
     service: Service = scope["app"].state.service
-    who = scope["state"].get("who")
+    who = scope["state"]["who"]
     try:
         async with service.pool.connection() as connection:
             await add_entry(
                 connection,
-                owner=who and who.owner,
-                token_id=who and who.token_id,
-                session_id=who and who.session_id,
+                owner=who.owner,
+                token_id=who.token_id,
+                session_id=who.session_id,
                 address=scope["client"][0] if scope.get("client") else "unknown",
                 action=f"{scope['method']} {scope['path']}",
                 target=location,

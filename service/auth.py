@@ -84,7 +84,7 @@ async def principal(
         token = await token_of(request, service, bearer.credentials)
         who = None if token is None else Principal(token.owner, frozenset(token.scopes), token.id)
     elif (secret := session_secret(request)) is not None:
-        who = await _of_session(service, secret)
+        who = await principal_of_session(service, secret)
     elif request.headers.get("authorization") is None and await _is_open(service):
         if passed_through_proxy(request.headers):
             detail = (
@@ -131,7 +131,8 @@ def session_secret(request: Request) -> str | None:
     return request.cookies.get(SECURE_COOKIE if request.url.scheme == "https" else COOKIE)
 
 
-async def _of_session(service: Service, secret: str) -> Principal | None:
+async def principal_of_session(service: Service, secret: str) -> Principal | None:
+    """Who has the session of that secret, or None if it is over."""
     async with service.pool.connection() as connection:
         session = await find_session(connection, secret)
         token = None if session is None else await get_token(connection, session.token_id)

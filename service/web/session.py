@@ -5,7 +5,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service.auth import COOKIE, SECURE_COOKIE, Principal, session_secret, token_of
+from service.auth import (
+    COOKIE,
+    SECURE_COOKIE,
+    Principal,
+    principal_of_session,
+    session_secret,
+    token_of,
+)
 from service.state import Service, ServiceDep
 from service.web.routing import PageRoute, go_to, local_address
 from service.web.templating import page
@@ -69,6 +76,7 @@ async def sign_out(request: Request, service: ServiceDep) -> Response:
     """End the session; the token stays valid."""
     secret = session_secret(request)
     if secret is not None:
+        request.state.who = await principal_of_session(service, secret)
         async with service.pool.connection() as connection:
             await end_session(connection, secret)
     response = go_to(request, "/sign-in")

@@ -197,6 +197,7 @@ def test_it_is_written_down_who_did_what(talk: Callable[..., None]) -> None:
         made = (await http.post("/v1/tokens", json=new, headers=boss)).json()
         assert (await http.post("/v1/tokens", json=new, headers=mine)).status_code == 403
         assert (await http.get("/v1/jobs", headers={"Authorization": "Bearer no\0ne"})).status_code == 401
+        assert (await http.post("/v1/tokens", json=new)).status_code == 401  # by nobody: fills no table
         await http.delete(f"/v1/tokens/{made['id']}", headers=boss)
         assert await status(http, mine, "/v1/audit") == 403
         told = [(e["owner"], e["action"], e["target"], e["status"]) for e in await audit(http, boss)]

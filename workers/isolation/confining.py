@@ -59,7 +59,7 @@ def confine(
 
 def limit_growth(memory_limit_bytes: int | None) -> None:
     """Bound what a job can take faster than its worker looks: processes of its user, and memory."""
-    with contextlib.suppress(ValueError, OSError):
+    with contextlib.suppress(ValueError, OSError, psutil.Error):
         _, most = resource.getrlimit(resource.RLIMIT_NPROC)
         limit = _threads_of_user() + _MOST_THREADS
         limit = limit if most == resource.RLIM_INFINITY else min(limit, most)

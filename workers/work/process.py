@@ -153,7 +153,7 @@ class _Worker:
         self._id = new_id()
         self._lost = False
         self._openings = Openings(name, pool, around)
-        self._left: dict[uuid.UUID, str] = {}
+        self._left: set[uuid.UUID] = set()
         self._sender = Sender(pool, settings.webhook_hosts)
 
     async def run(self) -> int:
@@ -238,18 +238,9 @@ class _Worker:
             await self._refuse(job_id, slip)
             return
         chosen = await choose(self._pool, self._around.slips, job_id, slip)
-        if chosen is None:
+        if chosen is None or await self._leaves(*chosen) or not await self._openings.come(*chosen):
             return
         job_id, slip = chosen
-        if (why := await unfit(self._pool, job_id, self._settings.stale_seconds)) is not None:
-            if job_id not in self._left:
-                logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
-                self._left[job_id] = why
-            wait_seconds = LEFT_POLLS * self._settings.poll_seconds
-            await put_off(self._pool, self._around.slips, job_id, slip, wait_seconds)
-            return
-        if not await self._openings.come(job_id, slip):
-            return
         since = time.monotonic()
         attempt = await claim(self._pool, job_id, slip, self._name)
         if attempt is None:
@@ -266,6 +257,18 @@ class _Worker:
             self._around.host.fail(f"it cannot look after jobs ({type(error).__name__}: {error})")
             with contextlib.suppress(Fenced, *DATABASE_ERRORS):
                 await attempt.hand_back(self._around.slips, "its worker failed")
+
+    async def _leaves(self, job_id: uuid.UUID, slip: int) -> bool:
+        """Whether a job was left to workers of another version."""
+        why = await unfit(self._pool, job_id, self._settings.stale_seconds)
+        if why is None:
+            return False
+        if job_id not in self._left:
+            logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
+            self._left.add(job_id)
+        wait_seconds = LEFT_POLLS * self._settings.poll_seconds
+        await put_off(self._pool, self._around.slips, job_id, slip, wait_seconds)
+        return True
 
     async def _refuse(self, job_id: uuid.UUID, slip: int) -> None:
         """Leave a job to other workers whose slip came too late to this one."""
