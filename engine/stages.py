@@ -15,6 +15,7 @@ DOING = {
     "export": "Exporting",
     "generate": "Generating",
     "render": "Rendering",
+    "edit": "Editing",
     "features": "Finding features",
     "matches": "Matching",
     "poses": "Finding poses",

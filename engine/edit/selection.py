@@ -2,13 +2,36 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from engine.edit.axes import infer_q
+from engine.edit.choices import Selection
+from engine.edit.matching import match_octagons
+from engine.edit.where import where
 from engine.errors import ConfigError
+from engine.files import Mesh
 from engine.gaussians.channels import common_widths
 from engine.gaussians.model import FlatGaussians, concatenate
+from engine.gaussians.octagon import CHI2_2_99, octagon_radii
+
+
+def chosen_by(gaussians: FlatGaussians, selection: Selection) -> Bool[np.ndarray, " n"]:
+    """Which of a scene are meant.
+
+    Raises:
+        ConfigError: the expression names what the scene does not have, or a box or sphere is none.
+    """
+    chosen = np.ones(len(gaussians), dtype=bool)
+    if selection.where is not None:
+        chosen &= where(gaussians, selection.where)
+    if (box := selection.box) is not None:
+        chosen &= inside_box(gaussians, np.array(box[:3]), np.array(box[3:]))
+    if (sphere := selection.sphere) is not None:
+        chosen &= inside_sphere(gaussians, np.array(sphere[:3]), sphere[3])
+    return ~chosen if selection.inverse else chosen
 
 
 def inside_box(
@@ -40,6 +63,26 @@ def inside_sphere(
     offsets = gaussians.means_world.astype(np.float64) - np.asarray(centre_world, np.float64)
     result: np.ndarray = np.linalg.norm(offsets, axis=1) <= radius_world
     return result
+
+
+def in_mesh(gaussians: FlatGaussians, mesh: Mesh, path: Path) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians have their octagon in a mesh that was exported from the scene, wherever it lies now.
+
+    Args:
+        gaussians: the scene.
+        mesh: what is left of its octagons after others were deleted in a mesh editor.
+        path: its file, named in errors.
+
+    Raises:
+        SceneFileError: the mesh does not belong to the scene, or its vertices cannot be identified.
+    """
+    opacities = gaussians.opacities
+    octagons = match_octagons(
+        path, mesh, opacities, octagon_radii(opacities, infer_q(mesh, opacities, CHI2_2_99))
+    )
+    chosen = np.zeros(len(gaussians), dtype=bool)
+    chosen[octagons.gids] = True
+    return chosen
 
 
 def with_sh_degree(gaussians: FlatGaussians, degree: int) -> FlatGaussians:

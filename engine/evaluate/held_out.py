@@ -1,4 +1,4 @@
-"""Renders the held-out views, measures them, and writes ``renders/``, ``metrics.json`` and the report."""
+"""Renders the held-out views, measures them, and writes their pictures, ``metrics.json`` and the report."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -10,24 +10,28 @@ import numba
 from engine.colour import composited
 from engine.evaluate.against_truth import TruthMeasures
 from engine.evaluate.gallery import ViewImages, WorstAndBest
-from engine.evaluate.layers import shown_layers
+from engine.evaluate.layers import shown_environment, shown_layers
 from engine.evaluate.report import write_report
 from engine.evaluate.truth import Truth
 from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
 from engine.events import Listener, StageProgress
+from engine.gaussians.materials import ALBEDO
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import EnvironmentMap
 from engine.light.relighting import Relighter
 from engine.render.images import write_png
 from engine.render.names import render_names
-from engine.render.renderer import background_colour, render_rays
+from engine.render.oversampling import render_filtered
+from engine.render.renderer import background_colour
 from engine.scene import Dataset
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer, TraceSettings
 from engine.writing import write_json
 
-RENDERS, METRICS, REPORT = "renders", "metrics.json", "report.html"
+SIDE = 2
+"""So many rays across a pixel, and as many down, where a shading model shades; else one at its centre."""
+RENDERS, LAYERS, METRICS, REPORT = "renders", "layers", "metrics.json", "report.html"
 
 
 def evaluate_held_out(
@@ -51,7 +55,8 @@ def evaluate_held_out(
     Args:
         dataset: photographs and split.
         gaussians: the scene.
-        output: folder that receives ``renders/<name>.png``, ``metrics.json`` and ``report.html``.
+        output: folder that receives ``renders/<name>.png``, ``metrics.json`` and ``report.html``, and where
+            there are materials ``layers/<layer>/<name>.png`` and ``layers/environment.png``.
         settings: where rays end, as in training.
         shading: what the scene was trained with.
         background: ``black`` or ``white``, behind renders and behind photographs with alpha.
@@ -74,8 +79,10 @@ def evaluate_held_out(
     for view, measured in _measured(
         _rendered(dataset, tracer, shading, background, measures), threads or numba.get_num_threads()
     ):
-        path = output / RENDERS / f"{names[view.name]}.png"
-        write_png(path, view.render)
+        write_png(output / RENDERS / f"{names[view.name]}.png", view.render)
+        if ALBEDO in view.layers:
+            for layer, shown in view.layers.items():
+                write_png(output / LAYERS / layer / f"{names[view.name]}.png", shown)
         rows.append(measured.metrics)
         images.offer(
             view.name,
@@ -87,6 +94,8 @@ def evaluate_held_out(
         measures.add_light(dataset, environment, relighter, tell)
     if measures is not None and (measures.rows or measures.light):
         run = {**run, "truth": measures.as_dict()}
+    if environment is not None:
+        write_png(output / LAYERS / "environment.png", shown_environment(environment.radiance_linear))
     metrics = summarise(rows).as_dict(run)
     write_json(output / METRICS, metrics)
     write_report(
@@ -111,7 +120,7 @@ def _rendered(
     for index in dataset.test_indices:
         rgb, alpha, weight = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
-        image = render_rays(tracer, rays, colour, shading)
+        image = render_filtered(tracer, rays, colour, shading, SIDE)
         if measures is not None:
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])

@@ -80,12 +80,17 @@ def sh_rotations(turns: Float[np.ndarray, "n 3 3"], degree: int) -> list[Float[n
     ]
 
 
+def spread_directions(count: int) -> Float[np.ndarray, "s 3"]:
+    """Unit directions spread evenly all around (Fibonacci's spiral)."""
+    z = 1 - 2 * (np.arange(count) + 0.5) / count
+    angle = _GOLDEN_ANGLE * np.arange(count)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1)
+
+
 @cache
 def _samples() -> tuple[Float[np.ndarray, "s 3"], dict[int, Float[np.ndarray, "m s"]]]:
     """Directions spread over the sphere, and for each degree the way from values there to coefficients."""
-    z = 1 - 2 * (np.arange(SAMPLES) + 0.5) / SAMPLES
-    angle = _GOLDEN_ANGLE * np.arange(SAMPLES)
-    ring = np.sqrt(1 - z * z)
-    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1)
+    directions = spread_directions(SAMPLES)
     basis = sh_basis(directions, 3)
     return directions, {band: np.linalg.pinv(basis[:, band**2 : (band + 1) ** 2]) for band in (1, 2, 3)}

@@ -25,6 +25,8 @@ is perceptual: GGX's alpha is its square.
 """
 AMBIENT = "ambient"
 """A channel beside them, which follows from the geometry: share of the light from all around that arrives."""
+BOUNCED = "bounced"
+"""A channel of width 3: irradiance over pi that other surfaces send, in the light a scene was learnt in."""
 DIELECTRIC_F0 = 0.04
 """What a surface that is no metal reflects head-on, that of an index of refraction of 1.5."""
 
@@ -76,3 +78,15 @@ def reflective_share(gaussians: FlatGaussians) -> float:
     shows = (gaussians.channels[METALLIC][:, 0] > 0.5) & (gaussians.channels[ROUGHNESS][:, 0] < 0.5)
     total = float(area.sum(dtype=np.float64))
     return float(area[shows].sum(dtype=np.float64)) / total if total > 0 else 0.0
+
+
+def with_room_for_bounced(gaussians: FlatGaussians) -> FlatGaussians:
+    """The same scene with channels of its own for the light that surfaces send each other, black at first.
+
+    A scene whose ambient visibility is not known stays without, as nothing says where that light arrives.
+    """
+    if AMBIENT not in gaussians.channels:
+        return gaussians
+    nothing = np.zeros((len(gaussians), 3), np.float32)
+    channels = {name: values.copy() for name, values in gaussians.channels.items()}
+    return gaussians.with_channels({**channels, BOUNCED: nothing})

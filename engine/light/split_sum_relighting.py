@@ -1,15 +1,14 @@
 """Scenes with materials in another light by the split sum: fast, as they were learnt."""
 
-from itertools import product
-
 import numpy as np
 from jaxtyping import Float32
 
+from engine.gaussians.materials import with_room_for_bounced
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import EnvironmentMap
 from engine.light.relighting import Part, RelitImage, silent
 from engine.rays import ImageRays
-from engine.render.renderer import background_colour, render_rays
+from engine.render.oversampling import pixel_means
 from engine.shading.deferred import Deferred
 from engine.shading.material_settings import MaterialSettings
 from engine.trace.make import make_tracer
@@ -47,28 +46,23 @@ class SplitSumRelighter:
         changed = {"learn": True, "environment_height": HEIGHT, "visibility": True, "indirect": "shaded"}
         shading = (learnt or MaterialSettings()).model_copy(update=changed)
         self._shading = Deferred(shading, extent_world=extent_world)
+        self._gaussians = with_room_for_bounced(gaussians)
         self._tracer = make_tracer(settings, threads=threads, build_quality=2)
-        self._tracer.build(gaussians, self._shading.features(gaussians))
+        self._tracer.build(self._gaussians, self._shading.features(self._gaussians))
         self._radiance: Float32[np.ndarray, "h w 3"] | None = None
 
     def put(self, environment: EnvironmentMap) -> None:
         """Take this environment from now on."""
-        if self._radiance is not environment.radiance_linear:
+        other = self._radiance is not environment.radiance_linear
+        if other:
             self._shading.light.put(environment.radiance_linear)
             self._radiance = environment.radiance_linear
-        self._shading.frame = environment.frame
+        if other or not np.array_equal(self._shading.frame, environment.frame):
+            self._shading.frame = environment.frame
+            self._shading.relight(self._gaussians, self._tracer)
 
     def render(self, image: ImageRays, part: Part = silent) -> RelitImage:
         """What a camera sees; ``part`` is told the share that is done."""
         assert self._radiance is not None, "an environment must be put first"
-        light = np.zeros((image.height_px, image.width_px, 3))
-        coverage = np.zeros((image.height_px, image.width_px))
-        offsets = [((k + 0.5) / self._side - 0.5) for k in range(self._side)]
-        for number, (down, across) in enumerate(product(offsets, offsets)):
-            part(number / self._side**2)
-            shifted = image.shifted(across, down)
-            found = render_rays(self._tracer, shifted, background_colour("black"), self._shading)
-            light += found.alpha[..., None] * found.layers["linear"]
-            coverage += found.alpha
-        linear = light / np.maximum(coverage, 1e-6)[..., None]
-        return RelitImage(linear.astype(np.float32), (coverage / self._side**2).astype(np.float32))
+        found = pixel_means(self._tracer, image, self._shading, self._side, part)
+        return RelitImage(found.linear, found.alpha)

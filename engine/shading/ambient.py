@@ -1,7 +1,9 @@
-"""Ambient visibility: the share of the light from all around that reaches a Gaussian past the others."""
+"""What reaches a Gaussian from all around: the light past the others, and the light that these send."""
+
+from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int64
 
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
@@ -10,11 +12,16 @@ from engine.trace.protocol import Tracer
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 RAYS_AT_ONCE = 1 << 18
+OPEN = 0.98
+"""Share of the light from all around from which on nothing else is asked for."""
+
+Radiance = Callable[[RayBatch], Float64[np.ndarray, "r 3"]]
+"""Linear radiance of what rays meet, times the share of it that hides the rest."""
 
 
 def ambient_visibility(
     gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer, *, rays: int, gap_world: float
-) -> Float32[np.ndarray, " u"]:
+) -> tuple[Float32[np.ndarray, " u"], Float32[np.ndarray, " u"]]:
     """Mean transmittance over the hemisphere, weighted by the cosine, of the side that sees more.
 
     A Gaussian of a solid thing has one side outside and one inside, and nothing else says which is which.
@@ -25,22 +32,62 @@ def ambient_visibility(
         tracer: built around all of them.
         rays: for each side of each.
         gap_world: distance from the Gaussian at which rays begin.
+
+    Returns:
+        That, and the side: 1 where the normal looks, else -1.
     """
-    out = np.empty(len(ids), np.float32)
-    fan = cosine_fan(rays)
-    step = max(1, RAYS_AT_ONCE // (2 * rays))
-    for first in range(0, len(ids), step):
-        part = ids[first : first + step]
-        frames = rotation_matrices(gaussians.quats_wxyz[part])
-        means = gaussians.means_world[part]
-        sides = []
-        for sign in (1.0, -1.0):
-            ways = np.einsum("nij,kj->nki", frames, fan * np.array([sign, 1.0, 1.0]))
-            starts = np.repeat(means + sign * gap_world * frames[:, :, 0], rays, axis=0)
-            left = tracer.transmittance(RayBatch(starts, ways.reshape(-1, 3), gap_world))
-            sides.append(left.reshape(-1, rays).mean(axis=1))
-        out[first : first + step] = np.maximum(*sides)
+    sides = np.empty((2, len(ids)), np.float32)
+    for part in _parts(len(ids), rays):
+        for number, side in enumerate((1.0, -1.0)):
+            fan = _fan_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, gap_world)
+            sides[number, part] = tracer.transmittance(fan).reshape(-1, rays).mean(axis=1)
+    return sides.max(axis=0), np.where(sides[0] >= sides[1], 1.0, -1.0).astype(np.float32)
+
+
+def bounced_light(
+    gaussians: FlatGaussians,
+    ids: Int64[np.ndarray, " u"],
+    side: Float32[np.ndarray, " u"],
+    radiance: Radiance,
+    *,
+    rays: int,
+    gap_world: float,
+) -> Float32[np.ndarray, "u 3"]:
+    """Irradiance over pi that the other Gaussians send to one side of each: the mean over the same rays.
+
+    Args:
+        gaussians: the scene.
+        ids: which of them.
+        side: of :func:`ambient_visibility`.
+        radiance: what comes from where it is not clear.
+        rays: for each.
+        gap_world: distance from the Gaussian at which rays begin.
+    """
+    out = np.empty((len(ids), 3), np.float32)
+    for part in _parts(len(ids), rays):
+        light = radiance(_fan_rays(gaussians, ids[part], side[part], rays, gap_world))
+        out[part] = light.reshape(-1, rays, 3).mean(axis=1)
     return out
+
+
+def _parts(count: int, rays: int) -> list[slice]:
+    step = max(1, RAYS_AT_ONCE // rays)
+    return [slice(first, first + step) for first in range(0, count, step)]
+
+
+def _fan_rays(
+    gaussians: FlatGaussians,
+    ids: Int64[np.ndarray, " u"],
+    side: Float[np.ndarray, " u"],
+    rays: int,
+    gap_world: float,
+) -> RayBatch:
+    """The fan over one side of each, begun a little above."""
+    frames = rotation_matrices(gaussians.quats_wxyz[ids])
+    frames = frames * np.stack([side, np.ones_like(side), np.ones_like(side)], axis=1)[:, None, :]
+    ways = np.einsum("nij,kj->nki", frames, cosine_fan(rays))
+    starts = np.repeat(gaussians.means_world[ids] + gap_world * frames[:, :, 0], rays, axis=0)
+    return RayBatch(starts, ways.reshape(-1, 3), gap_world)
 
 
 def cosine_fan(rays: int) -> Float64[np.ndarray, "k 3"]:

@@ -9,6 +9,8 @@ from engine.rays import RayBatch
 from engine.shading.split_sum import Surface
 from engine.trace.protocol import TraceResult
 
+LEAST_RISE = 0.01
+"""Cosine to the normal that reflected rays have at least."""
 LEAST_ALPHA = 0.02
 """Rays that met less show nothing that could be shaded."""
 
@@ -61,13 +63,28 @@ def spread_back(
     by_normal[which] += (by_unit_normal - along * surface.normal_world) / buffer.length[:, None]
 
 
-def reflected_rays(rays: RayBatch, buffer: Buffer, of: Int64[np.ndarray, " s"], gap_world: float) -> RayBatch:
-    """Rays from the points of a buffer along their reflected directions, begun a little off the surface."""
-    which = buffer.which[of]
+def reflected_rays(
+    rays: RayBatch,
+    buffer: Buffer,
+    gap_world: float,
+    facets_world: Float64[np.ndarray, "p 3"] | None = None,
+) -> RayBatch:
+    """Rays from the points of a buffer along their reflected directions, begun a little off the surface.
+
+    Args:
+        rays: that the buffer was gathered along.
+        buffer: of ``p`` points.
+        gap_world: how far off.
+        facets_world: unit normals to be mirrored at instead of the surface's; where that leads below the
+            surface, the ray leaves along it.
+    """
+    which, normals = buffer.which, buffer.surface.normal_world
     origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[which]
     directions = rays.directions_world[which].astype(np.float64)
-    normals = buffer.surface.normal_world[of]
-    points = origins + buffer.depth[of, None] * directions + gap_world * normals
-    mirrored = directions - 2 * (directions * normals).sum(axis=1, keepdims=True) * normals
+    points = origins + buffer.depth[:, None] * directions + gap_world * normals
+    facets = normals if facets_world is None else facets_world
+    mirrored = directions - 2 * (directions * facets).sum(axis=1, keepdims=True) * facets
+    rise = (mirrored * normals).sum(axis=1, keepdims=True)
+    mirrored += np.maximum(LEAST_RISE - rise, 0.0) * normals
     mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
     return RayBatch(points, mirrored, gap_world)

@@ -14,10 +14,10 @@ from jaxtyping import Float32, Float64, Int64
 
 from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.gaussians.channels import stacked
-from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
+from engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
-from engine.shading.ambient import ambient_visibility
+from engine.shading.ambient import OPEN, ambient_visibility, bounced_light
 from engine.shading.buffer import Buffer, gather, reflected_rays, spread_back
 from engine.shading.environment_frame import environment_frame
 from engine.shading.geometry_terms import (
@@ -29,10 +29,21 @@ from engine.shading.geometry_terms import (
 from engine.shading.learnt_light import LearntLight
 from engine.shading.material_settings import SEED_MATERIAL, SEED_REACH, MaterialSettings
 from engine.shading.protocol import Developed, Reversed, Sight
-from engine.shading.split_sum import Surface, shade, shade_reverse
+from engine.shading.reflections import (
+    Facets,
+    Mirrored,
+    facets_of,
+    follow,
+    follow_back,
+    mirrored_pair,
+    pair_mean,
+    pair_slope,
+)
+from engine.shading.split_sum import ShadeGradients, Surface, shade, shade_reverse
 from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 AMBIENT_COLUMN = 5
+BOUNCED_COLUMNS = slice(6, 9)
 HIDDEN = 0.5
 """Transmittance below which the seed's way of seeing counts the environment as hidden."""
 TURNS = 1 << 20
@@ -41,12 +52,11 @@ TURNS = 1 << 20
 
 @dataclass(frozen=True)
 class _Reflection:
-    """What the reflected rays of some pixels saw: of ``of`` (places in a buffer)."""
+    """What the reflected rays of a buffer met, two of each point where there are facets."""
 
-    of: Int64[np.ndarray, " s"]
-    seen: TraceResult
-    buffer: Buffer | None
-    linear: Float64[np.ndarray, "q 3"] | None
+    trace: TraceResult
+    mirrored: Mirrored | None = None
+    facets: Facets | None = None
 
 
 @dataclass(frozen=True)
@@ -87,24 +97,57 @@ class Deferred:
         self._features: Float32[np.ndarray, "n f"] = np.empty((0, 5), np.float32)
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"]:
-        """The materials side by side, and the ambient visibility where it is known."""
-        names = [name for name in (*MATERIAL_WIDTHS, AMBIENT) if name in gaussians.channels]
+        """The materials side by side, and what reaches a Gaussian from all around where it is known."""
+        names = [name for name in (*MATERIAL_WIDTHS, AMBIENT, BOUNCED) if name in gaussians.channels]
         self._features = stacked(gaussians.channels, names)
         return self._features
 
     def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
-        """Measure the ambient visibility of some of the Gaussians, by turns."""
+        """Measure what reaches some of the Gaussians from all around, by turns."""
         settings = self.settings
         if not settings.ambient or progress < settings.secondary_from or AMBIENT not in gaussians.channels:
             return
         parts = settings.ambient_parts
         turn = int(progress * TURNS) * 7919 % parts
-        ids = np.arange(turn, len(gaussians), parts)
-        visible = ambient_visibility(
-            gaussians, ids, tracer, rays=settings.ambient_rays, gap_world=2 * self._gap
+        self._look_around(gaussians, np.arange(turn, len(gaussians), parts), tracer)
+
+    def relight(self, gaussians: FlatGaussians, tracer: Tracer) -> None:
+        """Find the light that surfaces send each other under an environment that was just put."""
+        if BOUNCED in gaussians.channels and self.settings.ambient:
+            self._look_around(gaussians, np.arange(len(gaussians)), tracer)
+
+    def _look_around(self, gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer) -> None:
+        """Measure ambient visibility and bounced light of some of the Gaussians."""
+        channels, rays = gaussians.channels, self.settings.ambient_rays
+        visible, side = ambient_visibility(gaussians, ids, tracer, rays=rays, gap_world=2 * self._gap)
+        channels[AMBIENT][ids, 0] = visible
+        self._features[ids, AMBIENT_COLUMN] = visible
+        if BOUNCED not in channels:
+            return
+        dim = visible < OPEN
+        bounced = np.zeros((len(ids), 3), np.float32)
+        bounced[dim] = bounced_light(
+            gaussians, ids[dim], side[dim], lambda fan: self._radiance(fan, tracer), rays=rays,
+            gap_world=2 * self._gap,
+        )  # fmt: skip
+        channels[BOUNCED][ids] = bounced
+        self._features[ids, BOUNCED_COLUMNS] = bounced
+
+    def _radiance(self, rays: RayBatch, tracer: Tracer) -> Float64[np.ndarray, "r 3"]:
+        """What rays meet, times the share of it that hides the rest; lit by the environment alone.
+
+        So a Gaussian's bounced light does not depend on that of others, and not on whose turn it was.
+        """
+        seen = tracer.trace(rays)
+        buffer = gather(rays, seen)
+        surface = self._dimmed(seen, buffer)
+        out = np.zeros((len(rays), 3))
+        surface = replace(
+            surface, visibility=surface.ambient, bounced_linear=np.zeros((len(buffer.which), 3))
         )
-        gaussians.channels[AMBIENT][ids, 0] = visible
-        self._features[ids, 5] = visible
+        linear = shade(surface, self.light.levels, self.frame)
+        out[buffer.which] = buffer.alpha[:, None] * linear
+        return out
 
     def develop(self, sight: Sight) -> Developed:
         """Display colours, shaded as far as the training has handed over to that."""
@@ -157,7 +200,10 @@ class Deferred:
                 by_linear[(kept.linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
             blur = settings.blurred(sight.progress)
             back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
-            normal = back.normal + back.reflected if settings.reflected_gradient else back.normal
+            normal = back.normal
+            if settings.reflected_gradient:
+                led = back.reflected + self._facing_gradient(kept, back)
+                normal = normal + clipped(led, settings.normal_clip)
             by_material, rgb = back.material, by_rgb * np.float32(1 - kept.shaded)
             if settings.is_seed_deferred(sight.progress):
                 rgb[which] = by_rgb[which] * (1 - kept.surface.material[:, 3:4])
@@ -167,7 +213,7 @@ class Deferred:
                 rgb = weight * (seen.rgb_srgb - developed.rgb_srgb)
             spread_back(buffer, by_material, normal, by_features, by_alpha, by_normal)
             by_texels = back.texels(len(self.light.levels.texels))
-            further = self._reflected_back(kept, back.indirect, by_texels)
+            further = self._reflected_back(kept, back, by_texels)
             parameters = {"materials.texels": by_texels}
             self._regularise(sight, buffer, by_features, by_alpha, by_normal, by_depth)
         narrow = (x.astype(np.float32) for x in (rgb, -by_alpha, by_depth, by_normal, by_features))
@@ -229,13 +275,17 @@ class Deferred:
         self.light.restore(own)
 
     def _dimmed(self, seen: TraceResult, buffer: Buffer) -> Surface:
-        """The surface of a buffer with its ambient visibility, to which no gradient goes."""
+        """The surface of a buffer with what reaches it from all around, to which no gradient goes."""
         surface = buffer.surface
         if self.settings.recipe == "seed":  # the seed's matt part is a colour of its own
             return replace(surface, ambient=np.zeros(len(buffer.which)))
         if not self.settings.ambient or seen.features.shape[1] <= AMBIENT_COLUMN:
             return surface
-        return replace(surface, ambient=seen.features[buffer.which, AMBIENT_COLUMN] / buffer.alpha)
+        around = seen.features[buffer.which].astype(np.float64) / buffer.alpha[:, None]
+        surface = replace(surface, ambient=around[:, AMBIENT_COLUMN])
+        if around.shape[1] < BOUNCED_COLUMNS.stop:
+            return surface
+        return replace(surface, bounced_linear=around[:, BOUNCED_COLUMNS])
 
     def _layers(
         self,
@@ -267,61 +317,59 @@ class Deferred:
         settings = self.settings
         if not settings.visibility:
             return surface, None
-        of = np.arange(len(buffer.which))
-        if sight.view is not None and settings.secondary_share < 1:
-            # Every so-manieth pixel of the batch, which is drawn at random itself.
-            of = of[(of * settings.secondary_share) % 1 < settings.secondary_share]
-        rays = reflected_rays(sight.rays, buffer, of, self._gap)
-        seed = settings.recipe == "seed"
+        record, seed = sight.view is not None, settings.recipe == "seed"
+        if settings.indirect == "shaded" and not seed:
+            salt = int(sight.progress * TURNS)
+            facets = facets_of(surface, least_slope=settings.least_slope(sight.progress), salt=salt)
+            mirrored = follow(
+                mirrored_pair(sight.rays, buffer, facets, gap_world=self._gap),
+                sight.tracer, self.light.levels, self.frame, self._dimmed,
+                surfaces=settings.reflections, gap_world=self._gap, record=record,
+            )  # fmt: skip
+            visibility, indirect = pair_mean(mirrored.seen)
+            surface = replace(surface, visibility=visibility, indirect_linear=indirect)
+            return surface, _Reflection(mirrored.trace, mirrored, facets)
+        rays = reflected_rays(sight.rays, buffer, self._gap)
         if seed:
             rays = RayBatch(rays.origins_world, rays.directions_world, rays.t_min, SEED_REACH)
-        seen = sight.tracer.trace(rays, record=sight.view is not None)
-        visibility = surface.visibility.copy()
-        visibility[of] = seen.transmittance > HIDDEN if seed else seen.transmittance
+        seen = sight.tracer.trace(rays, record=record)
+        visibility = (seen.transmittance > HIDDEN if seed else seen.transmittance).astype(np.float64)
         indirect = np.zeros_like(surface.indirect_linear)
-        below, linear = None, None
-        if settings.indirect == "shaded" and not seed:
-            below = gather(rays, seen)
-            below = replace(below, surface=self._dimmed(seen, below))
-            linear = shade(below.surface, self.light.levels, self.frame)
-            indirect[of[below.which]] = below.alpha[:, None] * linear
-        elif seed and settings.indirect != "none":
-            indirect[of] = (1.0 - visibility[of, None]) * seen.rgb_srgb
+        if seed and settings.indirect != "none":
+            indirect = (1.0 - visibility[:, None]) * seen.rgb_srgb
         elif settings.indirect == "harmonics":
             alpha = np.maximum(1.0 - seen.transmittance.astype(np.float64), 1e-6)[:, None]
-            indirect[of] = srgb_to_linear(seen.rgb_srgb / alpha) * alpha
+            indirect = srgb_to_linear(seen.rgb_srgb / alpha) * alpha
         surface = replace(surface, visibility=visibility, indirect_linear=indirect)
-        return surface, _Reflection(of, seen, below, linear)
+        return surface, _Reflection(seen)
 
     def _reflected_back(
-        self, kept: _Kept, by_indirect: Float64[np.ndarray, "p 3"], by_texels: Float64[np.ndarray, "t 3"]
+        self, kept: _Kept, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]
     ) -> tuple[tuple[Recording, TraceGradients], ...]:
-        """Gradients by what reflected rays met: its materials and normals, or its harmonics; no geometry."""
+        """Gradients by what reflected rays met: its materials, or its harmonics; no geometry."""
         reflection = kept.reflection
-        if reflection is None or (hits := reflection.seen.hits) is None:
+        if reflection is None or (hits := reflection.trace.hits) is None:
             return ()
-        seen, count = reflection.seen, len(reflection.of)
-        nothing = np.zeros((count, 3), np.float32)
+        if (mirrored := reflection.mirrored) is not None:
+            by_light = np.concatenate([back.indirect, back.indirect]) / 2
+            return follow_back(mirrored, self.light.levels, self.frame, by_light, by_texels)
+        seen = reflection.trace
         if self.settings.recipe == "seed":
-            hidden = seen.transmittance <= HIDDEN
-            by_rgb = (by_indirect[reflection.of] * hidden[:, None]).astype(np.float32)
-            return ((hits, TraceGradients(rgb_srgb=by_rgb)),)
-        if self.settings.indirect == "harmonics":
+            slope = (seen.transmittance <= HIDDEN).astype(np.float64)[:, None]
+        elif self.settings.indirect == "harmonics":
             alpha = np.maximum(1.0 - seen.transmittance.astype(np.float64), 1e-6)[:, None]
             slope = 1.0 / encoding_slope(srgb_to_linear(seen.rgb_srgb / alpha))
-            by_rgb = (by_indirect[reflection.of] * slope).astype(np.float32)
-            return ((hits, TraceGradients(rgb_srgb=by_rgb)),)
-        below = reflection.buffer
-        if below is None:
+        else:
             return ()
-        by_linear = by_indirect[reflection.of[below.which]] * below.alpha[:, None]
-        back = shade_reverse(below.surface, self.light.levels, self.frame, by_linear)
-        by_texels += back.texels(len(by_texels))
-        by_features = np.zeros((count, seen.features.shape[1]))
-        by_alpha, by_normal = np.zeros(count), np.zeros((count, 3))
-        spread_back(below, back.material, np.zeros_like(back.normal), by_features, by_alpha, by_normal)
-        gradients = TraceGradients(rgb_srgb=nothing, features=by_features.astype(np.float32))
-        return ((hits, gradients),)
+        return ((hits, TraceGradients(rgb_srgb=(back.indirect * slope).astype(np.float32))),)
+
+    @staticmethod
+    def _facing_gradient(kept: _Kept, back: ShadeGradients) -> Float64[np.ndarray, "p 3"] | float:
+        """Gradients by the normals through what reflected rays meet."""
+        reflection = kept.reflection
+        if reflection is None or reflection.mirrored is None or reflection.facets is None:
+            return 0.0
+        return pair_slope(reflection.mirrored.seen, reflection.facets, back.around, back.specular)
 
     def _regularise(
         self,
@@ -343,6 +391,19 @@ class Deferred:
             smooth_normal_term(sight, self._window, settings.smooth_normal_weight, by_normal)
         if self._window > 1 and settings.smooth_weight > 0:
             smoothness_term(sight, self._window, settings.smooth_weight, by_features, by_alpha)
+
+
+def clipped(gradients: Float64[np.ndarray, "p 3"], most: float) -> Float64[np.ndarray, "p 3"]:
+    """Gradients no longer than ``most`` times the median of those that are not 0; 0 leaves them alone.
+
+    One pixel that looks into a mirror in a mirror says more loudly than a hundred others where to turn, and
+    is as likely to be wrong.
+    """
+    lengths = np.linalg.norm(gradients, axis=1)
+    if most == 0 or not (lengths > 0).any():
+        return gradients
+    longest = most * float(np.median(lengths[lengths > 0]))
+    return gradients * np.minimum(1.0, longest / np.maximum(lengths, 1e-30))[:, None]
 
 
 def encoding_slope(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:

@@ -5,7 +5,7 @@ over pi. Since the maps are fixed and linear, gradients go back by their transpo
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -72,12 +72,17 @@ class Prefilter:
         self.height = height
         self.heights = np.array([height >> halving for halving in _HALVINGS], np.int64)
         self.offsets = np.concatenate([[0], np.cumsum(2 * self.heights**2)])
-        self._maps: list[tuple[_Rows, _Rows]] = []
+        self._maps: list[_Rows] = []
         for level in range(1, len(_HALVINGS)):
             alpha = ROUGHNESSES[level] ** 2 if level < len(ROUGHNESSES) else -1.0
             source = height >> _SOURCES[level]
-            rows = _lobes(int(self.heights[level]), source, alpha, _LEAST[level])
-            self._maps.append((rows, rows.transposed(2 * source * source)))
+            self._maps.append(_lobes(int(self.heights[level]), source, alpha, _LEAST[level]))
+
+    @cached_property
+    def _turned(self) -> list[_Rows]:
+        """The transposes, which only those need who learn."""
+        sources = [self.height >> halving for halving in _SOURCES[1:]]
+        return [rows.transposed(2 * s * s) for rows, s in zip(self._maps, sources, strict=True)]
 
     def levels(self, radiance_linear: Float[np.ndarray, "h w 3"]) -> LightLevels:
         """All levels of an environment."""
@@ -86,7 +91,7 @@ class Prefilter:
         for _ in range(max(_SOURCES)):
             halved.append(_halved(halved[-1]))
         texels[: self.offsets[1]] = halved[0]
-        for level, (rows, _) in enumerate(self._maps, start=1):
+        for level, rows in enumerate(self._maps, start=1):
             rows.times(halved[_SOURCES[level]], texels[self.offsets[level] : self.offsets[level + 1]])
         return LightLevels(texels, self.offsets[:-1], self.heights, np.array(ROUGHNESSES))
 
@@ -95,7 +100,7 @@ class Prefilter:
         sizes = [2 * (self.height >> halving) ** 2 for halving in range(max(_SOURCES) + 1)]
         sums = [np.zeros((size, 3)) for size in sizes]
         sums[0] += by_texels[: self.offsets[1]]
-        for level, (_, turned) in enumerate(self._maps, start=1):
+        for level, turned in enumerate(self._turned, start=1):
             part = np.empty_like(sums[_SOURCES[level]])
             turned.times(by_texels[self.offsets[level] : self.offsets[level + 1]], part)
             sums[_SOURCES[level]] += part

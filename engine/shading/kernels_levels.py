@@ -6,6 +6,7 @@ wide as it is high. Directions here are in the map's own frame: right, up, forwa
 
 import math
 
+import numpy as np
 from numba import njit, prange
 
 from engine.shading.kernels_microfacets import ggx_density
@@ -36,7 +37,7 @@ def lobe_weight(cosine, alpha):
     return ggx_density(math.sqrt(0.5 * (1.0 + cosine)), alpha) * cosine
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy")
 def lobe_rows(height, source_height, alpha, least, starts, columns, weights, counting):
     """Each texel of a level as a weighted mean of texels of a map, in compressed sparse rows.
 
@@ -45,43 +46,53 @@ def lobe_rows(height, source_height, alpha, least, starts, columns, weights, cou
         source_height: rows of the map that it is made from.
         alpha: GGX's; negative for irradiance over pi.
         least: share of the largest weight below which a texel is left out.
-        starts: receives where each row begins.
+        starts: where each row begins; it is written if ``counting``, and else read.
         columns: receives the numbers of the texels.
         weights: receives their weights; they add up to 1.
         counting: whether only ``starts`` is wanted.
     """
-    peak = lobe_weight(1.0, alpha)
+    least_weight = least * lobe_weight(1.0, alpha)
     reach = math.pi / 2  # angle at which the weight falls below the least one
     if alpha >= 0.0:
         reach = 0.0
-        while reach < math.pi / 2 and lobe_weight(math.cos(reach), alpha) > least * peak:
+        while reach < math.pi / 2 and lobe_weight(math.cos(reach), alpha) > least_weight:
             reach += 0.002
-    place = 0
     texel = math.pi / source_height
-    for row in range(height):
+    sources = np.empty((source_height, 2 * source_height, 3))
+    for j in range(source_height):
+        for i in range(2 * source_height):
+            sources[j, i] = texel_direction(j, i, source_height)
+    starts[0] = 0
+    for number in prange(2 * height * height):
+        row, column = number // (2 * height), number % (2 * height)
         polar = math.pi * (row + 0.5) / height
         top = max(0, int((polar - reach) / texel - 1.0))
         bottom = min(source_height, int((polar + reach) / texel + 2.0))
-        for column in range(2 * height):
-            x, y, z = texel_direction(row, column, height)
-            starts[row * 2 * height + column] = place
-            total, first = 0.0, place
-            for j in range(top, bottom):
-                ring = math.sin(math.pi * (j + 0.5) / source_height)
-                for i in range(2 * source_height):
-                    a, b, c = texel_direction(j, i, source_height)
-                    weight = lobe_weight(x * a + y * b + z * c, alpha)
-                    if weight <= least * peak:
-                        continue
-                    if not counting:
-                        columns[place] = j * 2 * source_height + i
-                        weights[place] = weight * ring
-                        total += weight * ring
-                    place += 1
-            if not counting:
-                for k in range(first, place):
-                    weights[k] /= total
-    starts[2 * height * height] = place
+        x, y, z = texel_direction(row, column, height)
+        total = 0.0
+        first = 0 if counting else starts[number]
+        place = first
+        for j in range(top, bottom):
+            ring = math.sin(math.pi * (j + 0.5) / source_height)
+            for i in range(2 * source_height):
+                weight = lobe_weight(
+                    x * sources[j, i, 0] + y * sources[j, i, 1] + z * sources[j, i, 2], alpha
+                )
+                if weight <= least_weight:
+                    continue
+                if not counting:
+                    columns[place] = j * 2 * source_height + i
+                    weights[place] = weight * ring
+                    total += weight * ring
+                place += 1
+        if counting:
+            starts[number + 1] = place
+        else:
+            for k in range(first, place):
+                weights[k] /= total
+    if counting:
+        for number in range(2 * height * height):
+            starts[number + 1] += starts[number]
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -191,6 +191,7 @@ def reverse_pixel(
         sharp = mix(texels, near[0], near[1], near[2], near[3], near[4], near[5], channel)
         blurred = mix(texels, far[0], far[1], far[2], far[3], far[4], far[5], channel)
         around = sharp * (1.0 - between) + blurred * between
+        out.around[p, channel] = around
         irradiance = mix(texels, facing[0], facing[1], facing[2], facing[3], facing[4], facing[5], channel)
         seen = visibility[p] * around + indirect[p, channel]
         lit = ambient[p] * irradiance + bounced[p, channel]

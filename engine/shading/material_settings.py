@@ -29,13 +29,19 @@ class MaterialSettings(BaseModel):
         secondary_from: when visibility and indirect light begin.
         secondary_share: share of a batch's pixels that are given a reflected ray.
         visibility: whether what stands in the way of a reflection hides the environment there.
+        reflections: surfaces on the path of a reflected ray.
+        facet_slope: least angle between a normal and the two facets beside it at which rays are reflected, at
+            the beginning and from ``blur_until`` on; the rougher the surface, the larger.
         indirect: light of what stands there: ``shaded`` by the split sum, from the ``harmonics``, or
             ``none``.
         ambient: whether the irradiance is dimmed where other things hide the environment.
+        bounced: whether matt surfaces are lit by what others send, too.
         ambient_rays: rays from each side of a Gaussian that say how much.
         ambient_parts: rebuilds of the hierarchy in which all Gaussians have their turn.
         hdr: whether the environment may be brighter than 1.
         reflected_gradient: whether normals learn through the reflected direction.
+        normal_clip: gradients by normals through the reflected direction are cut off at so many times their
+            median of a batch; 0 leaves them alone.
         start: distance from the surface at which reflected rays begin, of the extent.
         blur: roughness of the level that leads reflected directions at first, and sees farther than a
             sharp one; it falls to 0 until ``blur_until``.
@@ -67,12 +73,16 @@ class MaterialSettings(BaseModel):
     secondary_from: float = Field(0.05, ge=0, le=1)
     secondary_share: float = Field(1.0, ge=0, le=1)
     visibility: bool = True
+    reflections: int = Field(3, ge=1, le=8)
+    facet_slope: tuple[float, float] = (0.1, 0.01)
     indirect: Literal["shaded", "harmonics", "none"] = "shaded"
     ambient: bool = True
+    bounced: bool = True
     ambient_rays: int = Field(16, ge=4)
     ambient_parts: int = Field(20, ge=1)
     hdr: bool = True
     reflected_gradient: bool = True
+    normal_clip: float = Field(2.0, ge=0)
     start: float = Field(0.004, gt=0)
     blur: float = Field(0.5, ge=0, le=1)
     blur_until: float = Field(0.3, ge=0, le=1)
@@ -105,3 +115,9 @@ class MaterialSettings(BaseModel):
     def blurred(self, progress: float) -> float:
         """Roughness of the level that leads reflected directions."""
         return self.blur * max(0.0, 1.0 - progress / self.blur_until) if self.blur_until > 0 else 0.0
+
+    def least_slope(self, progress: float) -> float:
+        """Tangent of the least angle between a normal and its facets."""
+        first, last = self.facet_slope
+        share = min(progress / self.blur_until, 1.0) if self.blur_until > 0 else 1.0
+        return first * (last / first) ** share

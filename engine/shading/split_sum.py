@@ -93,6 +93,7 @@ class ShadeGradients(NamedTuple):
         bounced: by the bounced light.
         specular: by what the lobe sees, each channel.
         diffuse: by the irradiance.
+        around: no gradient: what the lobe would see if nothing hid the environment.
         taps: texels that were asked.
         weights: their weights.
     """
@@ -106,6 +107,7 @@ class ShadeGradients(NamedTuple):
     bounced: Float64[np.ndarray, "p 3"]
     specular: Float64[np.ndarray, "p 3"]
     diffuse: Float64[np.ndarray, "p 3"]
+    around: Float64[np.ndarray, "p 3"]
     taps: Int32[np.ndarray, "p 12"]
     weights: Float64[np.ndarray, "p 12"]
 

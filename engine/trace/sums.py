@@ -12,12 +12,16 @@ def add_gradients(parts: Sequence[GaussianGradients]) -> GaussianGradients:
     """The sum of at least one, for all Gaussians that any of them met; a single one is returned as it is."""
     if len(parts) == 1:
         return parts[0]
-    ids = np.unique(np.concatenate([part.ids for part in parts]))
+    met = np.zeros(1 + max(int(part.ids.max(initial=-1)) for part in parts), bool)
+    for part in parts:
+        met[part.ids] = True
+    ids = np.flatnonzero(met).astype(parts[0].ids.dtype)
+    place = np.cumsum(met) - 1
     sums = {}
     for name in (field.name for field in fields(GaussianGradients) if field.name != "ids"):
         first = getattr(parts[0], name)
         total = np.zeros((len(ids), *first.shape[1:]), first.dtype)
         for part in parts:
-            total[np.searchsorted(ids, part.ids)] += getattr(part, name)
+            total[place[part.ids]] += getattr(part, name)
         sums[name] = total
     return GaussianGradients(ids=ids, **sums)

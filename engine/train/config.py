@@ -172,9 +172,12 @@ class TrainConfig(_Frozen):
 def iteration_count(config: TrainConfig, training_pixels: int) -> int:
     """``config.iterations``, or where that is 0 three rays for each pixel, in whole thousands.
 
-    Large scenes learn as long as there is something to see; small ones are done after 5,000.
+    Large scenes learn as long as there is something to see; small ones are done after 5,000. Materials take
+    four rays for each pixel, since normals go on getting better.
     """
-    return config.iterations or min(max(round(3 * training_pixels / config.rays / 1000), 5), 12) * 1000
+    rays_a_pixel = 4 if config.materials.learn else 3
+    wanted = round(rays_a_pixel * training_pixels / config.rays / 1000)
+    return config.iterations or min(max(wanted, 5), 12) * 1000
 
 
 def most_gaussians(config: TrainConfig, training_pixels: int) -> int:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from engine.errors import DatasetError
 from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
+from engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
 from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.scene import Dataset
 from engine.shading.material_settings import MaterialSettings
@@ -66,6 +66,8 @@ def with_first_materials(gaussians: FlatGaussians, settings: MaterialSettings) -
     """The same Gaussians with the materials that a training begins with, all alike."""
     values = (settings.first_albedo,) * 3, (settings.first_metallic,), (settings.first_roughness,)
     first = dict(zip(MATERIAL_WIDTHS, values, strict=True)) | {AMBIENT: (1.0,)}
+    if settings.recipe == "split_sum" and settings.bounced:
+        first[BOUNCED] = (0.0,) * 3
     return gaussians.with_channels(
         {name: np.tile(np.array(value, np.float32), (len(gaussians), 1)) for name, value in first.items()}
     )

@@ -27,7 +27,7 @@ def adam_step(
     g_means, g_quats, g_log_scales, g_logits, g_sh,
     rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rate_sh0, rate_sh_rest,
     opacity_weight, scale_weight, min_log_scale, max_log_scale,
-    beta1, beta2, epsilon, mean_steps,
+    beta1, beta2, epsilon, mean_steps, corrections,
 ):  # fmt: skip
     """One step for the Gaussians ``ids``; each has its own step count for the bias correction.
 
@@ -35,7 +35,7 @@ def adam_step(
     mean of its two scales.
 
     ``opacity_weight`` and ``scale_weight`` add the gradients of their regularisers. ``mean_steps`` receives
-    each mean's step, world units.
+    each mean's step, world units, and ``corrections`` what both moments are multiplied by.
     """
     basis_count = sh.shape[1]
     for k in prange(len(ids)):
@@ -43,6 +43,7 @@ def adam_step(
         steps[i] += 1
         c1 = 1.0 / (1.0 - beta1 ** steps[i])
         c2 = 1.0 / (1.0 - beta2 ** steps[i])
+        corrections[k, 0], corrections[k, 1] = c1, c2
         column = 0
         rate = rate_mean
         if mean_by_size:
@@ -88,15 +89,15 @@ def adam_step(
 
 
 @njit(cache=True, parallel=True)
-def adam_shares(ids, steps, first, second, column, values, g_values, rate, beta1, beta2, epsilon):
+def adam_shares(ids, corrections, first, second, column, values, g_values, rate, beta1, beta2, epsilon):
     """One step for numbers in (0, 1) of the Gaussians ``ids``, taken by their logits.
 
-    Their moments begin at ``column``; ``steps`` were counted already. A ``rate`` of 0 changes nothing.
+    Their moments begin at ``column``; ``corrections`` are those of :func:`adam_step`. A ``rate`` of 0 changes
+    nothing.
     """
     for k in prange(len(ids)):
         i = ids[k]
-        c1 = 1.0 / (1.0 - beta1 ** steps[i])
-        c2 = 1.0 / (1.0 - beta2 ** steps[i])
+        c1, c2 = corrections[k, 0], corrections[k, 1]
         for place in range(values.shape[1]):
             value = min(max(np.float64(values[i, place]), LEAST_SHARE), 1.0 - LEAST_SHARE)
             gradient = np.float64(g_values[k, place]) * value * (1.0 - value)

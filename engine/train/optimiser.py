@@ -6,7 +6,7 @@ After "Adam: A Method for Stochastic Optimization" (https://arxiv.org/abs/1412.6
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.gaussians.rows import join_rows, row_arrays, select_rows
@@ -90,6 +90,7 @@ class Adam:
             Each hit Gaussian's step of the mean, world units.
         """
         moved = np.empty((len(gradients.ids), 3), np.float32)
+        corrections = np.empty((len(gradients.ids), 2))
         hit = max(1, len(gradients.ids))
         decay = rates.decay**progress
         colour = rates.colour / SH_C0 * decay
@@ -105,13 +106,18 @@ class Adam:
             colour, colour * rates.sh_rest_ratio,
             loss.opacity / hit, loss.scale / (2 * hit * extent),
             float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
-            BETA1, BETA2, EPSILON, moved,
+            BETA1, BETA2, EPSILON, moved, corrections,
         )  # fmt: skip
-        self._step_channels(gaussians, gradients, rates, decay)
+        self._step_channels(gaussians, gradients, rates, decay, corrections)
         return moved
 
     def _step_channels(
-        self, gaussians: FlatGaussians, gradients: GaussianGradients, rates: LearningRates, decay: float
+        self,
+        gaussians: FlatGaussians,
+        gradients: GaussianGradients,
+        rates: LearningRates,
+        decay: float,
+        corrections: Float64[np.ndarray, "u 2"],
     ) -> None:
         column = 0
         if gradients.features.shape[1] < self.channel_first.shape[1]:
@@ -120,7 +126,7 @@ class Adam:
             rate, width = rates.of_channel(name), values.shape[1]
             if rate > 0:
                 adam_shares(
-                    gradients.ids, self.steps, self.channel_first, self.channel_second, column, values,
+                    gradients.ids, corrections, self.channel_first, self.channel_second, column, values,
                     gradients.features[:, column : column + width], rate * decay, BETA1, BETA2, EPSILON,
                 )  # fmt: skip
             column += width

@@ -23,7 +23,7 @@ from workers.queue import jobs as rows
 from workers.records.database import Connection
 from workers.records.datasets import get_dataset, photograph_sizes
 from workers.records.quotas import check_new_job
-from workers.records.rows import Job
+from workers.records.rows import Dataset, Job
 from workers.upkeep.webhooks.rows import add_endpoint
 from workers.work.kinds import JobKind, kind_named
 from workers.work.kinds.estimates import Estimate
@@ -165,8 +165,11 @@ async def _inputs(connection: Connection, who: Principal, asked: _Asked) -> _Inp
 
 async def _source(connection: Connection, who: Principal, asked: _Asked) -> _Inputs:
     new, kind = asked.new, asked.kind
-    if new.source_id is None or new.dataset_id is not None:
+    if new.source_id is None:
         raise input_problem("source_id", f"The kind {kind.name} works on source_id, a finished job.")
+    if new.dataset_id is not None and kind.on_others is None:
+        detail = f"The kind {kind.name} works on source_id alone, a finished job."
+        raise input_problem("dataset_id", detail)
     source = await rows.get_job(connection, new.source_id, lock=True)
     if source is None or not who.owns(source.owner):
         raise input_problem("source_id", "There is no such job.")
@@ -175,6 +178,12 @@ async def _source(connection: Connection, who: Principal, asked: _Asked) -> _Inp
         raise Problem(409, "source", f"The job in source_id is {source.state} and has no results.")
     if kind.source_files and kind.source_files[0] not in names:
         raise input_problem("source_id", f"The job in source_id has no {kind.source_files[0]}.")
+    if new.dataset_id is not None and kind.on_others is not None:
+        dataset = await _photographs(connection, who, new.dataset_id)
+        if not dataset.has_poses:
+            detail = "The dataset holds no COLMAP model, which says where in the scene its photographs are."
+            raise input_problem("dataset_id", detail)
+        return _Inputs(dataset.id, source.id, kind.on_others(asked.options))
     return _Inputs(source.dataset_id, source.id, asked.options)
 
 
@@ -182,17 +191,23 @@ async def _dataset(connection: Connection, who: Principal, asked: _Asked) -> _In
     new, kind = asked.new, asked.kind
     if new.dataset_id is None or new.source_id is not None:
         raise input_problem("dataset_id", f"A job of the kind {kind.name} works on dataset_id, a dataset.")
-    dataset = await get_dataset(connection, new.dataset_id, lock=True)
+    dataset = await _photographs(connection, who, new.dataset_id)
+    if kind.needs_poses(asked.options) and not dataset.has_poses:
+        detail = "The dataset holds no COLMAP model; set the option poses to auto, or send a model."
+        raise Problem(422, "poses", detail, errors=[{"pointer": "#/options/poses", "detail": detail}])
+    return _Inputs(dataset.id, None, kind.settle(asked.options, dataset.has_poses))
+
+
+async def _photographs(connection: Connection, who: Principal, dataset_id: uuid.UUID) -> Dataset:
+    """A dataset of photographs that is ready."""
+    dataset = await get_dataset(connection, dataset_id, lock=True)
     if dataset is None or not who.owns(dataset.owner):
         raise input_problem("dataset_id", "There is no such dataset.")
     if dataset.holds != "photographs":
         raise input_problem("dataset_id", "The dataset holds no photographs; give it as files_id.")
     if dataset.state != "committed":
         raise Problem(409, "dataset-open", "The dataset is not committed yet; POST to its /commit first.")
-    if kind.needs_poses(asked.options) and not dataset.has_poses:
-        detail = "The dataset holds no COLMAP model; set the option poses to auto, or send a model."
-        raise Problem(422, "poses", detail, errors=[{"pointer": "#/options/poses", "detail": detail}])
-    return _Inputs(dataset.id, None, kind.settle(asked.options, dataset.has_poses))
+    return dataset
 
 
 async def _revised(

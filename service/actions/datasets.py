@@ -2,6 +2,7 @@
 
 import asyncio
 import uuid
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
@@ -51,6 +52,14 @@ async def list_datasets(
     async with service.pool.connection() as connection:
         found = await rows.list_datasets(connection, owner=who.sees, before=before, limit=limit + 1)
     return cut(found, limit, lambda dataset: dataset.id)
+
+
+async def list_files_named(
+    service: Service, who: Principal, endings: Sequence[str], *, limit: int
+) -> list[tuple[Dataset, str]]:
+    """Files of the asker's committed datasets that hold files: those whose names end so, the newest first."""
+    async with service.pool.connection() as connection:
+        return await rows.files_named(connection, who.owner, endings, limit=limit)
 
 
 async def get_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> Dataset:

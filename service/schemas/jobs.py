@@ -39,7 +39,11 @@ class NewJob(Strict):
     )
 
     kind: str = Field("reconstruct", max_length=40, description="One of GET /v1/options.")
-    dataset_id: uuid.UUID | None = Field(None, description="A committed dataset, for kinds that need one.")
+    dataset_id: uuid.UUID | None = Field(
+        None,
+        description="A committed dataset, for kinds that need one; `evaluate` measures its photographs "
+        "in the place of those that the job in `source_id` held out.",
+    )
     source_id: uuid.UUID | None = Field(None, description="A job that succeeded, for kinds that work on one.")
     files_id: uuid.UUID | None = Field(
         None, description="A committed dataset that holds the files which the options name."

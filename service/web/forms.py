@@ -36,11 +36,16 @@ _LABELS = {
     "sh_degree": "Spherical harmonics, degree",
     "fps": "Images per second",
     "q": "Squared octagon radius, standard deviations",
+    "set.albedo": "Base colour",
+    "scale.albedo": "Base colour, times",
+    "scale.metallic": "Metallic, times",
+    "scale.roughness": "Roughness, times",
 }
 _TITLES = {
     "evaluate": "Measure it again",
     "export": "Write other formats",
     "render": "Render a video or images",
+    "material": "Change materials",
 }
 """What to do with a result, shorter than the kinds say it; a kind that is not here keeps its own title."""
 WITHOUT_FORM = ("relight",)
@@ -257,7 +262,7 @@ def _field(
         control = "list"
     return Field(
         path=path,
-        label=_LABELS.get(name) or _label(name),
+        label=_LABELS.get(path) or _LABELS.get(name) or _label(name),
         control=control,
         help=words if presets and (words := _HELPS.get(path)) else _sentence(text),
         choices=choices,

@@ -26,9 +26,11 @@ from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
 from service.web.forms import WITHOUT_FORM, options_form
 from service.web.light import light_form
 from service.web.reading import job_counts, job_detail, job_lines, photographs_of
+from service.web.relight import relight_form
 from service.web.results import (
     CONFIG,
     HELD_OUT,
+    LAYERS,
     METRICS,
     REPORT,
     SCENE,
@@ -87,6 +89,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         Threads.DOWNLOADS,
         lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)],
     )
+    held_out = await asyncio.to_thread(read_names, service.storage, by_name.get(HELD_OUT))
     figures = measured(metrics, artifacts, photographs)
     preview = detail.line.job.preview or {}
     shown = f"images/{preview.get('view')}"
@@ -102,6 +105,8 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         detail=detail,
         measured=figures,
         light=light_form(figures, artifacts, photographs, service.settings) if who.may("write") else None,
+        relight=await relight_form(service, who, artifacts, held_out),
+        layers=LAYERS,
         pictures=[row for row in artifacts if row.name.startswith("views/") and row.name.endswith(".png")][
             :MAX_PICTURES
         ],
@@ -110,6 +115,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         report=by_name.get(REPORT),
         video=next((row for row in artifacts if row.media_type == "video/mp4"), None),
         q=_octagon_q(config),
+        up=_up_world(config),
         background=config.get("reconstruction", {}).get("evaluate_background", "black"),
         photograph=shown if any(file.path == shown for file in photographs) else None,
         further=[options_form(kind, unwritable) for kind in extra] if who.may("write") else [],
@@ -229,10 +235,22 @@ def _fits(source_files: tuple[str, ...], names: dict[str, Artifact]) -> bool:
     return not source_files or source_files[0] in names
 
 
-def _octagon_q(config: dict[str, object]) -> float | None:
+def _at(config: dict[str, object], *keys: str) -> object:
     found: object = config
-    for key in ("reconstruction", "train", "trace", "q"):
+    for key in keys:
         found = found.get(key) if isinstance(found, dict) else None
+    return found
+
+
+def _up_world(config: dict[str, object]) -> str:
+    """The axis about which the light of a result lies, as JSON."""
+    found = _at(config, "reconstruction", "train", "materials", "up_world")
+    known = isinstance(found, list) and len(found) == 3 and all(isinstance(x, int | float) for x in found)
+    return json.dumps(found if known else [0, 0, 1])
+
+
+def _octagon_q(config: dict[str, object]) -> float | None:
+    found = _at(config, "reconstruction", "train", "trace", "q")
     return float(found) if isinstance(found, int | float) and found > 0 else None
 
 

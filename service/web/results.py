@@ -19,6 +19,17 @@ MAX_JSON_BYTES = 16 << 20
 SCENE, METRICS, REPORT, CONFIG, HELD_OUT = (
     "scene.ply", "metrics.json", "report.html", "config.json", "held_out.json",
 )  # fmt: skip
+LAYERS: Mapping[str, str] = {
+    "normal": "Normals",
+    "depth": "Depth",
+    "albedo": "Base colour",
+    "metallic": "Metallic",
+    "roughness": "Roughness",
+    "visibility": "Visibility",
+    "indirect": "Indirect light",
+}
+"""What can be shown of a view with materials, in the order in which it is offered."""
+LEARNT_LIGHT = "layers/environment.png"
 _SHOWN_BY_BROWSERS = frozenset({".jpg", ".jpeg", ".png", ".webp", ".bmp"})
 
 
@@ -51,6 +62,7 @@ class View:
         values: by the key of the metric; None where it could not be measured.
         render: name of the result that shows it, if there is one.
         photograph: name in the dataset, if a browser can show it.
+        layers: names of the results that show what lies behind the render, by layer.
         width: of the render, px.
         height: of the render, px.
     """
@@ -59,6 +71,7 @@ class View:
     values: Mapping[str, float | None]
     render: str | None
     photograph: str | None
+    layers: Mapping[str, str]
     width: int
     height: int
 
@@ -151,6 +164,11 @@ def measured(
                 {metric.key: _number(row.get(metric.key)) for metric in METRIC_LIST},
                 render if render in results else None,
                 photograph if shown else None,
+                {
+                    layer: name
+                    for layer in LAYERS
+                    if (name := render.replace("renders/", f"layers/{layer}/", 1)) in results
+                },
                 int(_number(row.get("width")) or 4),
                 int(_number(row.get("height")) or 3),
             )
@@ -194,6 +212,8 @@ _NAMED = {
     REPORT: (_FIGURES, "a browser; one file, to keep or to send"),
     CONFIG: (_RECORDS, "a text editor: every setting of the run"),
     HELD_OUT: (_RECORDS, "a text editor: the photographs that training never saw"),
+    "environment.hdr": (_SCENE, "Blender and whatever takes HDR light: what lit the photographs, all around"),
+    "edits.json": (_RECORDS, "a text editor: what was changed since the training"),
     "views.json": (_RECORDS, "octasplat render and surface, which need no photographs then"),
     "events.jsonl": (_RECORDS, "a text editor: what happened when, a line each"),
     "training.json": (_RECORDS, "a text editor"),

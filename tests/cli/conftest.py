@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -7,9 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from engine.config import resolve_config
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.light.environment import write_environment
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from workers.cli.main import cli
 
@@ -87,3 +92,24 @@ def run(scene: Path, octasplat: Octasplat, tmp_path_factory: pytest.TempPathFact
     result = octasplat("reconstruct", scene, "-o", output, *TINY)
     assert result.exit_code == 0, result.output
     return Run(scene, output, result.stdout)
+
+
+@pytest.fixture(scope="session")
+def shiny_run(run, tmp_path_factory) -> Path:
+    """The run of the other tests, with materials given to its Gaussians by hand."""
+    root = tmp_path_factory.mktemp("shiny")
+    shutil.copytree(run.output, root / "run")
+    gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
+    count = len(gaussians)
+    channels = {
+        "albedo": np.full((count, 3), 0.25, np.float32),
+        "metallic": np.full((count, 1), 1.0, np.float32),
+        "roughness": np.full((count, 1), 0.5, np.float32),
+    }
+    write_gaussian_ply(gaussians.with_channels(channels), root / "run" / "scene.ply")
+    write_environment(root / "run" / "environment.hdr", np.full((16, 32, 3), 0.5, np.float32))
+    content = json.loads((root / "run" / "config.json").read_text())
+    given = resolve_config("fast", settings={"test_every": 4}, assignments=["materials.learn=true"])
+    content["reconstruction"] = given.model_dump(mode="json")
+    (root / "run" / "config.json").write_text(json.dumps(content))
+    return root / "run"

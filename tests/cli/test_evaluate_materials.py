@@ -9,8 +9,6 @@ import OpenImageIO as oiio
 import pytest
 from pydantic import ValidationError
 
-from engine.config import resolve_config
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.light.environment import write_environment
 from engine.render.images import read_image
 from workers.records.sizes import Sizes
@@ -28,27 +26,6 @@ def save(path: Path, values: np.ndarray) -> None:
     assert output.open(str(path), oiio.ImageSpec(image.shape[1], image.shape[0], image.shape[2], "uint8"))
     assert output.write_image(image)
     output.close()
-
-
-@pytest.fixture(scope="module")
-def shiny_run(run, tmp_path_factory) -> Path:
-    """The run of the other tests, with materials given to its Gaussians by hand."""
-    root = tmp_path_factory.mktemp("shiny")
-    shutil.copytree(run.output, root / "run")
-    gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
-    count = len(gaussians)
-    channels = {
-        "albedo": np.full((count, 3), 0.25, np.float32),
-        "metallic": np.full((count, 1), 1.0, np.float32),
-        "roughness": np.full((count, 1), 0.5, np.float32),
-    }
-    write_gaussian_ply(gaussians.with_channels(channels), root / "run" / "scene.ply")
-    write_environment(root / "run" / "environment.hdr", np.full((16, 32, 3), 0.5, np.float32))
-    content = json.loads((root / "run" / "config.json").read_text())
-    given = resolve_config("fast", settings={"test_every": 4}, assignments=["materials.learn=true"])
-    content["reconstruction"] = given.model_dump(mode="json")
-    (root / "run" / "config.json").write_text(json.dumps(content))
-    return root / "run"
 
 
 @pytest.fixture(scope="module")

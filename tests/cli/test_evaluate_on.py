@@ -8,6 +8,9 @@ import pycolmap
 import pytest
 
 from engine.render.images import read_image
+from workers.work.kinds import kind_named
+from workers.work.programs import evaluate
+from workers.work.task import Task
 
 
 def part_of(scene: Path, folder: Path, wanted: set[str], *, points: bool = False) -> Path:
@@ -47,6 +50,15 @@ def test_views_of_another_folder_are_measured_as_the_run_measures_its_own(run, o
     own_picture = read_image(run.output / "renders" / f"{name}.png")
     assert (read_image(measured / "renders" / f"{name}.png") == own_picture).all()
     assert (run.output / "metrics.json").read_bytes() == own
+    # The same as a job: its results are those figures.
+    kind = kind_named("evaluate")
+    shutil.copytree(run.output, tmp_path / "attempt" / "run", ignore=shutil.ignore_patterns("on", "cache"))
+    options = kind.on_others(kind.resolve({}))
+    evaluate(Task(tmp_path / "attempt", options.model_dump(mode="json"), scene=others, threads=1))
+    results = tmp_path / "attempt" / "results"
+    assert json.loads((results / "metrics.json").read_text())["views"] == metrics["views"]
+    assert sorted(path.name for path in results.iterdir()) == ["metrics.json", "renders", "report.html"]
+    assert len(list((results / "renders").iterdir())) == len(pictures)
 
     same_name = part_of(run.scene, tmp_path / "elsewhere" / "others", {some[1]})
     result = octasplat("evaluate", run.output, "--on", same_name)

@@ -98,8 +98,9 @@ def test_poses_shared_by_some_images_are_told(edited, octasplat, tmp_path, tiny)
     assert "2 images" in result.stderr and "view_002.png = view_005.png" in result.stderr
 
 
-def test_masks_as_alpha_need_masks(scene, octasplat, tmp_path):
-    result = octasplat("reconstruct", scene, "-o", tmp_path / "run", "--masks", "alpha", *ONE_STEP)
+@pytest.mark.parametrize("shiny", [(), ("--materials",)])
+def test_masks_as_alpha_need_masks(scene, octasplat, tmp_path, shiny):
+    result = octasplat("reconstruct", scene, "-o", tmp_path / "run", "--masks", "alpha", *ONE_STEP, *shiny)
     assert result.exit_code == 1
     assert str(scene / "masks") in result.stderr and "--masks alpha" in result.stderr
     assert not (tmp_path / "run" / "config.json").exists()

@@ -150,6 +150,8 @@ def test_transform_crop_merge_clean(octasplat, scene: Path, tmp_path: Path) -> N
     assert octasplat("crop", scene, "-o", right, *box).exit_code == 0
     assert octasplat("crop", scene, "-o", left, *box, "--inverse").exit_code == 0
     assert_same(read(right), g.select(g.means_world[:, 0] >= 0))
+    assert octasplat("crop", scene, "-o", left, "--where", "x < 0").exit_code == 0
+    assert_same(read(left), g.select(g.means_world[:, 0] < 0))
     result = octasplat("merge", right, left, "-o", both, "--sh-degree", 1)
     assert result.exit_code == 0 and "150 Gaussians" in result.stdout
     assert len(read(both)) == 150 and read(both).sh_degree == 1

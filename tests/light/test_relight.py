@@ -61,6 +61,18 @@ def test_several_environments_have_folders_and_a_film(scene, tmp_path):
     assert (tmp_path / "film.mp4").stat().st_size > 500
 
 
+def test_light_is_cut_off_where_asked(scene, tmp_path):
+    """White metal in light of 0.5, or of what is left of it."""
+    for most, left in ((0.2, 0.2), (3, 0.5)):
+        done = relight(
+            scene / "ball.ply", "--environment", scene / "white.hdr", "-o", tmp_path / str(most), "--exr",
+            "--clamp", most, *SMALL,
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+        image = read_channels(tmp_path / str(most) / "frame_0000.exr")
+        assert image["G"][9:15, 13:19].mean() == pytest.approx(left, rel=0.03)
+
+
 @pytest.mark.parametrize(("by", "least"), [("split-sum", 60), ("path", 25)])
 def test_a_turned_environment_is_the_map_turned(scene, tmp_path, by, least):
     for name, environment, turn in (("a", "turned.exr", 0), ("b", "sides.exr", 180), ("c", "sides.exr", 0)):
@@ -79,12 +91,16 @@ def test_a_turned_environment_is_the_map_turned(scene, tmp_path, by, least):
         (("plain.ply", "white.hdr"), "plain.ply has no materials"),
         (("ball.ply", "ball.ply"), "HDR or EXR"),
         (("ball.ply", "missing.hdr"), "missing.hdr"),
+        (("ball.ply", "text.hdr"), "text.hdr: the environment cannot be read"),
+        (("ball.ply", "cut.hdr"), "cut.hdr is damaged"),
         (("ball.ply", "white.hdr", "other/white.exr"), "two environments"),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence(scene, tmp_path, arguments, told):
     (scene / "other").mkdir(exist_ok=True)
     write_environment(scene / "other" / "white.exr", np.full((16, 32, 3), 0.5, np.float32))
+    (scene / "text.hdr").write_text("no picture")
+    (scene / "cut.hdr").write_bytes((scene / "white.hdr").read_bytes()[:-40])
     maps = [part for name in arguments[1:] for part in ("--environment", scene / name)]
     done = relight(scene / arguments[0], *maps, "-o", tmp_path / "out", *SMALL)
     assert done.exit_code == 1

@@ -312,6 +312,89 @@ const steps = {
         return found;
     },
 
+    /** What lies behind the views of a result with materials, another light for it, and other materials. */
+    async relight() {
+        const found = {};
+        const page = await open();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await page.waitForSelector("#relight[data-ready=yes]");
+        const decoded = (selector) => page.evaluate(async (one) => {
+            const image = document.querySelector(one);
+            image.loading = "eager";
+            await image.decode();
+            return [new URL(image.src).pathname.replace(/.*\/artifacts\//, ""), image.naturalWidth, image.naturalHeight];
+        }, selector);
+        found.learnt = await decoded(".learnt img");
+        found.layers = [];
+        for (const button of await page.locator("#view-shown .layers [data-layer]").all()) {
+            await button.click();
+            found.layers.push([await button.textContent(), ...await decoded("#view-shown .below")]);
+            if (job.every) await shot(page, `materials_${await button.getAttribute("data-mode")}`, false);
+        }
+        await shot(page, "relight_form");
+        found.tag = await page.textContent("#view-shown .tag.right");
+        await page.locator(".sortable tbody tr").nth(1).click();
+        found.other = await decoded("#view-shown .below"); // the layer stays, the view changes
+        await page.click("#view-shown [data-mode=render]");
+        found.render = await decoded("#view-shown .below");
+        found.hidden = await page.evaluate(() => document.getElementById("relight-samples").parentElement.hidden);
+        await page.click("#relight [data-do=views]");
+        await page.waitForSelector("#relight .fault:not([hidden])");
+        found.refused = await page.textContent("#relight .fault");
+        await page.setInputFiles("#relight-file", job.map);
+        await page.fill("#relight-rotation_degrees", "90");
+        // The 3D view shows it at once; the learnt light is another.
+        await page.waitForSelector("#viewer[data-ready=yes]");
+        const look = async () => {
+            await page.evaluate(() => scrollTo(0, 0));
+            await page.waitForTimeout(500);
+            return brightness(page);
+        };
+        const looks = [await look()];
+        for (const live of ["this", "learnt", ""]) {
+            await page.selectOption("#relight-live", live);
+            await page.waitForSelector(`#relight[data-live=${live || "none"}]`);
+            looks.push(await look());
+            if (job.every && live) await shot(page, `live_${live}`, false);
+        }
+        found.looks = looks.map(({ mean }) => mean);
+        await page.selectOption("#relight-by", job.by);
+        if (job.preview) {
+            await page.click("#relight [data-do=preview]");
+            await page.waitForSelector("#relight figure.preview:not([hidden])");
+            found.preview = await decoded("#relight .preview img");
+            found.took = await page.textContent("#relight .light-state");
+            await shot(page, "relight_preview");
+        }
+        found.nameless = await nameless(page);
+        await page.click("#relight [data-do=views]");
+        await page.waitForURL((url) => !url.pathname.endsWith(job.job));
+        found.first = page.url().split("/").pop();
+        if (job.preview) {
+            await page.waitForSelector(".pictures img");
+            await shot(page, "relight_result");
+        }
+        // What was sent before can be chosen.
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await page.waitForSelector("#relight[data-ready=yes]");
+        found.maps = await page.locator("#relight-map option").allTextContents();
+        await page.selectOption("#relight-map", { index: 1 });
+        await page.check("#relight [name=spin]");
+        await page.click("#relight [data-do=turntable]");
+        await page.waitForURL((url) => !url.pathname.endsWith(job.job));
+        found.second = page.url().split("/").pop();
+        await page.goto(`${job.url}/jobs/${job.job}`);
+        await page.click("form[data-kind=material] >> xpath=ancestor::details >> summary");
+        await page.fill("#material-set-albedo", "#ff8000");
+        await page.fill("#material-scale-roughness", "0.5");
+        await page.fill("#material-where", "metallic > 0.5");
+        await shot(page, "material_form");
+        await page.click("form[data-kind=material] [type=submit]");
+        await page.waitForURL((url) => !url.pathname.endsWith(job.job));
+        found.third = page.url().split("/").pop();
+        return found;
+    },
+
     /** All pages as narrow as a phone, in dark and light, and by touch. */
     async phone() {
         const found = { overflow: {}, background: {} };

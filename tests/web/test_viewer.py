@@ -3,12 +3,15 @@
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "tools"))  # the browser, and a scene to draw
+sys.path.append(str(Path(__file__).parents[1] / "light"))
 from browser import Page, open_page, psnr
+from light_scenes import shiny_ball
 from shell_scene import our_view, shell_scene
 
 import service.web
@@ -16,6 +19,8 @@ from engine.colour import to_bytes
 from engine.files.gaussian_ply import write_gaussian_ply
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
+from engine.light.environment import EnvironmentMap, environment_frame, read_environment, write_environment
+from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.renderer import background_colour, render_rays
 from engine.trace.cpu import CpuTracer
@@ -30,6 +35,7 @@ PAGE = """<!doctype html>
 <canvas width="256" height="256"></canvas>
 <script type="module">
 import { PerspectiveCamera } from "/files/vendor/three.js";
+import { readHdr } from "/files/viewer/environment.js";
 import { SplatRenderer, Sorting } from "/files/viewer/splats.js";
 window.result = (async () => {
   const job = JOB;
@@ -45,6 +51,10 @@ window.result = (async () => {
     worker.postMessage({ load: job.url });
   });
   view.setScene(scene, job.q);
+  if (job.light) {
+    view.setLight(readHdr(await (await fetch("/files/light.hdr")).arrayBuffer()));
+    view.lighting.turn(job.light.up, job.light.degrees);
+  }
   const camera = new PerspectiveCamera(job.fov, 1, 0.01, 100);
   camera.matrixAutoUpdate = false;
   camera.matrix.fromArray(job.pose);
@@ -71,7 +81,13 @@ def camera_at(x: float, y: float, z: float) -> RenderCamera:
 
 
 def draw(
-    scene: FlatGaussians, camera: RenderCamera, folder: Path, *, q: float, background: tuple[float, ...]
+    scene: FlatGaussians,
+    camera: RenderCamera,
+    folder: Path,
+    *,
+    q: float,
+    background: tuple[float, ...],
+    light: dict[str, Any] | None = None,
 ) -> Page:
     write_gaussian_ply(scene, folder / "scene.ply")
     # three.js cameras look along -z with y up.
@@ -83,10 +99,12 @@ def draw(
         "url": "/files/scene.ply",
         "q": q,
         "background": background,
+        "light": light,
     }
     files = {path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*.js")}
     page = PAGE.replace("JOB", json.dumps(job))
-    return open_page(page, files={**files, "scene.ply": folder / "scene.ply"}, width=SIDE_PX, height=SIDE_PX)
+    files |= {path.name: path for path in (folder / "scene.ply", folder / "light.hdr") if path.exists()}
+    return open_page(page, files=files, width=SIDE_PX, height=SIDE_PX)
 
 
 def with_harmonics(scene: FlatGaussians, degree: int) -> FlatGaussians:
@@ -120,3 +138,31 @@ def test_the_papers_radius_over_white_from_inside(tmp_path: Path) -> None:
     assert page.result["drawn"] < len(scene)
     quality = psnr(page.image, ours)
     assert quality >= 42.0, page.messages
+
+
+@pytest.mark.parametrize(
+    ("metallic", "roughness", "degrees"), [(1.0, 0.1, 0), (1.0, 0.4, 90), (0.0, 0.8, -30)]
+)
+def test_draws_materials_in_the_light_of_a_map(
+    tmp_path: Path, metallic: float, roughness: float, degrees: int, least: float
+) -> None:
+    """A ball, which hides nothing of the light from itself, as ``relight`` shows it.
+
+    Its map has 256 rows and the viewer's 128, which tells where edges of light are mirrored.
+    """
+    scene = shiny_ball(2000, 1.0, albedo=(0.9, 0.5, 0.2), metallic=metallic, roughness=roughness)
+    random = np.random.default_rng(3)
+    light = np.kron(random.uniform(0, 1, (4, 8, 3)) ** 3, np.ones((8, 8, 1))).astype(np.float32)
+    write_environment(tmp_path / "light.hdr", light)
+    camera = camera_at(0.3, -0.4, -4.0)
+    up = (0.0, -1.0, 0.0)
+    asked = {"up": up, "degrees": degrees}
+    page = draw(scene, camera, tmp_path, q=CHI2_2_99, background=(0, 0, 0), light=asked)
+    relighter = SplitSumRelighter(scene, TraceSettings(), None, extent_world=40.0, side=1, threads=1)
+    relighter.put(
+        EnvironmentMap(read_environment(tmp_path / "light.hdr"), environment_frame(np.array(up), degrees))
+    )
+    ours = to_bytes(np.clip(relighter.render(camera.rays()).over(background_colour("black")), 0, 1))
+    assert (ours.max(axis=2) > 20).mean() > 0.1
+    quality = psnr(page.image, ours)
+    assert quality >= least, page.messages

@@ -24,6 +24,7 @@ from workers.cli.commands.export import export
 from workers.cli.commands.fsck import fsck
 from workers.cli.commands.import_ import import_
 from workers.cli.commands.info import info
+from workers.cli.commands.material import material
 from workers.cli.commands.merge import merge
 from workers.cli.commands.migrate import migrate
 from workers.cli.commands.open import open_page
@@ -92,7 +93,7 @@ def cli() -> None:
 
 for _command in (
     reconstruct, evaluate, info, export, import_, render, relight, stage, surface,
-    edit, deform, transform, crop, merge, clean, demo, backup, restore,
+    material, edit, deform, transform, crop, merge, clean, demo, backup, restore,
     serve, worker, open_page, token, fsck, quota, migrate, *CLIENT_COMMANDS,
 ):  # fmt: skip
     cli.add_command(_command)

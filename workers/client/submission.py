@@ -1,12 +1,12 @@
 """From a folder to results: upload, queue, wait, download."""
 
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from engine.errors import OctasplatError
+from engine.errors import ConfigError, OctasplatError
 from engine.events import Listener, Warned, ignore
 from engine.light.companions import companions
 from engine.light.stage_file import named_files, read_stage, with_files
@@ -52,15 +52,8 @@ def submit(api: Api, what: Submission, listener: Listener = ignore) -> dict[str,
     Raises:
         OctasplatError: the scene or the options are refused, or the service does not answer.
     """
-    dataset_id = _as_id(str(what.scene))
-    if dataset_id is None:
-        with counted_stage("upload", listener) as progress:
-            dataset = upload_scene(api, what.scene, progress=lambda d, t: progress(d >> 10, t >> 10))
-        dataset_id = dataset["id"]
-        for warning in dataset["facts"].get("warnings", ()):
-            listener(Warned(warning))
     body = {
-        "dataset_id": dataset_id,
+        "dataset_id": _dataset_of(api, what.scene, listener),
         "options": dict(what.options),
         "label": what.label,
         "queue": what.queue,
@@ -79,6 +72,7 @@ class Derivation:
         kind: of the job, such as ``render``; GET /v1/options has them.
         options: of the kind.
         files: files that the options name, by these names.
+        scene: photographs to work on instead of the finished job's: a folder, ZIP file or id of a dataset.
         label: what to call the job.
         queue: which workers.
         priority: higher goes first.
@@ -88,6 +82,7 @@ class Derivation:
     kind: str
     options: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, Path] = field(default_factory=dict)
+    scene: Path | None = None
     label: str | None = None
     queue: str = "cpu"
     priority: int = 0
@@ -117,6 +112,26 @@ def with_stage(what: Derivation, stage: Path) -> Derivation:
     return replace(what, options=options, files={**what.files, **files})
 
 
+def with_environments(what: Derivation, maps: Sequence[Path]) -> Derivation:
+    """The same with maps of light, which are sent under their own names, or plain ones where those are odd.
+
+    Raises:
+        ConfigError: one is not there, or two have one name.
+    """
+    files: dict[str, Path] = {}
+    for path in maps:
+        if not path.is_file():
+            raise ConfigError(f"{path}: there is no such file; name an HDR or EXR image.")
+        try:
+            name = check_name(path.name)
+        except NameRefused:
+            name = check_name(f"map_{len(files)}{path.suffix.lower()}")
+        if name in files:
+            raise ConfigError(f"{path}: two environments are called {name}; rename one.")
+        files[name] = path
+    return replace(what, options={**what.options, "environments": list(files)}, files={**what.files, **files})
+
+
 def derive(api: Api, what: Derivation, listener: Listener = ignore) -> dict[str, Any]:
     """Send the files that the options name, and queue a job on the results of another; returns the job.
 
@@ -132,6 +147,8 @@ def derive(api: Api, what: Derivation, listener: Listener = ignore) -> dict[str,
         "queue": what.queue,
         "priority": what.priority,
     }
+    if what.scene is not None:
+        body["dataset_id"] = _dataset_of(api, what.scene, listener)
     if what.files:
         with counted_stage("upload", listener) as progress:
             sent = upload_files(
@@ -187,6 +204,18 @@ def fetch(
                 api, job_id, folder, names=names, progress=lambda d, t: progress(d >> 10, t >> 10)
             )
         )
+
+
+def _dataset_of(api: Api, scene: Path, listener: Listener) -> str:
+    """The dataset of these photographs, sent if that is not done yet."""
+    dataset_id = _as_id(str(scene))
+    if dataset_id is not None:
+        return dataset_id
+    with counted_stage("upload", listener) as progress:
+        dataset = upload_scene(api, scene, progress=lambda d, t: progress(d >> 10, t >> 10))
+    for warning in dataset["facts"].get("warnings", ()):
+        listener(Warned(warning))
+    return str(dataset["id"])
 
 
 def _as_id(text: str) -> str | None:

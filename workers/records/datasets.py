@@ -1,10 +1,10 @@
 """Datasets and their files in the tables."""
 
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from psycopg.rows import class_row
+from psycopg.rows import class_row, dict_row
 from psycopg.types.json import Jsonb
 
 from workers.records.database import Connection, naming
@@ -57,6 +57,23 @@ async def list_datasets(
             {"owner": owner, "before": before, "limit": limit},
         )
         return await cursor.fetchall()
+
+
+async def files_named(
+    connection: Connection, owner: str, endings: Sequence[str], *, limit: int
+) -> list[tuple[Dataset, str]]:
+    """Files that options may name, whose names end so, with their committed datasets; the newest first."""
+    async with connection.cursor(row_factory=dict_row) as cursor:
+        await cursor.execute(
+            """
+            SELECT f.path AS file_path, d.* FROM datasets d JOIN dataset_files f ON f.dataset_id = d.id
+            WHERE d.owner = %s AND d.holds = 'files' AND d.state = 'committed'
+              AND lower(f.path) LIKE ANY(%s)
+            ORDER BY d.id DESC, f.path LIMIT %s
+            """,
+            [owner, [f"%{ending}" for ending in endings], limit],
+        )
+        return [(Dataset(**row), path) for row in await cursor.fetchall() if (path := row.pop("file_path"))]
 
 
 async def put_file(

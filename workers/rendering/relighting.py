@@ -61,7 +61,7 @@ def relight_files(
             another render where this one is to go on.
         OctasplatError: the source cannot be read or the output not written.
     """
-    environments = _environments(options["environment"])
+    environments = _environments(options["environment"], options["clamp"])
     source = read_source(options, say)
     ply = options["source"] / SCENE if is_run(options["source"]) else options["source"]
     require_materials(source.gaussians, ply)
@@ -89,8 +89,8 @@ def relight_files(
     return series.render(paint, kept, listener)
 
 
-def _environments(paths: Sequence[Path]) -> dict[str, Float32[np.ndarray, "h w 3"]]:
-    """The maps by the names of their files.
+def _environments(paths: Sequence[Path], most: float | None) -> dict[str, Float32[np.ndarray, "h w 3"]]:
+    """The maps by the names of their files, nowhere brighter than ``most``.
 
     Raises:
         ConfigError: one cannot be used, or two have one name.
@@ -99,7 +99,7 @@ def _environments(paths: Sequence[Path]) -> dict[str, Float32[np.ndarray, "h w 3
     for path in paths:
         if path.stem in found:
             raise ConfigError(f"{path}: two environments are called {path.stem}; rename one.")
-        found[path.stem] = read_environment(path)
+        found[path.stem] = np.minimum(read_environment(path), np.float32(np.inf if most is None else most))
     return found
 
 

@@ -25,6 +25,7 @@ _DONE = {
     "export": ("Exported", "file"),
     "generate": ("Generated", "photograph"),
     "render": ("Rendered", "image"),
+    "edit": ("Edited", ""),
     "features": ("Found features", "photograph"),
     "matches": ("Matched", "pair"),
     "poses": ("Found the poses of", "photograph"),

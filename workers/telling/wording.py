@@ -90,5 +90,5 @@ def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
         mean_metrics(metrics),
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
         f"trained in {duration(metrics['seconds'])}",
-        *(f"{label + ':':8}{output / name}" for label, name in files),
+        *(f"{label + ':':8}{output / name}" for label, name in files if (output / name).exists()),
     ]

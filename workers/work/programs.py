@@ -23,7 +23,9 @@ from engine.stages import counted_stage, stopping
 from engine.writing import write_json
 from workers.store.names import check_name
 from workers.work.kinds.options import (
+    EvaluateOptions,
     ExportJobOptions,
+    MaterialJobOptions,
     PictureOptions,
     ReconstructOptions,
     RelightJobOptions,
@@ -96,17 +98,19 @@ def _publish_run(task: Task) -> None:
 
 
 def evaluate(task: Task) -> None:
-    """The held-out views of a finished reconstruction, measured again."""
-    evaluate_run(
+    """The held-out views of a finished reconstruction measured again, or all views of these photographs."""
+    all_views = EvaluateOptions.model_validate(task.options).all_views
+    metrics = evaluate_run(
         task.run,
-        scene=task.scene,
+        scene=None if all_views else task.scene,
+        on=task.scene if all_views else None,
         threads=task.threads,
         listener=stopping(task.listener, task.should_stop),
     )
-    for name in ("metrics.json", "report.html"):
-        _publish(task, task.run / name, name)
-    for path in sorted((task.run / "renders").rglob("*.png")):
-        _publish(task, path, path.relative_to(task.run).as_posix())
+    folder = metrics.parent
+    pictures = [path for part in ("renders", "layers") for path in sorted((folder / part).rglob("*.png"))]
+    for path in (metrics, folder / REPORT, *pictures):
+        _publish(task, path, path.relative_to(folder).as_posix())
 
 
 def export(task: Task) -> None:
@@ -173,6 +177,7 @@ def relight(task: Task) -> None:
         "samples": options.samples,
         "depth": options.depth,
         "rotate": options.rotation_degrees,
+        "clamp": options.clamp,
         "spin": options.spin,
     }
 
@@ -180,6 +185,23 @@ def relight(task: Task) -> None:
         return relight_files(options.mode, arguments, tell, say, keeping)
 
     _make_pictures(task, options, work)
+
+
+def material(task: Task) -> None:
+    """The scene of a reconstruction with other materials: results like those of a run."""
+    from engine.edit.material_run import change_materials, edit_note, write_changed_run
+    from engine.edit.selection import chosen_by
+
+    options = MaterialJobOptions.model_validate(task.options)
+    tell = stopping(task.listener, task.should_stop)
+    with counted_stage("edit", tell, 0):
+        gaussians, _ = read_gaussian_ply(task.run / SCENE)
+        chosen = chosen_by(gaussians, options)
+        changed = change_materials(task.run, gaussians, chosen, options)
+        folder = task.folder / "changed"
+        write_changed_run(task.run, changed, folder, edit_note(options, options, chosen))
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        _publish(task, path, path.relative_to(folder).as_posix())
 
 
 def _picture_arguments(task: Task, options: PictureOptions) -> dict[str, Any]:

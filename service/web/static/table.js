@@ -28,6 +28,19 @@ for (const table of document.querySelectorAll("table.sortable")) {
 
 const shown = document.getElementById("view-shown");
 const rows = [...document.querySelectorAll("tr[data-render]")];
+let mode = "render";
+
+/** The picture that is meant: the render of the view that is chosen, or what lies behind it. */
+function show() {
+    const row = rows.find((other) => other.classList.contains("current") && other.dataset.render) ?? rows[0];
+    const button = shown.querySelector(`[data-mode=${mode}][data-layer]`);
+    const label = button?.dataset.layer ?? "Render", name = row.cells[0].dataset.sort;
+    const below = shown.querySelector(".below"), tag = shown.querySelector(".tag.right");
+    below.src = button ? row.dataset.render.replace("/renders/", `/layers/${mode}/`) : row.dataset.render;
+    below.alt = `${label} of ${name}`;
+    if (tag) tag.textContent = label;
+    shown.querySelector(".compare").classList.toggle("difference", mode === "difference");
+}
 for (const row of shown ? rows : []) {
     row.addEventListener("click", () => {
         rows.forEach((other) => other.classList.toggle("current", other === row));
@@ -35,8 +48,7 @@ for (const row of shown ? rows : []) {
         const below = shown.querySelector(".below"), above = shown.querySelector(".above");
         below.width = row.dataset.width;
         below.height = row.dataset.height;
-        below.src = row.dataset.render;
-        below.alt = `Render of ${name}`;
+        show();
         if (above) {
             above.src = row.dataset.photograph ?? "";
             above.alt = `Photograph ${name}`;
@@ -47,6 +59,7 @@ for (const row of shown ? rows : []) {
 for (const button of shown?.querySelectorAll("[data-mode]") ?? []) {
     button.addEventListener("click", () => {
         shown.querySelectorAll("[data-mode]").forEach((other) => other.setAttribute("aria-pressed", String(other === button)));
-        shown.querySelector(".compare").classList.toggle("difference", button.dataset.mode === "difference");
+        mode = button.dataset.mode;
+        show();
     });
 }

@@ -101,6 +101,20 @@ def submit(
     metavar="STAGE.toml",
     help="Render: the stage; it and the files that it names are sent.",
 )
+@click.option(
+    "--environment",
+    "environments",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="MAP",
+    help="Relight: an HDR or EXR image, which is sent; several have their turns.",
+)
+@click.option(
+    "--on",
+    type=click.Path(path_type=Path),
+    metavar="SCENE",
+    help="Evaluate: measure all photographs of this folder, ZIP file or dataset in the same world instead.",
+)
 @set_option
 @click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
@@ -110,24 +124,27 @@ def submit(
 @server_option
 @quiet_option
 def derive(
-    kind: str, job_id: str, stage: Path | None, wait: bool, output: Path | None, server: str | None,
-    quiet: bool, **given: Any,
+    kind: str, job_id: str, stage: Path | None, environments: tuple[Path, ...], on: Path | None, wait: bool,
+    output: Path | None, server: str | None, quiet: bool, **given: Any,
 ) -> None:  # fmt: skip
-    """Queue a job of the KIND evaluate, export or render on the results of JOB; 'last' is the newest one.
+    """Queue a job of the KIND evaluate, export, render, relight or material on the results of JOB.
 
-    For example: octasplat derive render last --stage stage.toml --set frames=60 --wait
+    'last' is the newest job. For example: octasplat derive render last --stage stage.toml --set frames=60,
+    or: octasplat derive material last --set set.roughness=0.3 --set where="metallic > 0.5" --wait
     """
     from workers.cli.submitting import derive, submit_and_wait
-    from workers.client.submission import Derivation, with_stage
+    from workers.client.submission import Derivation, with_environments, with_stage
 
     with connected(server) as api:
         source = _job(api, job_id)["id"]
         what = Derivation(
-            source, kind, _assigned({}, given["assignments"]),
+            source, kind, _assigned({}, given["assignments"]), scene=on,
             label=given["label"], queue=given["queue"], priority=given["priority"],
         )  # fmt: skip
         if stage is not None:
             what = with_stage(what, stage)
+        if environments:
+            what = with_environments(what, environments)
         if wait:
             submit_and_wait(api, what, output or Path(f"{kind}-result"), quiet=quiet)
             return

@@ -34,10 +34,18 @@ from workers.cli.options import quiet_option, threads_option
     help="Fast, as in training, with traced visibility; or right, by paths of light.",
 )
 @click.option(
-    "--samples", type=click.IntRange(1, 65536), default=64, show_default=True, help="Paths a pixel."
+    "--samples",
+    type=click.IntRange(1, 65536),
+    help="Rays or paths a pixel.  [default: 4 rays of the split sum, 64 paths]",
 )
 @click.option("--depth", type=click.IntRange(1, 64), default=6, show_default=True, help="Surfaces on a path.")
 @click.option("--rotate", type=float, default=0.0, metavar="DEG", help="Turn the light about the vertical.")
+@click.option(
+    "--clamp",
+    type=click.FloatRange(0, min_open=True),
+    metavar="MOST",
+    help="Cut the light of the maps off at this radiance: fewer bright specks by paths, and weaker lamps.",
+)
 @click.option("--spin", is_flag=True, help="Turn the light once round from the first image to the last.")
 @click.option(
     "--views",

@@ -21,6 +21,7 @@ from workers.work.kinds.estimates import (
 from workers.work.kinds.options import (
     EvaluateOptions,
     ExportJobOptions,
+    MaterialJobOptions,
     ReconstructOptions,
     RelightJobOptions,
     RenderJobOptions,
@@ -30,6 +31,8 @@ from workers.work.kinds.options import (
 from workers.work.kinds.table import JobKind, register, validated
 
 _RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl")
+_LIGHT = "environment.hdr"
+"""What results with materials have, and no others."""
 
 
 def register_all() -> None:
@@ -58,14 +61,15 @@ def register_all() -> None:
     register(
         JobKind(
             name="evaluate",
-            title="Measure the held-out views of a reconstruction again",
+            title="Measure views of a reconstruction: those held out again, or other photographs",
             needs="result",
             options=EvaluateOptions,
             program="workers.work.programs:evaluate",
             stages=lambda _options: ("evaluate",),
             resolve=validated(EvaluateOptions),
-            source_files=_RUN_FILES,
+            source_files=(*_RUN_FILES, _LIGHT, "edits.json"),
             needs_photographs=lambda _options: True,
+            on_others=lambda options: options.model_copy(update={"all_views": True}),
         )
     )
     register(
@@ -119,7 +123,19 @@ def register_all() -> None:
                 (f"environments.{place}", name)
                 for place, name in enumerate(cast(RelightJobOptions, options).environments)
             ),
-            source_files=(*_RUN_FILES[:4], "environment.hdr"),
+            source_files=(_LIGHT, *_RUN_FILES[:4]),
+        )
+    )
+    register(
+        JobKind(
+            name="material",
+            title="The scene of a reconstruction with other materials",
+            needs="result",
+            options=MaterialJobOptions,
+            program="workers.work.programs:material",
+            stages=lambda _options: ("edit",),
+            resolve=validated(MaterialJobOptions),
+            source_files=(_LIGHT, *_RUN_FILES, "edits.json"),
         )
     )
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from engine.config import ReconstructionConfig
+from engine.edit.choices import MaterialChange, Selection
 from engine.errors import SceneFileError
 from engine.files import exporter_for
 from engine.light.stage import Stage
@@ -17,7 +18,7 @@ from engine.train.config import preset, with_materials
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _TAKEN = frozenset(
     {"scene.ply", "config.json", "held_out.json", "views.json", "events.jsonl", "metrics.json", "report.html"}
-    | {"training.json", "environment.hdr", "renders", "checkpoints", "cache", "poses"}
+    | {"training.json", "environment.hdr", "edits.json", "renders", "layers", "checkpoints", "cache", "poses"}
 )  # fmt: skip
 
 
@@ -61,9 +62,16 @@ class ReconstructOptions(ReconstructionConfig):
 
 
 class EvaluateOptions(BaseModel):
-    """Options of ``evaluate``: the held-out views of a finished reconstruction are measured again."""
+    """Options of ``evaluate``: views of a finished reconstruction are measured.
+
+    Attributes:
+        all_views: all photographs, not only those that were held out; so it is with the photographs of
+            another dataset, in the same world, which the job names as 'dataset_id'.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    all_views: bool = False
 
 
 class ExportJobOptions(BaseModel):
@@ -153,6 +161,7 @@ class RelightJobOptions(PictureOptions):
         samples: rays or paths a pixel; None takes 4 rays or 64 paths.
         depth: most surfaces on a path.
         rotation_degrees: turns the light about the vertical.
+        clamp: radiance at which the light of the environments is cut off; None takes all of it.
         spin: turn the light once round from the first image to the last.
         background: behind the scene; None takes that of the reconstruction's evaluation.
     """
@@ -164,6 +173,7 @@ class RelightJobOptions(PictureOptions):
     samples: int | None = Field(None, ge=1, le=4096)
     depth: int = Field(6, ge=1, le=64)
     rotation_degrees: float = Field(0.0, ge=-360, le=360)
+    clamp: float | None = Field(None, gt=0)
     spin: bool = False
     background: Literal["black", "white", "environment"] | None = None
 
@@ -171,6 +181,10 @@ class RelightJobOptions(PictureOptions):
     def rays(self) -> int:
         """Rays or paths a pixel, under all environments together."""
         return len(self.environments) * (self.samples or (64 if self.by == "path" else 4))
+
+
+class MaterialJobOptions(Selection, MaterialChange):
+    """Options of ``material``: what becomes of the materials of which Gaussians."""
 
 
 def _learns_materials(train: object) -> bool:

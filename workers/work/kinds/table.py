@@ -28,6 +28,8 @@ class JobKind:
         source_files: results of the source job that it reads, if it needs one; those that are missing are
             left out.
         needs_photographs: whether it reads the photographs of the source job as well.
+        on_others: the options as they are kept where the job names photographs to work on in the place of the
+            source job's; None for a kind that works on those only.
         needs_poses: whether its dataset must hold a COLMAP model, given the options.
         settle: the options as they are kept, given whether the dataset holds a COLMAP model.
         revise: complete options from those of a job and what a user changes of them.
@@ -51,6 +53,7 @@ class JobKind:
     resolve: Callable[[Mapping[str, Any]], BaseModel]
     source_files: tuple[str, ...] = ()
     needs_photographs: Callable[[BaseModel], bool] = lambda _options: False
+    on_others: Callable[[BaseModel], BaseModel] | None = None
     needs_poses: Callable[[BaseModel], bool] = lambda _options: False
     settle: Callable[[BaseModel, bool], BaseModel] = lambda options, _has_poses: options
     revise: Callable[[Mapping[str, Any], Mapping[str, Any]], BaseModel] | None = None

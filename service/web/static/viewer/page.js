@@ -111,11 +111,24 @@ class Viewer {
         tools.querySelector("[data-do=full]").hidden = !document.fullscreenEnabled;
         tools.querySelector(".count").textContent = `${thousands(scene.count)} Gaussians`;
         this.splats.setBackground(...BACKGROUNDS[this.background]);
+        this.takeLight();
         new ResizeObserver(() => this.resize()).observe(this.canvas.parentElement);
         this.resize();
         this.do("reset");
         this.place.textContent = "";
         requestAnimationFrame((now) => this.tick(now));
+    }
+
+    /** Where materials can be lit here, whoever has a map says so: {map, degrees}, or a map of null for none. */
+    takeLight() {
+        if (!this.splats.lighting) return;
+        this.box.addEventListener("light", ({ detail: { map, degrees } }) => {
+            if (map !== undefined) this.splats.setLight(map);
+            this.splats.lighting.turn(JSON.parse(this.box.dataset.up), degrees);
+            this.wake();
+        });
+        this.box.dataset.materials = "yes";
+        this.box.dispatchEvent(new Event("materials"));
     }
 
     do(action) {

@@ -7,6 +7,7 @@ const SIZES = {
     int: 4, uint: 4, int32: 4, uint32: 4, float: 4, float32: 4, double: 8, float64: 8,
 };
 const SH_DC = ["f_dc_0", "f_dc_1", "f_dc_2"];
+const MATERIAL = ["albedo_0", "albedo_1", "albedo_2", "metallic", "roughness"];
 const MAX_HEADER_BYTES = 1 << 16;
 
 /** The header at the start of `bytes`; null while it is not complete. */
@@ -42,10 +43,11 @@ export function readHeader(bytes) {
 /**
  * The Gaussians of a whole file.
  *
- * @returns {{count, shCount, geometry: Float32Array, harmonics: Uint16Array, bounds: Float32Array}}
+ * @returns {{count, shCount, geometry: Float32Array, harmonics: Uint16Array, bounds: Float32Array, materials: ?Uint16Array}}
  *   geometry has 12 numbers a Gaussian: mean x y z and opacity, first leg x y z and 0, second leg x y z and 0,
  *   world units. A leg is an in-plane axis times its standard deviation. harmonics has 4 half-precision
- *   numbers a coefficient: red, green, blue and 0. bounds has the length of the longer leg.
+ *   numbers a coefficient: red, green, blue and 0. bounds has the length of the longer leg. materials, if there
+ *   are any, has 8 half-precision numbers: linear base colour, metallic, roughness, share of ambient light, 0, 0.
  */
 export function readGaussians(bytes) {
     const header = readHeader(bytes);
@@ -72,6 +74,10 @@ export function readGaussians(bytes) {
     for (let channel = 0; channel < 3; channel++) {
         restReaders.push(readers(Array.from({ length: shCount - 1 }, (_, k) => `f_rest_${channel * restCount + k}`)));
     }
+
+    const ofMaterial = MATERIAL.every((name) => name in offsets) ? readers(MATERIAL) : null;
+    const ambient = "ambient" in offsets ? reader("ambient") : () => 1;
+    const materials = ofMaterial && new Uint16Array(count * 8);
 
     const geometry = new Float32Array(count * 12);
     const harmonics = new Uint16Array(count * shCount * 4);
@@ -106,11 +112,13 @@ export function readGaussians(bytes) {
             geometry.fill(0, g, g + 12);
             bounds[i] = 0;
         }
+        ofMaterial?.forEach((read, k) => { materials[i * 8 + k] = toHalf(read(row)); });
+        if (materials) materials[i * 8 + 5] = toHalf(ambient(row));
         for (let channel = 0; channel < 3; channel++) {
             const h = i * shCount * 4 + channel;
             harmonics[h] = toHalf(dc[channel](row));
             for (let k = 1; k < shCount; k++) harmonics[h + 4 * k] = toHalf(restReaders[channel][k - 1](row));
         }
     }
-    return { count, shCount, geometry, harmonics, bounds };
+    return { count, shCount, geometry, harmonics, bounds, materials };
 }

@@ -55,7 +55,7 @@ async function load(url) {
     const scene = readGaussians(bytes);
     // The sorter keeps its own copy: what is sent to the page is gone from here.
     sort = makeSorter({ count: scene.count, geometry: scene.geometry.slice(), bounds: scene.bounds.slice() });
-    postMessage({ scene }, [scene.geometry.buffer, scene.harmonics.buffer, scene.bounds.buffer]);
+    postMessage({ scene }, [scene.geometry.buffer, scene.harmonics.buffer, scene.bounds.buffer, ...(scene.materials ? [scene.materials.buffer] : [])]);
 }
 
 onmessage = ({ data }) => {

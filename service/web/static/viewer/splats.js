@@ -6,6 +6,7 @@ import {
     NearestFilter, NoBlending, OneFactor, OneMinusSrcAlphaFactor, OrthographicCamera, RawShaderMaterial, RGBAFormat, Scene,
     UnsignedByteType, Vector2, Vector3, WebGLRenderer, WebGLRenderTarget,
 } from "../vendor/three.js";
+import { Lighting } from "./lighting.js";
 import { FRAGMENT, PRESENT_FRAGMENT, PRESENT_VERTEX, VERTEX } from "./shaders.js";
 
 export const CHI2_2_99 = 9.210340371976184;
@@ -27,8 +28,11 @@ export class SplatRenderer {
         });
         this.scene = new Scene();
         this.mesh = null;
+        this.lighting = null;
+        this.isLit = false;
         this.background = new Color(0, 0, 0);
         this.present = presentation(this.target, this.background);
+        this.precise = Boolean(precise);
         this.flat = new OrthographicCamera();
         this.scale = 1;
         this.buffer = new Vector2();
@@ -53,6 +57,18 @@ export class SplatRenderer {
         }));
         this.mesh.frustumCulled = false;
         this.scene.add(this.mesh);
+        if (!scene.materials || !this.precise) return;
+        const materials = packed(scene.materials, scene.count, 2, limit, HalfFloatType, Uint16Array);
+        const { geometryTexture, geometryColumns, q: radius } = this.mesh.material.uniforms;
+        const uniforms = { geometryTexture, geometryColumns, q: radius, materialTexture: { value: materials.texture }, materialColumns: { value: materials.columns } };
+        this.lighting = new Lighting(this.mesh.geometry, uniforms, fullScreen);
+        this.lighting.uniforms.background.value = this.background;
+    }
+
+    /** Shows materials in the light of a map as of environment.js; null goes back to the harmonics. */
+    setLight(map) {
+        if (map) this.lighting.setMap(map);
+        this.isLit = Boolean(map);
     }
 
     /** Draws the first `count` Gaussians of `order`, in that order. */
@@ -78,14 +94,17 @@ export class SplatRenderer {
     render(camera) {
         this.renderer.getDrawingBufferSize(this.buffer);
         const width = Math.max(1, Math.round(this.buffer.x * this.scale)), height = Math.max(1, Math.round(this.buffer.y * this.scale));
-        if (this.target.width !== width || this.target.height !== height) this.target.setSize(width, height);
-        this.renderer.setRenderTarget(this.target);
+        const target = this.isLit ? this.lighting.target : this.target;
+        if (target.width !== width || target.height !== height) target.setSize(width, height);
+        this.renderer.setRenderTarget(target);
         this.renderer.setClearColor(0x000000, 0);
         this.renderer.clear(true, false, false);
-        if (this.mesh) this.renderer.render(this.scene, camera);
+        if (this.mesh) this.renderer.render(this.isLit ? this.lighting.octagons : this.scene, camera);
         this.renderer.setRenderTarget(null);
-        this.present.material.uniforms.sizePx.value.copy(this.buffer);
-        this.renderer.render(this.present.scene, this.flat);
+        const { uniforms } = this.isLit ? this.lighting : this.present.material;
+        uniforms.sizePx.value.copy(this.buffer);
+        if (this.isLit) [uniforms.cameraWorld.value, uniforms.projectionInverse.value] = [camera.matrixWorld, camera.projectionMatrixInverse];
+        this.renderer.render(this.isLit ? this.lighting.scene : this.present.scene, this.flat);
     }
 }
 
@@ -148,18 +167,23 @@ function packed(values, count, texels, limit, type, ArrayType) {
     return { texture, columns };
 }
 
-function presentation(target, background) {
+/** A scene of one triangle that fills the screen. */
+function fullScreen(material) {
     const scene = new Scene();
     const geometry = new InstancedBufferGeometry();
     geometry.setAttribute("position", new Float32BufferAttribute([-1, -1, 0, 3, -1, 0, -1, 3, 0], 3));
     geometry.instanceCount = 1;
+    const mesh = new Mesh(geometry, material);
+    mesh.frustumCulled = false;
+    scene.add(mesh);
+    return scene;
+}
+
+function presentation(target, background) {
     const material = new RawShaderMaterial({
         glslVersion: GLSL3, vertexShader: PRESENT_VERTEX, fragmentShader: PRESENT_FRAGMENT,
         uniforms: { image: { value: target.texture }, sizePx: { value: new Vector2() }, background: { value: background } },
         depthTest: false, depthWrite: false, blending: NoBlending,
     });
-    const mesh = new Mesh(geometry, material);
-    mesh.frustumCulled = false;
-    scene.add(mesh);
-    return { scene, material };
+    return { scene: fullScreen(material), material };
 }

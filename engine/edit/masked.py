@@ -1,0 +1,100 @@
+"""Gaussians chosen in pictures: those that show where masks are white."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from engine.config import read_config
+from engine.errors import ConfigError, DatasetError
+from engine.gaussians.model import FlatGaussians
+from engine.rays import ImageRays, RayBatch
+from engine.render.images import read_image
+from engine.render.jobs import view_shots
+from engine.render.renderer import tile_order
+from engine.run_folder import CONFIG, is_run, run_viewpoints
+from engine.scene.model import Viewpoints
+from engine.trace.make import make_tracer
+from engine.trace.protocol import TraceGradients, Tracer
+
+WHITE = 0.5
+
+
+def under_masks(
+    source: Path, gaussians: FlatGaussians, masks: Sequence[Path], *, threads: int = 0
+) -> Bool[np.ndarray, " n"]:
+    """Which Gaussians of a run show where masks of its photographs are white.
+
+    Args:
+        source: folder of the run.
+        gaussians: its scene.
+        masks: images of any size with the names of photographs, as ``0001.png`` or ``0001.jpg.png``.
+        threads: to use; 0 takes all.
+
+    Raises:
+        ConfigError: the source is no run, or an image is no mask of its photographs.
+    """
+    if not is_run(source):
+        raise ConfigError(f"{source}: masks need the folder of a run, which knows its cameras.")
+    config, viewpoints = read_config(source / CONFIG), run_viewpoints(source)
+    near_world = config.train.near * viewpoints.extent
+    tracer = make_tracer(config.train.trace, threads=threads)
+    tracer.build(gaussians)
+    views = ((_rays(viewpoints, path, near_world), path) for path in masks)
+    return shown_in(tracer, len(gaussians), ((rays, _mask(path, rays)) for rays, path in views))
+
+
+def shown_in(
+    tracer: Tracer, count: int, views: Iterable[tuple[ImageRays, Bool[np.ndarray, "h w"]]]
+) -> Bool[np.ndarray, " n"]:
+    """Gaussians of which more shows inside masks than outside, in all views together.
+
+    Args:
+        tracer: with the scene built.
+        count: number of its Gaussians.
+        views: rays through pixels, and which pixels are meant.
+    """
+    inside, outside = np.zeros(count), np.zeros(count)
+    for image, mask in views:
+        order = tile_order(image.height_px, image.width_px)
+        meant = mask.ravel()[order]
+        inside += _weights(tracer, image.rays[order[meant]], count)
+        outside += _weights(tracer, image.rays[order[~meant]], count)
+    return np.asarray(inside > outside)
+
+
+def _weights(tracer: Tracer, rays: RayBatch, count: int) -> Float64[np.ndarray, " n"]:
+    """How much of each Gaussian rays see."""
+    sums = np.zeros(count)
+    if len(rays):
+        seen = tracer.trace(rays, record=True)
+        assert seen.hits is not None
+        found = tracer.backward(seen.hits, TraceGradients(np.zeros_like(seen.rgb_srgb))).numpy()
+        sums[found.ids] = found.weight_sums
+    return sums
+
+
+def _rays(viewpoints: Viewpoints, path: Path, near_world: float) -> ImageRays:
+    for number, view in enumerate(viewpoints.views):
+        if path.name in (f"{Path(view.name).name}.png", Path(view.name).with_suffix(path.suffix).name):
+            return view_shots(viewpoints, np.array([number]), near_world)[0].rays()
+    raise ConfigError(f"{path}: the run has no photograph of this name.")
+
+
+def _mask(path: Path, image: ImageRays) -> Bool[np.ndarray, "h w"]:
+    """Which pixels of an image of rays lie where a mask is white."""
+    try:
+        mask = read_image(path)[..., 0]
+    except DatasetError as error:
+        raise ConfigError(f"{path}: the mask cannot be read: {error}") from None
+    rows, columns = (
+        _middles(size, there)
+        for size, there in zip(mask.shape, (image.height_px, image.width_px), strict=True)
+    )
+    return np.asarray(mask[np.ix_(rows, columns)] > WHITE)
+
+
+def _middles(size: int, there: int) -> Int64[np.ndarray, " p"]:
+    """Places in a row of ``size`` pixels of the middles of ``there`` pixels."""
+    return ((np.arange(there) + 0.5) * size / there).astype(np.int64)

@@ -1,0 +1,82 @@
+"""Materials of chosen Gaussians changed, and harmonics that show it."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from engine.colour import linear_to_srgb
+from engine.edit.choices import MaterialChange
+from engine.gaussians.channels import stacked
+from engine.gaussians.harmonics import sh_basis, spread_directions
+from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
+from engine.gaussians.model import FlatGaussians
+from engine.shading.environment_levels import LightLevels
+from engine.shading.split_sum import Surface, shade
+
+_AT_ONCE = 1 << 14
+_DIRECTIONS = 64
+"""From which a Gaussian is looked at to see how its look changes."""
+
+
+def with_materials(
+    gaussians: FlatGaussians, chosen: Bool[np.ndarray, " n"], change: MaterialChange
+) -> FlatGaussians:
+    """The scene, which has materials, with those of the chosen Gaussians changed and all else shared."""
+    values, factors = change.set.given(), change.scale.given()
+    changed = {name: gaussians.channels[name].copy() for name in (*values, *factors)}
+    for name, value in values.items():
+        changed[name][chosen] = value
+    for name, factor in factors.items():
+        changed[name][chosen] = np.clip(changed[name][chosen] * np.float32(factor), 0.0, 1.0)
+    return gaussians.with_channels(changed)
+
+
+def with_harmonics_following(
+    before: FlatGaussians,
+    after: FlatGaussians,
+    chosen: Bool[np.ndarray, " n"],
+    light: LightLevels,
+    frame: Float64[np.ndarray, "3 3"],
+) -> FlatGaussians:
+    """The changed scene with harmonics that show the change, for whoever draws harmonics.
+
+    To those of each chosen Gaussian is added by how much its split sum differs between the two materials, in
+    display values and from all directions, as nearly as its harmonics can say it. Its share of the light
+    from all around stands for what it sees of the environment; a scene without that channel sees all.
+
+    Args:
+        before: the scene as it was.
+        after: the same with other materials.
+        chosen: whose harmonics follow.
+        light: levels of the environment that the scene was learnt with.
+        frame: its right, up and forward in the world, as rows.
+    """
+    directions_world = spread_directions(_DIRECTIONS)
+    solve = np.linalg.pinv(sh_basis(directions_world, after.sh_degree))
+    sh, rows = after.sh.copy(), np.flatnonzero(chosen)
+    for start in range(0, len(rows), _AT_ONCE):
+        part = rows[start : start + _AT_ONCE]
+        looks = [_look(scene.select(part), directions_world, light, frame) for scene in (before, after)]
+        sh[part] += np.einsum("kd,ndc->nkc", solve, looks[1] - looks[0]).astype(np.float32)
+    return replace(after, sh=sh)
+
+
+def _look(
+    gaussians: FlatGaussians,
+    directions_world: Float64[np.ndarray, "d 3"],
+    light: LightLevels,
+    frame: Float64[np.ndarray, "3 3"],
+) -> Float64[np.ndarray, "n d 3"]:
+    """Display colours of Gaussians as they are seen along directions."""
+    count, views = len(gaussians), len(directions_world)
+    directions = np.tile(directions_world, (count, 1))
+    normals = np.repeat(gaussians.rotations[:, :, 0].astype(np.float64), views, axis=0)
+    normals *= np.where((normals * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None]
+    material = np.repeat(stacked(gaussians.channels, list(MATERIAL_WIDTHS)), views, axis=0)
+    surface = Surface.alone(material, normals, directions)
+    if AMBIENT in gaussians.channels:
+        seen = np.repeat(gaussians.channels[AMBIENT][:, 0].astype(np.float64), views)
+        surface = replace(surface, visibility=seen, ambient=seen)
+    shown = linear_to_srgb(np.minimum(shade(surface, light, frame), 1.0))
+    return shown.reshape(count, views, 3)

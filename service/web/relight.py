@@ -1,0 +1,63 @@
+"""What the form of another light needs of a finished job with materials: its views, and maps of light."""
+
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from service.actions.datasets import list_files_named
+from service.auth import Principal
+from service.settings import ServiceSettings
+from service.state import Service
+from service.web.light import MAX_VIEWS, PREVIEW_PRIORITY
+from service.web.results import LEARNT_LIGHT
+from workers.records.rows import Artifact
+from workers.work.kinds import kind_named
+
+MAPS = (".hdr", ".exr")
+MAX_MAPS = 60
+
+
+@dataclass(frozen=True)
+class SentMap:
+    """A map of light that was sent before: its dataset, what that is called, and its name in it."""
+
+    dataset_id: uuid.UUID
+    title: str
+    name: str
+
+
+@dataclass(frozen=True)
+class RelightForm:
+    """The form of another light.
+
+    Attributes:
+        views: names of the photographs that were held out, for previews.
+        maps: that are here already, the newest first.
+        learnt: name of the result that shows the light which the job learnt.
+        priority: of a preview.
+        max_file_bytes: length of one file that is sent.
+    """
+
+    views: list[str]
+    maps: list[SentMap]
+    learnt: str | None
+    priority: int
+    max_file_bytes: int
+
+
+async def relight_form(
+    service: Service, who: Principal, artifacts: Sequence[Artifact], held_out: Sequence[str]
+) -> RelightForm | None:
+    """The form for a job's result; None where it has no materials, or the asker may queue nothing."""
+    names = {row.name for row in artifacts}
+    if not who.may("write") or not names.issuperset(kind_named("relight").source_files):
+        return None
+    files = await list_files_named(service, who, MAPS, limit=MAX_MAPS)
+    settings: ServiceSettings = service.settings
+    return RelightForm(
+        sorted(held_out)[:MAX_VIEWS],
+        [SentMap(dataset.id, dataset.name, path) for dataset, path in files],
+        LEARNT_LIGHT if LEARNT_LIGHT in names else None,
+        min(PREVIEW_PRIORITY, settings.max_priority),
+        settings.max_upload_bytes,
+    )

@@ -1,0 +1,108 @@
+// The form of another light on the page of a finished job with materials.
+
+import { SentFiles, fieldValues, holds, plainName, showFields } from "../form_parts.js";
+import { answer, queueJob } from "../options.js";
+import { Trials, sentences } from "../trial.js";
+import { readHdr } from "../viewer/environment.js";
+
+const PREVIEW = { samples: { "split-sum": 1, path: 4 }, side: 320 };
+const WHAT = {
+    views: { mode: "views", format: "png" },
+    turntable: { mode: "turntable", frames: 96, width_px: 640, height_px: 480 },
+};
+
+const section = document.getElementById("relight");
+const form = section.querySelector("form");
+const { job: source, queue, priority } = section.dataset;
+const trials = new Trials(section);
+const sent = new SentFiles("light", Number(section.dataset.maxFile), (words) => trials.say(words));
+
+/** The map that is meant: its dataset, and its name there. */
+async function light() {
+    const { map } = fieldValues(form);
+    if (map) return { files_id: map.slice(0, map.indexOf("/")), name: map.slice(map.indexOf("/") + 1) };
+    const file = form.elements.file.files[0];
+    if (!file) throw new Error("Choose a file of light: HDR or EXR.");
+    const name = plainName(file, "light.hdr");
+    return { files_id: await sent.dataset([{ name, file }]), name };
+}
+
+/** The options that the form asks for. */
+function asked() {
+    const { rotation_degrees, spin, by, samples, background } = fieldValues(form);
+    return { rotation_degrees, spin, by, ...(by === "path" ? { samples: Number(samples) } : {}), ...(background ? { background } : {}) };
+}
+
+async function queueRelight(options, more = {}) {
+    const { files_id, name } = await light();
+    const body = { kind: "relight", source_id: source, queue, files_id, options: { ...asked(), ...options, environments: [name] }, ...more };
+    return queueJob(body, crypto.randomUUID?.() ?? String(Math.random()));
+}
+
+function preview() {
+    const view = form.elements.view.value, { by } = fieldValues(form), samples = PREVIEW.samples[by];
+    const options = { mode: "views", photographs: [view], format: "png", max_side: PREVIEW.side, samples };
+    const about = by === "path" ? `${samples} paths a pixel; more have less grain.` : `${samples} ray a pixel; a render has smoother edges.`;
+    trials.show(() => queueRelight(options, { priority: Number(priority), label: "preview of another light" }), view, "in another light", about);
+}
+
+async function render(options, button) {
+    trials.complain("");
+    button.disabled = true;
+    try {
+        location.href = `/jobs/${await queueRelight(options)}`;
+    } catch (error) {
+        trials.say("");
+        trials.complain(sentences(error));
+        button.disabled = false;
+    }
+}
+
+/** The file of the map that the 3D view is to show. */
+async function liveFile() {
+    const { live, map } = fieldValues(form);
+    if (live === "this" && !map) {
+        const file = form.elements.file.files[0];
+        if (!file) throw new Error("Choose a file of light: HDR.");
+        return file.arrayBuffer();
+    }
+    const path = map.slice(map.indexOf("/") + 1).split("/").map(encodeURIComponent).join("/");
+    const address = live === "learnt" ? section.dataset.learnt : `/v1/datasets/${map.slice(0, map.indexOf("/"))}/files/${path}`;
+    const response = await fetch(address);
+    if (!response.ok) await answer(response);
+    return response.arrayBuffer();
+}
+
+/** Shows the light in the 3D view: all of it, or only that it was turned. */
+async function showLive(anew) {
+    const { live, rotation_degrees } = fieldValues(form);
+    const degrees = live === "this" ? rotation_degrees : 0;
+    trials.complain("");
+    try {
+        const map = !live ? null : anew ? readHdr(await liveFile()) : undefined;
+        viewer.dispatchEvent(new CustomEvent("light", { detail: { map, degrees } }));
+        if (anew) section.dataset.live = live || "none";
+    } catch (error) {
+        form.elements.live.value = "";
+        viewer.dispatchEvent(new CustomEvent("light", { detail: { map: null, degrees: 0 } }));
+        trials.complain(sentences(error));
+    }
+}
+
+const viewer = document.getElementById("viewer");
+const offerLive = () => { form.elements.live.closest(".field").hidden = false; };
+if (viewer?.dataset.materials) offerLive();
+else viewer?.addEventListener("materials", offerLive);
+form.elements.live.addEventListener("change", () => showLive(true));
+for (const name of ["map", "file"]) form.elements[name].addEventListener("change", () => { if (form.elements.live.value === "this") showLive(true); });
+form.elements.rotation_degrees.addEventListener("input", () => { if (form.elements.live.value === "this") showLive(false); });
+
+const show = () => showFields(form, (needs) => holds(needs, fieldValues(form)));
+form.addEventListener("input", show);
+form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    if (form.elements.view) preview();
+});
+for (const [name, options] of Object.entries(WHAT)) section.querySelector(`[data-do=${name}]`)?.addEventListener("click", ({ target }) => render(options, target));
+show();
+section.dataset.ready = "yes";

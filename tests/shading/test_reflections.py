@@ -1,0 +1,122 @@
+"""Reflected rays in pairs, from surface to surface: closed forms."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engine.colour import srgb_to_linear
+from engine.gaussians.model import concatenate
+from engine.rays import ImageRays, RayBatch
+from engine.render.oversampling import pixel_means
+from engine.shading.deferred import Deferred
+from engine.shading.material_settings import MaterialSettings
+from engine.shading.protocol import Sight
+from engine.shading.reflections import Seen, facets_of, noise, pair_mean, pair_slope
+from engine.shading.split_sum import Surface
+from engine.trace.cpu import CpuTracer
+
+sys.path.append(str(Path(__file__).parent))
+
+from test_deferred import BARE, floor, wall
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def test_noise_is_even_and_follows_from_the_direction_and_the_salt_alone() -> None:
+    ways = unit(np.random.default_rng(0).normal(size=(20_000, 3)))
+    found = noise(ways, 3)
+    np.testing.assert_array_equal(found[:, ::-1], noise(ways[::-1].copy(), 3))
+    assert np.abs(found - noise(ways, 4)).max() > 0.5
+    counts, _, _ = np.histogram2d(*found, bins=10, range=[[0, 1], [0, 1]])
+    assert counts.min() > 130 and counts.max() < 270  # 200 each
+
+
+def test_facets_lie_on_both_sides_as_far_off_as_the_roughness_says() -> None:
+    count = 4000
+    way = np.tile(unit(np.array([0.3, 0.1, -1.0])), (count, 1))
+    way = unit(way + np.random.default_rng(1).normal(scale=1e-3, size=way.shape))
+    normal = np.tile([0.0, 0.0, 1.0], (count, 1))
+    for roughness, least in ((0.6, 0.001), (0.02, 0.03)):
+        surface = Surface.alone(np.full((count, 5), roughness), normal, way)
+        facets = facets_of(surface, least_slope=least, salt=0)
+        one, other = facets.normals(normal, 1.0), facets.normals(normal, -1.0)
+        np.testing.assert_allclose(one[:, :2], -other[:, :2], atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(one, axis=1), 1)
+        # The median of GGX's slopes among the flattest nine tenths: u = 0.45.
+        expected = max(roughness**2 * np.sqrt(0.45 / 0.55), least)
+        assert np.median(facets.slope) == pytest.approx(expected, rel=0.05)
+
+
+def test_differences_of_pairs_are_the_slope_by_the_normal_in_the_mean() -> None:
+    count = 40_000
+    rng = np.random.default_rng(2)
+    way = np.tile(unit(np.array([0.5, -0.2, -1.0])), (count, 1)) + rng.normal(scale=1e-6, size=(count, 3))
+    normal = np.tile(unit(np.array([0.1, 0.2, 1.0])), (count, 1))
+    surface = Surface.alone(np.full((count, 5), 0.1), normal, way)
+    facets = facets_of(surface, least_slope=1e-3, salt=0)
+    colours, hidden = rng.normal(size=(3, 3)), rng.normal(size=3)
+
+    def seen(facing: np.ndarray) -> Seen:
+        """Light and visibility that grow evenly with the reflected direction."""
+        mirrored = way - 2 * (way * facing).sum(axis=1, keepdims=True) * facing
+        return Seen(mirrored @ hidden, mirrored @ colours)
+
+    one, other = (seen(facets.normals(normal, sign)) for sign in (1.0, -1.0))
+    pairs = Seen(*(np.concatenate(both) for both in zip(one, other, strict=True)))
+    around, by_incoming = np.full((count, 3), 2.0), np.tile([1.0, -0.5, 0.25], (count, 1))
+    found = pair_slope(pairs, facets, around, by_incoming).mean(axis=0)
+
+    def loss(facing: np.ndarray) -> float:
+        visibility, light = seen(facing)
+        return float((by_incoming[:1] * (light[:1] + visibility[:1, None] * around[:1])).sum())
+
+    steps = 1e-5 * np.eye(3)
+    expected = np.array([(loss(normal + h) - loss(normal - h)) / 2e-5 for h in steps])
+    expected -= (expected @ normal[0]) * normal[0]
+    np.testing.assert_allclose(found, expected, atol=0.03 * np.linalg.norm(expected))
+    np.testing.assert_allclose(pair_mean(pairs).light_linear, seen(normal).light_linear, atol=5e-3)
+
+
+def test_a_path_goes_from_mirror_to_mirror() -> None:
+    half = [0.5, 0.5, 0.5, 1, 0.02]
+    ground = wall((0, 0, 1), floor(1.5, 0.1), half)
+    above = wall((0, 0, 1), floor(1.5, 0.1, above=0.5), half)
+    lid = above.select(np.abs(above.means_world[:, 0] - 0.5) < 0.25)
+    scene = concatenate([ground, lid])
+    way = unit(np.array([[1.0, 0.03, -1.0]]))
+    rays = RayBatch(np.array([[-0.1, 0.0, 0.1]]), way)
+    radiance = np.full((16, 32, 3), 0.9, np.float32)
+    radiance[8:] = 0.1  # the lower half
+    shown = {}
+    for surfaces in (1, 2, 3):
+        settings = MaterialSettings(**BARE, reflections=surfaces, facet_slope=(1e-3, 1e-3), start=0.01)
+        model = Deferred(settings, extent_world=1.0)
+        model.light.put(radiance)
+        tracer = CpuTracer(threads=1)
+        tracer.build(scene, model.features(scene))
+        found = model.develop(Sight(rays, tracer.trace(rays), tracer)).rgb_srgb[0]
+        shown[surfaces] = float(srgb_to_linear(found).mean())
+    # Ground, lid, ground, and out into the upper half; cut off at the lid, that mirrors the lower half.
+    assert shown[1] == pytest.approx(0.1 * 0.5**2, abs=0.01)
+    assert shown[2] == pytest.approx(0.9 * 0.5**3, abs=0.01)
+    assert shown[3] == pytest.approx(shown[2], abs=1e-3)
+
+
+def test_a_pixel_at_an_outline_is_covered_by_its_share() -> None:
+    plate = wall((0, 0, 1), floor(2.0, 0.05), [0.8, 0.8, 0.8, 0.0, 1.0])
+    plate = plate.select(plate.means_world[:, 0] < -0.12)
+    model = Deferred(MaterialSettings(**BARE), extent_world=1.0)
+    model.light.put(np.full((16, 32, 3), 0.5, np.float32))
+    tracer = CpuTracer(threads=1)
+    tracer.build(plate, model.features(plate))
+    x = np.linspace(-1.6, 1.6, 9)  # nine pixels; the fifth lies on the edge
+    ways = np.stack([x, np.zeros(9), np.full(9, -4.0)], axis=1)[None]
+
+    image = ImageRays.of(np.array([0, 0, 4.0]), unit(ways))
+    found = pixel_means(tracer, image, model, 2)
+    np.testing.assert_allclose(found.alpha[0], [1, 1, 1, 1, 0.55, 0, 0, 0, 0], atol=0.06)
+    np.testing.assert_allclose(found.linear[0, :5], 0.5 * (0.8 + 0.04), atol=0.03)

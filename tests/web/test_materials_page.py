@@ -1,0 +1,96 @@
+"""The page of a result with materials: what lies behind its views, another light, other materials."""
+
+import shutil
+import urllib.request
+import uuid
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from web_bench import Browse, Service
+
+from engine.light.environment import write_environment
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from workers.cli.main import cli
+
+pytestmark = [pytest.mark.tools, pytest.mark.heavy]
+
+RUN = (
+    "--preset", "fast", "--iterations", "30", "--rays", "256", "--max-gaussians", "300", "--threads", "1",
+    "--set", "initial_points=200", "--set", "probe_rays=256", "--test-every", "4", "--exports", "",
+    "--materials", "--set", "materials.environment_height=16", "--set", "materials.ambient_rays=4",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene, a run of it with materials, and a map of light."""
+    root = tmp_path_factory.mktemp("shiny")
+    config = GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=400)
+    write_generated_scene(root / "scene", config)
+    done = CliRunner().invoke(cli, ["reconstruct", str(root / "scene"), "-o", str(root / "run"), *RUN, "-q"])
+    assert done.exit_code == 0, done.output
+    write_environment(root / "a map.hdr", np.full((8, 16, 3), 0.5, np.float32))
+    return root
+
+
+@pytest.fixture(scope="module")
+def job(service: Service, folder: Path) -> str:
+    """A reconstruction that nobody has worked on yet."""
+    command = ("submit", folder / "scene", "--queue", "nobody", "--server", service.url, "-q")
+    done = CliRunner().invoke(cli, [str(part) for part in command])
+    assert done.exit_code == 0, done.output
+    return done.stdout.strip().splitlines()[-1]
+
+
+def test_behind_the_views_in_another_light_and_of_other_stuff(
+    service: Service, browse: Browse, folder: Path, job: str
+) -> None:
+    service.worker.run(uuid.UUID(job), folder / "run")
+    found = browse("relight", service.url, job=job, map=str(folder / "a map.hdr"), by="path")
+
+    worst, other = found["render"][0].removeprefix("renders/"), found["other"][0].rpartition("/")[2]
+    assert found["learnt"] == ["layers/environment.png", 32, 16]
+    shown = [name for name, *_ in found["layers"]]
+    assert shown == [
+        "Normals",
+        "Depth",
+        "Base colour",
+        "Metallic",
+        "Roughness",
+        "Visibility",
+        "Indirect light",
+    ]
+    first = {address.rpartition("/")[2] for _, address, *_ in found["layers"]}
+    assert len(first) == 1 and first != {other} and worst == other  # the other row was chosen after these
+    assert [address.split("/")[1] for _, address, *_ in found["layers"]][2:4] == ["albedo", "metallic"]
+    assert {tuple(size) for _, _, *size in found["layers"]} == {(64, 48)} and found["tag"] == "Indirect light"
+
+    plain, lit, learnt, plain_again = found["looks"]
+    assert plain == plain_again and abs(lit - plain) > 1 and learnt != lit != plain
+    assert found["hidden"] and found["refused"] == "Choose a file of light: HDR or EXR."
+    relit, film, changed = (service.ask("GET", f"/v1/jobs/{found[k]}") for k in ("first", "second", "third"))
+    assert relit["kind"] == film["kind"] == "relight" and relit["source_id"] == film["source_id"] == job
+    wanted = {"environments": ["a_map.hdr"], "rotation_degrees": 90, "mode": "views", "by": "path"}
+    assert wanted.items() <= relit["options"].items() and relit["options"]["samples"] == 64
+    assert film["files_id"] == relit["files_id"] and found["maps"] == ["A file of yours", "a_map.hdr (light)"]
+    assert film["options"]["spin"] and film["options"]["mode"] == "turntable"
+    assert changed["kind"] == "material" and changed["options"]["where"] == "metallic > 0.5"
+    assert changed["options"]["set"]["albedo"][0] == 1 and changed["options"]["scale"]["roughness"] == 0.5
+    assert found["nameless"] == [] and found["complaints"] == []
+
+
+def test_a_result_without_materials_has_none_of_it(
+    service: Service, folder: Path, job: str, tmp_path: Path
+) -> None:
+    dataset = service.ask("GET", f"/v1/jobs/{job}")["dataset_id"]
+    plain = service.ask("POST", "/v1/jobs", {"dataset_id": dataset, "queue": "nobody"})["id"]
+    left_out = shutil.ignore_patterns("environment.hdr", "layers")
+    shutil.copytree(folder / "run", tmp_path / "run", ignore=left_out)
+    service.worker.run(uuid.UUID(plain), tmp_path / "run")
+    with urllib.request.urlopen(f"{service.url}/jobs/{plain}", timeout=60) as answer:
+        text = answer.read().decode()
+    assert "Held-out views" in text
+    for part in ('id="relight"', 'data-kind="material"', "Base colour"):
+        assert part not in text
