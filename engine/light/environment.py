@@ -1,16 +1,12 @@
 """Environment maps: equirectangular images of linear radiance, turned, and sampled by their brightness."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.errors import ConfigError, DatasetError
-from engine.render.images import read_image, write_exr, write_rgbe
 from engine.shading.environment_frame import environment_frame as environment_frame
 
-MAX_PIXELS = 1 << 27
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -40,42 +36,6 @@ class EnvironmentSampler:
     rows: Float64[np.ndarray, " h1"]
     columns: Float64[np.ndarray, "h w1"]
     shares: Float64[np.ndarray, "h w"]
-
-
-def read_environment(path: Path) -> Float32[np.ndarray, "h w 3"]:
-    """The linear radiance of an HDR or EXR image; a single channel stands for all three.
-
-    Raises:
-        ConfigError: the file is no such image, or holds values that are negative or not finite.
-    """
-    if path.suffix.lower() not in (".hdr", ".exr", ".pic"):
-        raise ConfigError(f"{path}: an environment is an HDR or EXR image; an 8-bit one holds no light.")
-    try:
-        image = read_image(path)
-    except DatasetError as error:
-        raise ConfigError(f"{path}: the environment cannot be read: {error}") from None
-    if image.shape[0] * image.shape[1] > MAX_PIXELS:
-        raise ConfigError(f"{path}: has more than {MAX_PIXELS >> 20} million pixels; make it smaller.")
-    rgb = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
-    if not np.isfinite(rgb).all() or (rgb < 0).any():
-        raise ConfigError(f"{path}: holds values that are negative or not finite; mend the image.")
-    return np.ascontiguousarray(rgb)
-
-
-def write_environment(path: Path, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
-    """Write a map as RGBE (``.hdr``, values to within 1 %) or as EXR (``.exr``, exactly), atomically.
-
-    Raises:
-        ConfigError: the name ends otherwise.
-        OutputError: the file cannot be written.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".hdr":
-        write_rgbe(path, radiance_linear)
-    elif suffix == ".exr":
-        write_exr(path, {name: radiance_linear[..., k] for k, name in enumerate("RGB")})
-    else:
-        raise ConfigError(f"{path}: an environment is written as .hdr or .exr.")
 
 
 def environment_sampler(radiance_linear: Float32[np.ndarray, "h w 3"]) -> EnvironmentSampler:

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from engine.colour import srgb_to_linear
 from engine.errors import ConfigError
+from engine.files.environment_map import read_environment
 from engine.light.arrays import Materials, MeshQueries, Surfaces
-from engine.light.environment import EnvironmentMap, environment_frame, read_environment
+from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.file_materials import FileMaterial, file_material
 from engine.light.kernels_surface import GLASS
 from engine.light.lights import LightArrays, ShiningMesh, light_arrays, rectangle_sides, triangle_areas

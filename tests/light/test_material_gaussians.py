@@ -7,8 +7,8 @@ import pytest
 from light_scenes import camera, psnr, shiny_ball
 
 from engine.colour import linear_to_srgb
+from engine.files.environment_map import write_environment
 from engine.gaussians.model import FlatGaussians
-from engine.light.environment import write_environment
 from engine.light.integrator import LitScene, PathTracer
 from engine.light.layers import stage_layers
 from engine.light.stage import (
