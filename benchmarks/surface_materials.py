@@ -20,11 +20,11 @@ from jaxtyping import Bool, Float32
 from engine.config import read_config
 from engine.evaluate.truth import TRUTH, Truth, read_truth
 from engine.files import read_scene
-from engine.files.environment_map import read_environment
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.relighting import PathRelighter
 from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.light.stage import Integrator
+from engine.render.environment_map import read_environment
 from engine.render.images import read_image, write_png
 from engine.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
 from engine.scene import Dataset, load_scene

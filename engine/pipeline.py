@@ -32,13 +32,13 @@ from engine.events import (
     broadcast,
 )
 from engine.files import ExportOptions, check_writable
-from engine.files.environment_map import write_environment
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
 from engine.gaussians.materials import reflective_share
 from engine.gaussians.model import FlatGaussians
 from engine.plain_colours import PlainScene
 from engine.poses import find_poses
+from engine.render.environment_map import write_environment
 from engine.run_folder import (
     CACHE,
     CHECKPOINTS,

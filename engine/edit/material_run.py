@@ -13,10 +13,10 @@ from engine.config import read_config
 from engine.edit.choices import MaterialChange, Selection
 from engine.edit.material_change import with_harmonics_following, with_materials
 from engine.errors import ConfigError, OutputError
-from engine.files.environment_map import read_environment
 from engine.files.gaussian_ply import read_near_world, write_gaussian_ply
 from engine.gaussians.materials import require_materials
 from engine.gaussians.model import FlatGaussians
+from engine.render.environment_map import read_environment
 from engine.run_folder import CONFIG, ENVIRONMENT, EVENTS, HELD_OUT, POSES, SCENE, TRAINING, VIEWS, is_run
 from engine.shading.environment_frame import environment_frame
 from engine.shading.learnt_light import LearntLight

@@ -20,11 +20,11 @@ from engine.evaluate.truth_metrics import (
     pooled_psnr,
 )
 from engine.events import Listener, StageProgress, Warned
-from engine.files.environment_map import read_environment
 from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.relighting import Relighter, RelitImage
 from engine.rays import ImageRays
+from engine.render.environment_map import read_environment
 from engine.render.renderer import RenderedImage
 from engine.scene import Dataset
 

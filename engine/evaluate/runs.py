@@ -10,12 +10,12 @@ from engine.errors import ConfigError, OutputError
 from engine.evaluate.held_out import evaluate_held_out
 from engine.evaluate.truth import Truth, find_truth
 from engine.events import Listener, StageProgress, Warned
-from engine.files.environment_map import read_environment
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
 from engine.gaussians.materials import has_materials
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.poses.find import read_record
+from engine.render.environment_map import read_environment
 from engine.run_folder import (
     CACHE,
     CONFIG,

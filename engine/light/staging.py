@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from engine.colour import srgb_to_linear
 from engine.errors import ConfigError
-from engine.files.environment_map import read_environment
 from engine.light.arrays import Materials, MeshQueries, Surfaces
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.file_materials import FileMaterial, file_material
@@ -28,6 +27,7 @@ from engine.light.meshes import (
 )
 from engine.light.stage import Diffuse, Glass, Light, PointLight, RectangleLight, Shining, Stage, StageMesh
 from engine.rays import RayBatch
+from engine.render.environment_map import read_environment
 from engine.trace.meshes import TriangleScene
 
 SMOOTH_DEGREES = 30.0

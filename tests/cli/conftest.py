@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from engine.config import resolve_config
-from engine.files.environment_map import write_environment
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.render.environment_map import write_environment
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from workers.cli.main import cli
 

@@ -9,7 +9,7 @@ import OpenImageIO as oiio
 import pytest
 from pydantic import ValidationError
 
-from engine.files.environment_map import write_environment
+from engine.render.environment_map import write_environment
 from engine.render.images import read_image
 from workers.records.sizes import Sizes
 from workers.work.kinds import kind_named

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from engine.colour import linear_to_srgb
 from engine.files import export_scene, read_mesh
-from engine.files.environment_map import write_environment
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.render.environment_map import write_environment
 from engine.render.images import read_image
 from workers.work.kinds import kind_named
 from workers.work.programs import material

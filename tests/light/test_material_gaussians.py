@@ -7,7 +7,6 @@ import pytest
 from light_scenes import camera, psnr, shiny_ball
 
 from engine.colour import linear_to_srgb
-from engine.files.environment_map import write_environment
 from engine.gaussians.model import FlatGaussians
 from engine.light.integrator import LitScene, PathTracer
 from engine.light.layers import stage_layers
@@ -21,6 +20,7 @@ from engine.light.stage import (
     StageMesh,
 )
 from engine.light.staging import stage_meshes
+from engine.render.environment_map import write_environment
 from engine.trace.protocol import TraceSettings
 
 FOLDER = Path(__file__).parent

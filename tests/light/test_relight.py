@@ -8,8 +8,8 @@ from click.testing import CliRunner, Result
 from light_scenes import psnr, shiny_ball
 
 from engine.colour import linear_to_srgb
-from engine.files.environment_map import write_environment
 from engine.files.gaussian_ply import write_gaussian_ply
+from engine.render.environment_map import write_environment
 from engine.render.images import read_channels, read_image
 from workers.cli.main import cli
 

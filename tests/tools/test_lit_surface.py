@@ -10,13 +10,13 @@ from blender_python import SCRIPTS, run_blender
 from lit_surface import in_cycles, in_threejs, view_of
 
 from engine.files import write_surface
-from engine.files.environment_map import write_environment
 from engine.gaussians.frames import frames_from_normals, quaternions
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import EnvironmentMap
 from engine.light.relighting import PathRelighter
 from engine.light.stage import Integrator
 from engine.render.cameras import RenderCamera, focal_from_fov
+from engine.render.environment_map import write_environment
 from engine.render.paths import look_at
 from engine.shading.environment_frame import environment_frame
 from engine.surface.cameras import cameras_around

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from web_bench import Browse, Service
 
-from engine.files.environment_map import write_environment
+from engine.render.environment_map import write_environment
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from workers.cli.main import cli
 

@@ -16,13 +16,13 @@ from shell_scene import our_view, shell_scene
 
 import service.web
 from engine.colour import to_bytes
-from engine.files.environment_map import read_environment, write_environment
 from engine.files.gaussian_ply import write_gaussian_ply
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.render.cameras import RenderCamera, focal_from_fov
+from engine.render.environment_map import read_environment, write_environment
 from engine.render.renderer import background_colour, render_rays
 from engine.trace.cpu import CpuTracer
 from engine.trace.protocol import TraceSettings

@@ -13,12 +13,12 @@ from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.config import read_config
 from engine.errors import ConfigError
 from engine.events import Listener
-from engine.files.environment_map import read_environment
 from engine.gaussians.materials import require_materials
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.relighting import PathRelighter, Relighter, surroundings
 from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.light.stage import Integrator
+from engine.render.environment_map import read_environment
 from engine.render.identity import identity_of
 from engine.render.images import write_exr, write_png
 from engine.render.jobs import Shot, camera_shots, view_shots
