@@ -105,7 +105,7 @@ class Instances(SingleRayTracer):
         inner = lib.rtcGetGeometry(self._scene.handle, 0)
         lib.rtcSetGeometryIntersectFunction(inner, intersect_instance.address)
         lib.rtcCommitGeometry(inner)
-        lib.rtcCommitScene(self._scene.handle)
+        lib.rtcJoinCommitScene(self._scene.handle)
         radius = octagon_radii(gaussians.opacities, SETTINGS.q)[:, None]
         axes = gaussians.rotations.astype(np.float64)  # columns: normal, u, v
         half = np.concatenate([np.full((len(gaussians), 1), THICKNESS), radius * gaussians.scales], axis=1)
@@ -122,7 +122,7 @@ class Instances(SingleRayTracer):
             lib.rtcCommitGeometry(geometry)
             lib.rtcAttachGeometry(top, geometry)
             lib.rtcReleaseGeometry(geometry)
-        self.commit_ms = 1e3 * seconds(lambda: lib.rtcCommitScene(top))
+        self.commit_ms = 1e3 * seconds(lambda: lib.rtcJoinCommitScene(top))
         device.check("building the instances")
         self._bottom, self._scene.handle = self._scene.handle, top
 
@@ -192,7 +192,7 @@ def geometry(scene: Boxes, origins: np.ndarray, directions: np.ndarray) -> None:
 
     def refit() -> None:
         lib.rtcCommitGeometry(inner)
-        lib.rtcCommitScene(handle)
+        lib.rtcJoinCommitScene(handle)
 
     rng = np.random.default_rng(0)
     size = np.exp(scene.gaussians.log_scales).mean()

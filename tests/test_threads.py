@@ -72,3 +72,19 @@ def test_a_run_on_one_thread_uses_one(tmp_path: Path) -> None:
     program.returncode = os.waitstatus_to_exitcode(status)
     assert program.returncode == 0
     assert used.ru_utime < 1.25 * (time.perf_counter() - began)
+
+
+def test_nothing_goes_on_working_after_hierarchies_were_built_on_one_thread() -> None:
+    script = """
+import time
+import numpy as np
+from engine.trace.embree_library import Device, MeshScene
+corners = np.random.default_rng(0).normal(size=(3000, 3)).astype(np.float32)
+faces = np.arange(3000, dtype=np.uint32).reshape(-1, 3)
+scenes = [MeshScene(Device(1), corners, faces) for _ in range(4)]
+before = time.process_time()
+time.sleep(1)
+print(time.process_time() - before)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 0.3

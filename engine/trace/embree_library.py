@@ -29,7 +29,7 @@ _SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "rtcReleaseScene": (None, [Handle]),
     "rtcSetSceneFlags": (None, [Handle, ctypes.c_int]),
     "rtcSetSceneBuildQuality": (None, [Handle, ctypes.c_int]),
-    "rtcCommitScene": (None, [Handle]),
+    "rtcJoinCommitScene": (None, [Handle]),
     "rtcAttachGeometry": (ctypes.c_uint, [Handle, Handle]),
     "rtcNewGeometry": (Handle, [Handle, ctypes.c_int]),
     "rtcReleaseGeometry": (None, [Handle]),
@@ -148,7 +148,8 @@ class _Scene:
         lib.rtcCommitGeometry(geometry)
         lib.rtcAttachGeometry(self.handle, geometry)
         lib.rtcReleaseGeometry(geometry)
-        lib.rtcCommitScene(self.handle)
+        # Joined, since rtcCommitScene on one thread leaves another of TBB's spinning for ever.
+        lib.rtcJoinCommitScene(self.handle)
         self._device.check(f"building the hierarchy over {count} {what}")
 
     def __del__(self) -> None:
