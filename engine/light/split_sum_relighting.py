@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32
 
-from engine.gaussians.materials import with_room_for_bounced
+from engine.gaussians.materials import AMBIENT, with_room_for_bounced
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import EnvironmentMap
 from engine.light.relighting import Part, RelitImage, silent
@@ -42,13 +42,17 @@ class SplitSumRelighter:
         side: int = 2,
         threads: int = 0,
     ) -> None:
-        self._side = side
+        self._across = side
         changed = {"learn": True, "environment_height": HEIGHT, "visibility": True, "indirect": "shaded"}
         shading = (learnt or MaterialSettings()).model_copy(update=changed)
         self._shading = Deferred(shading, extent_world=extent_world)
         self._gaussians = with_room_for_bounced(gaussians)
         self._tracer = make_tracer(settings, threads=threads, build_quality=2)
         self._tracer.build(self._gaussians, self._shading.features(self._gaussians))
+        self._all = np.arange(len(gaussians))
+        self._open_sides: Float32[np.ndarray, " n"] | None = None
+        if AMBIENT in gaussians.channels and shading.ambient:
+            self._open_sides = self._shading.look_around(self._gaussians, self._all, self._tracer)
         self._radiance: Float32[np.ndarray, "h w 3"] | None = None
 
     def put(self, environment: EnvironmentMap) -> None:
@@ -59,10 +63,11 @@ class SplitSumRelighter:
             self._radiance = environment.radiance_linear
         if other or not np.array_equal(self._shading.frame, environment.frame):
             self._shading.frame = environment.frame
-            self._shading.relight(self._gaussians, self._tracer)
+            if self._open_sides is not None:
+                self._shading.bounce(self._gaussians, self._all, self._open_sides, self._tracer)
 
     def render(self, image: ImageRays, part: Part = silent) -> RelitImage:
         """What a camera sees; ``part`` is told the share that is done."""
         assert self._radiance is not None, "an environment must be put first"
-        found = pixel_means(self._tracer, image, self._shading, self._side, part)
+        found = pixel_means(self._tracer, image, self._shading, self._across, part)
         return RelitImage(found.linear, found.alpha)

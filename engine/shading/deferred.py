@@ -39,6 +39,7 @@ from engine.shading.reflections import (
     pair_mean,
     pair_slope,
 )
+from engine.shading.slopes import clipped, encoding_slope
 from engine.shading.split_sum import ShadeGradients, Surface, shade, shade_reverse
 from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
@@ -109,28 +110,36 @@ class Deferred:
             return
         parts = settings.ambient_parts
         turn = int(progress * TURNS) * 7919 % parts
-        self._look_around(gaussians, np.arange(turn, len(gaussians), parts), tracer)
+        ids = np.arange(turn, len(gaussians), parts)
+        self.bounce(gaussians, ids, self.look_around(gaussians, ids, tracer), tracer)
 
-    def relight(self, gaussians: FlatGaussians, tracer: Tracer) -> None:
-        """Find the light that surfaces send each other under an environment that was just put."""
-        if BOUNCED in gaussians.channels and self.settings.ambient:
-            self._look_around(gaussians, np.arange(len(gaussians)), tracer)
-
-    def _look_around(self, gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer) -> None:
-        """Measure ambient visibility and bounced light of some of the Gaussians."""
-        channels, rays = gaussians.channels, self.settings.ambient_rays
+    def look_around(
+        self, gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer
+    ) -> Float32[np.ndarray, " u"]:
+        """Measure the ambient visibility of Gaussians; returns their open sides for :meth:`bounce`."""
+        rays = self.settings.ambient_rays
         visible, side = ambient_visibility(gaussians, ids, tracer, rays=rays, gap_world=2 * self._gap)
-        channels[AMBIENT][ids, 0] = visible
+        gaussians.channels[AMBIENT][ids, 0] = visible
         self._features[ids, AMBIENT_COLUMN] = visible
-        if BOUNCED not in channels:
+        return side
+
+    def bounce(
+        self,
+        gaussians: FlatGaussians,
+        ids: Int64[np.ndarray, " u"],
+        side: Float32[np.ndarray, " u"],
+        tracer: Tracer,
+    ) -> None:
+        """Find the light that others send to the open sides of Gaussians, if the scene has room for it."""
+        if BOUNCED not in gaussians.channels:
             return
-        dim = visible < OPEN
+        dim = gaussians.channels[AMBIENT][ids, 0] < OPEN
         bounced = np.zeros((len(ids), 3), np.float32)
         bounced[dim] = bounced_light(
-            gaussians, ids[dim], side[dim], lambda fan: self._radiance(fan, tracer), rays=rays,
-            gap_world=2 * self._gap,
+            gaussians, ids[dim], side[dim], lambda fan: self._radiance(fan, tracer),
+            rays=self.settings.ambient_rays, gap_world=2 * self._gap,
         )  # fmt: skip
-        channels[BOUNCED][ids] = bounced
+        gaussians.channels[BOUNCED][ids] = bounced
         self._features[ids, BOUNCED_COLUMNS] = bounced
 
     def _radiance(self, rays: RayBatch, tracer: Tracer) -> Float64[np.ndarray, "r 3"]:
@@ -391,22 +400,3 @@ class Deferred:
             smooth_normal_term(sight, self._window, settings.smooth_normal_weight, by_normal)
         if self._window > 1 and settings.smooth_weight > 0:
             smoothness_term(sight, self._window, settings.smooth_weight, by_features, by_alpha)
-
-
-def clipped(gradients: Float64[np.ndarray, "p 3"], most: float) -> Float64[np.ndarray, "p 3"]:
-    """Gradients no longer than ``most`` times the median of those that are not 0; 0 leaves them alone.
-
-    One pixel that looks into a mirror in a mirror says more loudly than a hundred others where to turn, and
-    is as likely to be wrong.
-    """
-    lengths = np.linalg.norm(gradients, axis=1)
-    if most == 0 or not (lengths > 0).any():
-        return gradients
-    longest = most * float(np.median(lengths[lengths > 0]))
-    return gradients * np.minimum(1.0, longest / np.maximum(lengths, 1e-30))[:, None]
-
-
-def encoding_slope(linear: Float64[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
-    """Slope of the display values by the linear ones; beyond white that at white, so that light can fall."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92, (1.055 / 2.4) * np.maximum(x, 0.0031308) ** (1 / 2.4 - 1))

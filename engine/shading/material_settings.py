@@ -1,8 +1,8 @@
 """Every knob of learning materials and light from photographs, with its default."""
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 SEED_SECOND_STAGE = 0.36
 """Share of the training after which the seed's code begins deferred shading, with materials as at first."""
@@ -27,7 +27,6 @@ class MaterialSettings(BaseModel):
         environment_every: iterations between two steps of the environment.
         hand_over: when shading begins to replace the harmonics' colours, and when it has.
         secondary_from: when visibility and indirect light begin.
-        secondary_share: share of a batch's pixels that are given a reflected ray.
         visibility: whether what stands in the way of a reflection hides the environment there.
         reflections: surfaces on the path of a reflected ray.
         facet_slope: least angle between a normal and the two facets beside it at which rays are reflected, at
@@ -71,7 +70,6 @@ class MaterialSettings(BaseModel):
     environment_every: int = Field(4, ge=1)
     hand_over: tuple[float, float] = (0.0, 0.02)
     secondary_from: float = Field(0.05, ge=0, le=1)
-    secondary_share: float = Field(1.0, ge=0, le=1)
     visibility: bool = True
     reflections: int = Field(3, ge=1, le=8)
     facet_slope: tuple[float, float] = (0.1, 0.01)
@@ -100,6 +98,14 @@ class MaterialSettings(BaseModel):
     first_albedo: float = Field(0.5, gt=0, lt=1)
     first_metallic: float = Field(0.5, gt=0, lt=1)
     first_roughness: float = Field(0.3, gt=0, lt=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_secondary_share(cls, given: Any) -> Any:
+        """Runs of earlier versions list a ``secondary_share``; 1 meant all pixels, as now."""
+        if isinstance(given, dict) and given.get("secondary_share") == 1:
+            given = {name: value for name, value in given.items() if name != "secondary_share"}
+        return given
 
     def is_seed_deferred(self, progress: float) -> bool:
         """Whether the seed's second stage has begun."""

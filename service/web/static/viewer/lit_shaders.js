@@ -1,58 +1,28 @@
 // Materials in the light of a map: octagons blend their materials and normals, then each pixel is shaded once.
 
-export const MATERIAL_VERTEX = /* glsl */ `
-precision highp float;
-precision highp int;
-precision highp sampler2D;
+import { FALL_OFF, OCTAGON } from "./shaders.js";
 
-uniform mat4 viewMatrix;
-uniform mat4 projectionMatrix;
-uniform vec3 cameraPosition;
-uniform sampler2D geometryTexture;
+export const MATERIAL_VERTEX = /* glsl */ `${OCTAGON}
 uniform sampler2D materialTexture;
-uniform int geometryColumns;
 uniform int materialColumns;
-uniform float q;
 
-in vec3 position;
-in uint number;
-
-out vec2 plane;
-flat out float opacity;
 flat out vec4 first;           // base colour and metallic
 flat out vec2 second;          // roughness and the share of light from all around
 flat out vec3 normal;
 
-vec4 geometryAt(int i, int k) {
-    return texelFetch(geometryTexture, ivec2((i % geometryColumns) * 3 + k, i / geometryColumns), 0);
-}
-
 void main() {
     int i = int(number);
-    vec4 middle = geometryAt(i, 0);
-    vec3 a = geometryAt(i, 1).xyz, b = geometryAt(i, 2).xyz;
-    opacity = middle.w;
-    float radius = sqrt(max(0.0, q + 2.0 * log(max(opacity, 1e-20))));
-    if (radius == 0.0) {
-        gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-        return;
-    }
-    plane = radius * position.xy;
-    vec3 world = middle.xyz + plane.x * a + plane.y * b;
-    normal = normalize(cross(a, b));
-    if (dot(normal, middle.xyz - cameraPosition) > 0.0) normal = -normal;
+    vec3 world;
+    if (!placeCorner(i, world)) return;
+    normal = normalize(cross(geometryAt(i, 1).xyz, geometryAt(i, 2).xyz));
+    if (dot(normal, geometryAt(i, 0).xyz - cameraPosition) > 0.0) normal = -normal;
     ivec2 at = ivec2((i % materialColumns) * 2, i / materialColumns);
     first = texelFetch(materialTexture, at, 0);
     second = texelFetch(materialTexture, at + ivec2(1, 0), 0).xy;
-    gl_Position = projectionMatrix * viewMatrix * vec4(world, 1.0);
 }
 `;
 
-export const MATERIAL_FRAGMENT = /* glsl */ `
-precision highp float;
-
-in vec2 plane;
-flat in float opacity;
+export const MATERIAL_FRAGMENT = /* glsl */ `${FALL_OFF}
 flat in vec4 first;
 flat in vec2 second;
 flat in vec3 normal;
@@ -61,7 +31,7 @@ layout(location = 1) out vec4 facing;
 layout(location = 2) out vec4 rest;
 
 void main() {
-    float alpha = min(opacity * exp(-0.5 * dot(plane, plane)), 0.999);
+    float alpha = alphaHere();
     colour = vec4(first.rgb * alpha, alpha);
     facing = vec4(normal * alpha, alpha);
     rest = vec4(vec3(first.a, second) * alpha, alpha);

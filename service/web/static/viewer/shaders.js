@@ -1,6 +1,7 @@
 // One octagon: its corners from the Gaussian's numbers, its fall-off in every pixel.
 
-export const VERTEX = /* glsl */ `
+// Begins a vertex shader: what it is given, and the corner of its octagon.
+export const OCTAGON = /* glsl */ `
 precision highp float;
 precision highp int;
 precision highp sampler2D;
@@ -9,22 +10,50 @@ uniform mat4 viewMatrix;
 uniform mat4 projectionMatrix;
 uniform vec3 cameraPosition;
 uniform sampler2D geometryTexture;
-uniform sampler2D harmonicsTexture;
 uniform int geometryColumns;   // Gaussians in a row
-uniform int harmonicsColumns;
-uniform int shCount;
 uniform float q;               // squared radius of an opaque octagon, in standard deviations
 
 in vec3 position;              // corner on the unit circle
 in uint number;                // of the Gaussian
 
 out vec2 plane;                // place in the octagon, in standard deviations
-out vec3 colour;
 flat out float opacity;
 
 vec4 geometryAt(int i, int k) {
     return texelFetch(geometryTexture, ivec2((i % geometryColumns) * 3 + k, i / geometryColumns), 0);
 }
+
+// Sets plane, opacity and gl_Position; whether anything shows.
+bool placeCorner(int i, out vec3 world) {
+    vec4 first = geometryAt(i, 0);
+    opacity = first.w;
+    // The radius at which alpha falls to exp(-q/2), whatever the opacity.
+    float radius = sqrt(max(0.0, q + 2.0 * log(max(opacity, 1e-20))));
+    plane = radius * position.xy;
+    world = first.xyz + plane.x * geometryAt(i, 1).xyz + plane.y * geometryAt(i, 2).xyz;
+    gl_Position = radius == 0.0 ? vec4(2.0, 2.0, 2.0, 1.0) : projectionMatrix * viewMatrix * vec4(world, 1.0);
+    return radius > 0.0;
+}
+`;
+
+// Begins a fragment shader of an octagon.
+export const FALL_OFF = /* glsl */ `
+precision highp float;
+
+in vec2 plane;
+flat in float opacity;
+
+float alphaHere() {
+    return min(opacity * exp(-0.5 * dot(plane, plane)), 0.999);
+}
+`;
+
+export const VERTEX = /* glsl */ `${OCTAGON}
+uniform sampler2D harmonicsTexture;
+uniform int harmonicsColumns;
+uniform int shCount;
+
+out vec3 colour;
 
 vec3 sh(ivec2 at, int k) {
     return texelFetch(harmonicsTexture, at + ivec2(k, 0), 0).rgb;
@@ -53,31 +82,17 @@ vec3 shaded(int i, vec3 d) {
 
 void main() {
     int i = int(number);
-    vec4 first = geometryAt(i, 0);
-    opacity = first.w;
-    // The radius at which alpha falls to exp(-q/2), whatever the opacity.
-    float radius = sqrt(max(0.0, q + 2.0 * log(max(opacity, 1e-20))));
-    if (radius == 0.0) {
-        gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-        return;
-    }
-    plane = radius * position.xy;
-    vec3 world = first.xyz + plane.x * geometryAt(i, 1).xyz + plane.y * geometryAt(i, 2).xyz;
-    colour = shaded(i, normalize(world - cameraPosition));
-    gl_Position = projectionMatrix * viewMatrix * vec4(world, 1.0);
+    vec3 world;
+    if (placeCorner(i, world)) colour = shaded(i, normalize(world - cameraPosition));
 }
 `;
 
-export const FRAGMENT = /* glsl */ `
-precision highp float;
-
-in vec2 plane;
+export const FRAGMENT = /* glsl */ `${FALL_OFF}
 in vec3 colour;
-flat in float opacity;
 out vec4 premultiplied;
 
 void main() {
-    float alpha = min(opacity * exp(-0.5 * dot(plane, plane)), 0.999);
+    float alpha = alphaHere();
     premultiplied = vec4(max(colour, 0.0) * alpha, alpha);
 }
 `;
