@@ -142,14 +142,16 @@ def test_the_papers_radius_over_white_from_inside(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("metallic", "roughness", "degrees"), [(1.0, 0.1, 0), (1.0, 0.4, 90), (0.0, 0.8, -30)]
+    ("metallic", "roughness", "degrees", "least"),
+    [(1.0, 0.1, 0, 25.0), (1.0, 0.4, 90, 38.0), (0.0, 0.8, -30, 45.0)],
 )
 def test_draws_materials_in_the_light_of_a_map(
     tmp_path: Path, metallic: float, roughness: float, degrees: int, least: float
 ) -> None:
-    """A ball, which hides nothing of the light from itself, as ``relight`` shows it.
+    """A ball, about as ``relight`` shows it.
 
-    Its map has 256 rows and the viewer's 128, which tells where edges of light are mirrored.
+    Its map has 256 rows and the viewer's 128, which tells where edges of light are mirrored; and the facets of
+    a rough metal see the ball itself near its outline, for which the viewer does not look.
     """
     scene = shiny_ball(2000, 1.0, albedo=(0.9, 0.5, 0.2), metallic=metallic, roughness=roughness)
     random = np.random.default_rng(3)
