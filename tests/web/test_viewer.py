@@ -150,8 +150,8 @@ def test_draws_materials_in_the_light_of_a_map(
 ) -> None:
     """A ball, about as ``relight`` shows it.
 
-    Its map has 256 rows and the viewer's 128, which tells where edges of light are mirrored; and the facets of
-    a rough metal see the ball itself near its outline, for which the viewer does not look.
+    Its map has 256 rows and the viewer's 128, which tells where edges of light are mirrored; and facets of
+    rough metal see the ball itself near its outline, for which the viewer does not look.
     """
     scene = shiny_ball(2000, 1.0, albedo=(0.9, 0.5, 0.2), metallic=metallic, roughness=roughness)
     random = np.random.default_rng(3)
