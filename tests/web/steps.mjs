@@ -367,6 +367,13 @@ const steps = {
             await shot(page, "relight_preview");
         }
         found.nameless = await nameless(page);
+        const wide = page.viewportSize();
+        await page.setViewportSize({ width: 360, height: 760 });
+        await page.evaluate(() => document.querySelectorAll("details").forEach((fold) => { fold.open = true; }));
+        await page.waitForTimeout(400);
+        found.overflow = await overflow(page);
+        await shot(page, "relight_phone");
+        await page.setViewportSize(wide);
         await page.click("#relight [data-do=views]");
         await page.waitForURL((url) => !url.pathname.endsWith(job.job));
         found.first = page.url().split("/").pop();

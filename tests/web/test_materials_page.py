@@ -78,7 +78,7 @@ def test_behind_the_views_in_another_light_and_of_other_stuff(
     assert film["options"]["spin"] and film["options"]["mode"] == "turntable"
     assert changed["kind"] == "material" and changed["options"]["where"] == "metallic > 0.5"
     assert changed["options"]["set"]["albedo"][0] == 1 and changed["options"]["scale"]["roughness"] == 0.5
-    assert found["nameless"] == [] and found["complaints"] == []
+    assert found["nameless"] == [] and found["overflow"] <= 0 and found["complaints"] == []
 
 
 def test_a_result_without_materials_has_none_of_it(
