@@ -183,7 +183,7 @@ def test_channels_are_stepped_by_their_logits_as_torch_does() -> None:
     adam, rates = Adam.fresh(scene), LearningRates(albedo=0.05, decay=1.0)
     for _ in range(5):
         given = gradients(scene, np.arange(6), rng)
-        given.features = rng.normal(size=(6, 7)).astype(np.float32)
+        given.features = rng.normal(size=(6, adam.channel_first.shape[1])).astype(np.float32)
         judge.zero_grad()
         (torch.sigmoid(leaf) * torch.from_numpy(given.features[:, :3]).double()).sum().backward()
         judge.step()
