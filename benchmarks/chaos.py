@@ -78,7 +78,7 @@ class Run:
         deadline = time.monotonic() + seconds
         while True:
             try:
-                with Api(self.machine.address) as api:
+                with Api(self.machine.address, self.machine.token) as api:
                     return ask(api)
             except (Unreachable, ServiceError, httpx.HTTPError) as error:
                 refused = isinstance(error, ServiceError) and error.status not in (500, 502, 503, 504, 507)
@@ -137,7 +137,7 @@ class Run:
         """What is wrong, in sentences."""
         found: list[str] = []
         storage = open_storage(self.machine.data / "store", floor_bytes=0)
-        with Api(self.machine.address) as api:
+        with Api(self.machine.address, self.machine.token) as api:
             listed = {job["id"]: job for job in api.pages("/v1/jobs", "jobs", limit=200)}
             if set(listed) != set(self.accepted):
                 found.append(f"{len(self.accepted)} jobs were accepted and {len(listed)} are there")
@@ -168,7 +168,7 @@ class Run:
 
     def report(self) -> dict[str, Any]:
         """Numbers of the run, after :meth:`faults`."""
-        with Api(self.machine.address) as api:
+        with Api(self.machine.address, self.machine.token) as api:
             jobs = list(api.pages("/v1/jobs", "jobs", limit=200))
         return {
             "jobs": len(self.accepted),

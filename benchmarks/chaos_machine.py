@@ -73,6 +73,11 @@ class Machine:
         return f"http://127.0.0.1:{self.port}"
 
     @property
+    def token(self) -> str:
+        """What it made for its own user."""
+        return (self.data / "token").read_text().strip()
+
+    @property
     def log(self) -> Path:
         """What everything said; not on the small disk."""
         return self.data.with_name(f"{self.data.name}.log")

@@ -1,13 +1,17 @@
 """``octasplat demo``, made tiny."""
 
 import signal
+import subprocess
+import sys
 import time
 import webbrowser
+from pathlib import Path
 
 import pytest
 
 import workers.cli.demonstration
 
+ROOT = Path(__file__).resolve().parents[2]
 SIZE = ("--views", 4, "--width", 32, "--height", 24)
 
 
@@ -35,6 +39,29 @@ def test_a_signal_leaves_no_half_of_a_scene(start_octasplat, tmp_path, number, c
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == code, stderr
     assert len(stderr.splitlines()) <= 1, stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+STOPPED_AT_ONCE = """
+import os, pathlib, signal, sys
+from workers.cli.demonstration import make_scene
+
+made = pathlib.Path.mkdir
+
+def mkdir(path, *given, **named):
+    made(path, *given, **named)
+    if path.name.endswith(".partial"):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+pathlib.Path.mkdir = mkdir
+make_scene(pathlib.Path(sys.argv[1]), {"views": 4}, quiet=True)
+"""
+
+
+def test_a_signal_at_the_very_beginning_leaves_nothing(tmp_path):
+    """As it happens on a loaded machine: right after the folder was made."""
+    command = [sys.executable, "-c", STOPPED_AT_ONCE, str(tmp_path / "still")]
+    assert subprocess.run(command, cwd=ROOT, check=False, timeout=120).returncode == 143
     assert list(tmp_path.iterdir()) == []
 
 

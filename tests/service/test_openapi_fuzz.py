@@ -45,6 +45,7 @@ def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
         "OCTASPLAT_FLOOR_BYTES": "0",
         "OCTASPLAT_PORT": "0",
         "OCTASPLAT_TOKEN": TOKEN,
+        "OCTASPLAT_WRONG_TOKEN_SECONDS": "0",
         "OCTASPLAT_KIND_MODULES": '["toy_kind"]',
         "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'work'}",
     }

@@ -44,7 +44,7 @@ class Machine:
 
     @property
     def api(self) -> Api:
-        return Api(json.loads((self.data / "serve.json").read_text())["url"])
+        return Api.local(self.data)
 
     def children(self, word: str) -> list[psutil.Process]:
         """Processes below whose command holds ``word``."""
@@ -121,7 +121,7 @@ def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None
     """The log tells what was done, also by lost attempts, and nothing names a path of the machine."""
     environment = {
         **os.environ,
-        "OCTASPLAT_SERVER": json.loads((machine.data / "serve.json").read_text())["url"],
+        "OCTASPLAT_DATA": str(machine.data),
     }
 
     def command(*arguments: str) -> str:
@@ -239,8 +239,9 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
                 "lit",
                 "--wait",
             )
-            command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit", "--server", api.address)
-            lit = CliRunner().invoke(cli, [str(word) for word in command])
+            command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit")
+            environment = {"OCTASPLAT_DATA": str(machine.data)}
+            lit = CliRunner(env=environment).invoke(cli, [str(word) for word in command])
             assert lit.exit_code == 0 and "Rendered 1 image in" in lit.output, lit.output
             assert (tmp_path / "lit" / "views" / "view_000.png").is_file()
             with pytest.raises(ServiceError, match="no result nothing"):

@@ -18,7 +18,7 @@ from psycopg.rows import class_row
 
 from workers.queue.jobs import NewJob, artifacts_of, cancel_job, create_job, retry_job
 from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.records.database import Connection, open_pool
+from workers.records.database import Connection, naming, open_pool
 from workers.records.rows import Artifact, Job, JobEvent
 from workers.store.opening import open_storage
 
@@ -50,22 +50,24 @@ class Bench:
         """The file that toys wait for; beside the folder, as that may be on a disk that is full."""
         return self.folder.with_name(f"{self.folder.name}.gate")
 
-    def worker(self, *, queues: str = "cpu", name: str = "w", **settings: str) -> "subprocess.Popen[bytes]":
-        """Start a worker in a process."""
+    def worker(
+        self, *, queues: str = "cpu", name: str = "w", root: Path = ROOT, **settings: str
+    ) -> "subprocess.Popen[bytes]":
+        """Start a worker in a process, of the version in the folder ``root``."""
         given = {**FAST, "STORAGE": str(self.folder / "store"), "WORK": str(self.folder / f"work-{name}")}
         given.update(settings)
         environment = {
             **os.environ,
             **{f"OCTASPLAT_{key}": value for key, value in given.items()},
             "DATABASE_URL": self.conninfo,
-            "PYTHONPATH": f"{ROOT}{os.pathsep}{Path(__file__).parent}",
+            "PYTHONPATH": f"{root}{os.pathsep}{root / 'tests' / 'work'}",
             "OMP_NUM_THREADS": "1",
             "NUMBA_NUM_THREADS": "2",
             "A_SECRET_TOKEN": "must not reach the child",
         }
         command = [sys.executable, "-m", "workers", "worker", "--queues", queues, "--name", name]
         with (self.folder / f"{name}.log").open("ab") as log:
-            process = subprocess.Popen(command, env=environment, cwd=ROOT, stderr=log)
+            process = subprocess.Popen(command, env=environment, cwd=root, stderr=log)
         self.processes.append(process)
         return process
 
@@ -103,7 +105,7 @@ class Bench:
         """The job as it is."""
         with psycopg.connect(self.conninfo) as connection:
             cursor = connection.cursor(row_factory=class_row(Job))
-            job = cursor.execute("SELECT * FROM jobs WHERE id = %s", [job_id]).fetchone()
+            job = cursor.execute(naming("SELECT {} FROM jobs WHERE id = %s", Job), [job_id]).fetchone()
         assert job is not None
         return job
 
@@ -111,7 +113,8 @@ class Bench:
         """What happened to the job."""
         with psycopg.connect(self.conninfo) as connection:
             cursor = connection.cursor(row_factory=class_row(JobEvent))
-            cursor.execute("SELECT * FROM job_events WHERE job_id = %s ORDER BY id", [job_id])
+            query = naming("SELECT {} FROM job_events WHERE job_id = %s ORDER BY id", JobEvent)
+            cursor.execute(query, [job_id])
             return cursor.fetchall()
 
     def log(self, job_id: uuid.UUID) -> str:

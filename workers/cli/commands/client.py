@@ -44,9 +44,10 @@ def set_option(command: F) -> F:
 @contextmanager
 def connected(server: str | None) -> Iterator["Api"]:
     """The service that the user means; the token is no option, as others on a machine see those."""
-    from workers.client.api import TOKEN, Api, find_address
+    from workers.client.api import Api, find_address, find_token
 
-    with Api(server or find_address(os.environ), os.environ.get(TOKEN)) as api:
+    address = server or find_address(os.environ)
+    with Api(address, find_token(os.environ, address)) as api:
         yield api
 
 

@@ -13,6 +13,8 @@ from workers.work.kinds.estimates import (
     estimate_reconstruction,
     estimate_relight,
     estimate_render,
+    image_bytes,
+    reconstruction_bytes,
     rendered_pixels,
     training_pixels,
 )
@@ -165,6 +167,7 @@ def _reconstruction_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple
         Demand("train.patch_side", "rays", train.patch_side**2),
         Demand("max_side", "side_px", asked.max_side or 0),
         Demand("exports", "exports", len(asked.exports)),
+        Demand("max_side", "workspace_bytes", reconstruction_bytes(asked, sizes)),
     )
 
 
@@ -172,12 +175,15 @@ def _render_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand,
     asked = cast(RenderJobOptions, options)
     path = "frames" if asked.mode == "turntable" else "max_side"
     pixels = rendered_pixels(asked, sizes)
-    if asked.stage is None:
-        return (Demand(path, "render_pixels", pixels),)
-    paths = pixels * asked.stage.integrator.samples
-    return (
+    always = (
         Demand(path, "render_pixels", pixels),
-        Demand("stage.integrator.samples", "render_paths", paths),
+        Demand("format", "workspace_bytes", image_bytes(asked, sizes)),
+    )
+    if asked.stage is None:
+        return always
+    return (
+        *always,
+        Demand("stage.integrator.samples", "render_paths", pixels * asked.stage.integrator.samples),
     )
 
 
@@ -187,6 +193,7 @@ def _relight_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand
     pixels = rendered_pixels(asked, sizes)
     return (
         Demand(path, "render_pixels", pixels * len(asked.environments)),
+        Demand("format", "workspace_bytes", image_bytes(asked, sizes, len(asked.environments))),
         Demand("samples", "render_paths", pixels * asked.rays),
     )
 
