@@ -24,7 +24,8 @@ FAST = {
     "POLL_SECONDS": "0.2",
     "GRACE_SECONDS": "10",
     "THREADS": "1",
-    "KIND_MODULES": '["benchmarks.chaos_kind"]',
+    "FULL_DISK_SECONDS": "0.5",
+    "KIND_MODULES": '["benchmarks.chaos_kind", "benchmarks.glutton_kind"]',
 }
 MIB = 1 << 20
 
