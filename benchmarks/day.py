@@ -1,6 +1,6 @@
 """A day's work in an hour: five owners queue short jobs while all that works is upgraded, drained and killed.
 
-    python -m benchmarks.day --jobs 500 --minutes 60    # prints a report as JSON; exit code 1 if there are faults
+    python -m benchmarks.day --jobs 500 --minutes 60    # a report as JSON; exit code 1 if there are faults
 
 Four workers and a front end of the release before begin. After a tenth of the time the front end and then one
 worker after another is replaced by this version's; all the time workers are drained and killed, as are
