@@ -89,7 +89,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         Threads.DOWNLOADS,
         lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)],
     )
-    held_out = await asyncio.to_thread(read_names, service.storage, by_name.get(HELD_OUT))
+    held_out = await in_thread(Threads.DOWNLOADS, read_names, service.storage, by_name.get(HELD_OUT))
     figures = measured(metrics, artifacts, photographs)
     preview = detail.line.job.preview or {}
     shown = f"images/{preview.get('view')}"
