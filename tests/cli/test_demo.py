@@ -31,12 +31,12 @@ def test_scene_only(octasplat, tmp_path):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_no_half_of_a_scene(start_octasplat, tmp_path, number, code):
     process = start_octasplat("demo", "-o", tmp_path / "still", "--scene-only", "--views", 500)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240
     while not any(path.name.endswith(".partial") for path in tmp_path.iterdir()):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.05)
     process.send_signal(number)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=240)
     assert process.returncode == code, stderr
     assert len(stderr.splitlines()) <= 1, stderr
     assert list(tmp_path.iterdir()) == []

@@ -105,7 +105,7 @@ def test_two_starts_at_once_make_one_database(server: EmbeddedPostgres) -> None:
         )
         for _ in range(2)
     ]
-    answers = [process.communicate(timeout=60)[0] for process in both]
+    answers = [process.communicate(timeout=240)[0] for process in both]
     assert answers[0] == answers[1] and answers[0]
 
 

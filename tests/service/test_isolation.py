@@ -59,7 +59,7 @@ def served(project: Path, short_root: Path, tmp_path: Path) -> Iterator[Api]:
     with Api.local(data) as api:
         yield api
     process.terminate()
-    assert process.wait(60) == 0
+    assert process.wait(120) == 0
 
 
 def test_serve_runs_nothing_of_the_current_folder(served: Api, project: Path, tmp_path: Path) -> None:

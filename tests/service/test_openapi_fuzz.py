@@ -67,7 +67,7 @@ def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
     assert address.startswith("http"), log.read_text()
     yield FrontEnd(process, address, log)
     process.terminate()
-    process.wait(20)
+    process.wait(120)
     process.stdout.close()
 
 

@@ -59,7 +59,7 @@ def test_serve_keeps_a_token_for_its_user(short_root: Path) -> None:
             assert secret not in tokens and made not in tokens
     finally:
         process.terminate()
-        assert process.wait(60) == 0
+        assert process.wait(120) == 0
     path.chmod(0o644)  # somebody may have read it
     process = start(data)
     try:
@@ -70,4 +70,4 @@ def test_serve_keeps_a_token_for_its_user(short_root: Path) -> None:
             assert stale.status_code == 401
     finally:
         process.terminate()
-        assert process.wait(60) == 0
+        assert process.wait(120) == 0

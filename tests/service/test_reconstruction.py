@@ -60,7 +60,7 @@ class Machine:
     def stop(self) -> int:
         if self.process.poll() is None:
             self.process.terminate()
-        return self.process.wait(60)
+        return self.process.wait(120)
 
 
 def start(data: Path) -> Machine:
@@ -80,7 +80,7 @@ def start(data: Path) -> Machine:
     with log.open("ab") as output:
         process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=output)
     machine = Machine(data, process)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240
     while not (data / "serve.json").exists():
         assert process.poll() is None and time.monotonic() < deadline, log.read_text()
         time.sleep(0.05)
@@ -152,7 +152,7 @@ def test_everything_is_killed_and_the_result_is_the_same(
         job = submit(api, Submission(scene, OPTIONS, "killed"))
         address = f"/v1/jobs/{job['id']}"
 
-        def until(ready: Any, seconds: float = 60.0) -> dict[str, Any]:
+        def until(ready: Any, seconds: float = 240.0) -> dict[str, Any]:
             deadline = time.monotonic() + seconds
             while not ready(now := api.get(address)):
                 assert time.monotonic() < deadline, now
@@ -263,6 +263,6 @@ def test_killed_database_comes_back(machine: Machine, scene: Path) -> None:
 
 def test_second_service_on_the_same_data_is_refused(machine: Machine) -> None:
     command = [sys.executable, "-m", "workers", "serve", "--data", str(machine.data), "--port", "0"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1 and "Another octasplat serve" in done.stderr
     assert "Traceback" not in done.stderr

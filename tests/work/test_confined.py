@@ -107,7 +107,7 @@ def test_what_the_kernel_does_not_do_is_said_once(short_root: Path, tmp_path: Pa
             assert {row["facts"]["isolation"]["folders"] for row in workers} == {None}
     finally:
         process.terminate()
-        process.wait(60)
+        process.wait(120)
     wait_for_end(process.pid)
     lines = [line for line in log.read_text().splitlines() if "nothing keeps the programs" in line]
     assert len(lines) == 1 and "folders" in lines[0] and "network" not in lines[0]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from postgres_for_tests import copied_database
-from worker_bench import ROOT, Bench
+from worker_bench import PATIENCE_SECONDS, ROOT, Bench
 
 from workers.postgres.embedded import EmbeddedPostgres
 from workers.records.migrate import migrate
@@ -54,7 +54,7 @@ def test_what_a_worker_does_not_know_it_leaves_to_a_newer_one(bench: Bench) -> N
     shaded = bench.submit(options={"steps": 3, "shade": 0.5})
     plain = bench.submit(options={"steps": 3})
     assert bench.over(plain).worker == "old"  # what it knows it does meanwhile
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE_SECONDS
     while bench.worker_logs().count("leaves job") < 2:
         assert time.monotonic() < deadline, bench.worker_logs()
         time.sleep(0.05)

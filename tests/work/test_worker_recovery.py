@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import psycopg
 import pytest
-from worker_bench import ROOT, Bench, alive, child_pids, wait_for_end
+from worker_bench import PATIENCE_SECONDS, ROOT, Bench, alive, child_pids, wait_for_end
 
 TAKEN_OVER_SECONDS = 20.0
 """After 2.4 s a worker is missed; the rest is for a machine that is busy."""
@@ -123,7 +123,7 @@ def test_terminated_worker_hands_back_at_once(bench: Bench) -> None:
     bench.up("second")
     first.terminate()
     bench.wait(job_id, lambda job: job.worker == "second")  # long before anybody could miss the first
-    assert first.wait(60) == 0
+    assert first.wait(PATIENCE_SECONDS) == 0
     bench.open_gate()
     job = bench.over(job_id)
     assert (job.state, job.attempt, job.rescues) == ("succeeded", 2, 0)
