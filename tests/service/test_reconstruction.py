@@ -82,7 +82,9 @@ def start(data: Path) -> Machine:
     machine = Machine(data, process)
     deadline = time.monotonic() + 240
     while not (data / "serve.json").exists():
-        assert process.poll() is None and time.monotonic() < deadline, log.read_text()
+        if process.poll() is not None or time.monotonic() > deadline:
+            machine.stop()
+            raise AssertionError(log.read_text())
         time.sleep(0.05)
     return machine
 
