@@ -12,7 +12,7 @@ from workers.client.watch import watch_job
 
 
 class Front(BaseHTTPRequestHandler):
-    """Ends each stream of events after one, as a front end that is stopped does; the job is over in the end."""
+    """Ends each stream of events after one, as one that is stopped does; in the end the job is over."""
 
     state = "running"
 
