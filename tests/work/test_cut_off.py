@@ -19,7 +19,7 @@ LONG = {"STALE_SECONDS": "600"}
 
 @pytest.fixture
 def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(conninfo, tmp_path / "bench")
+    bench = Bench(conninfo, tmp_path / "bench", stale_seconds=3.0)
     bench.folder.mkdir()
     yield bench
     bench.close()

@@ -10,7 +10,7 @@ from worker_bench import PATIENCE_SECONDS, Bench
 
 @pytest.fixture
 def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(conninfo, tmp_path)
+    bench = Bench(conninfo, tmp_path, stale_seconds=3.0)
     yield bench
     bench.close()
 

@@ -23,7 +23,7 @@ PREVIOUS = "8a6786e625c3"
 
 @pytest.fixture
 def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(conninfo, tmp_path)
+    bench = Bench(conninfo, tmp_path, stale_seconds=3.0)
     yield bench
     bench.close()
 
@@ -91,7 +91,7 @@ def test_the_release_before_works_beside_this_one(
 ) -> None:
     """Jobs are taken over in both directions, and the earlier front end answers."""
     with copied_database(postgres, "template0") as conninfo:
-        bench = Bench(conninfo, tmp_path)
+        bench = Bench(conninfo, tmp_path, stale_seconds=3.0)
         environment = {**os.environ, "DATABASE_URL": conninfo, "PYTHONPATH": str(previous)}
         settings = {
             "DATA": str(tmp_path),

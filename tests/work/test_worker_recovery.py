@@ -18,7 +18,7 @@ TAKEN_OVER_SECONDS = 20.0
 
 @pytest.fixture
 def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(conninfo, tmp_path)
+    bench = Bench(conninfo, tmp_path, stale_seconds=3.0)
     yield bench
     bench.close()
 
