@@ -10,7 +10,7 @@ from worker_bench import PATIENCE_SECONDS, Bench
 
 @pytest.fixture
 def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(conninfo, tmp_path, stale_seconds=3.0)
+    bench = Bench(conninfo, tmp_path)
     yield bench
     bench.close()
 
@@ -39,7 +39,7 @@ def test_interrupted_job_is_taken_before_the_tiny_ones_behind_it(bench: Bench, k
     if kill:
         worker.kill()
         worker.wait()
-        bench.worker(queues="", name="care")  # finds out that the first is lost
+        bench.worker(queues="", name="care", STALE_SECONDS="3")  # finds out that the first is lost
         bench.wait(long_one, lambda job: job.state == "queued")
     else:
         worker.terminate()
