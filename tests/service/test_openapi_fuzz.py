@@ -135,7 +135,7 @@ def test_no_request_breaks_the_service(front_end: FrontEnd, conninfo: str, tmp_p
     for _attempt in range(3):
         done = subprocess.run(
             command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False,
-            timeout=100 * EXAMPLES,
+            timeout=300 * EXAMPLES,
         )  # fmt: skip
         if AST_IN_THREADS not in done.stdout:
             break

@@ -175,12 +175,16 @@ class Verdicts:
                 await self._pause(error)
 
     async def _said(self, say: Callable[[], Awaitable[T]]) -> T:
+        """What ``say`` brings; it is given longer each time, or a slow database would never be told."""
+        settings = self._around.settings
+        seconds = settings.heartbeat_seconds
         while True:
             try:
-                async with asyncio.timeout(self._around.settings.heartbeat_seconds):
+                async with asyncio.timeout(seconds):
                     return await say()
             except DATABASE_ERRORS as error:
                 await self._pause(error)
+                seconds = max(seconds, min(2 * seconds, settings.stale_seconds / 3))
 
     async def _pause(self, error: Exception) -> None:
         if self._contact.is_lost:
