@@ -11,6 +11,7 @@ import socket
 import tempfile
 import time
 import uuid
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,9 @@ THIN_SECONDS = 600.0
 ABANDONED_SECONDS = 86_400.0
 ROOM_LOOK_SECONDS = 5.0
 LEFT_POLLS = 3
-"""A job that is left to workers of another version is kept from all for so many looks at the queue."""
+"""A job that is left to workers of another version is kept from all for so many looks at the queue ..."""
+LEFT_SECONDS = 30.0
+"""... and for twice as many each further time, up to this time."""
 EXIT_LOST_DATABASE = 69
 
 
@@ -153,7 +156,7 @@ class _Worker:
         self._id = new_id()
         self._lost = False
         self._openings = Openings(name, pool, around)
-        self._left: set[uuid.UUID] = set()
+        self._left: Counter[uuid.UUID] = Counter()
         self._sender = Sender(pool, settings.webhook_hosts)
 
     async def run(self) -> int:
@@ -263,10 +266,12 @@ class _Worker:
         why = await unfit(self._pool, job_id, self._settings.stale_seconds)
         if why is None:
             return False
-        if job_id not in self._left:
+        if not self._left[job_id]:
             logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
-            self._left.add(job_id)
-        wait_seconds = LEFT_POLLS * self._settings.poll_seconds
+        # Rarer each time, so that however many there are they do not keep it from those that it can do.
+        wait_seconds = LEFT_POLLS * self._settings.poll_seconds * 2 ** min(self._left[job_id], 10)
+        wait_seconds = min(wait_seconds, LEFT_SECONDS)
+        self._left[job_id] += 1
         await put_off(self._pool, self._around.slips, job_id, slip, wait_seconds)
         return True
 
