@@ -51,7 +51,7 @@ def previous(tmp_path: Path) -> Path:
 async def submit_many(connection: Connection) -> list[uuid.UUID]:
     """Jobs of others, of a kind that only a later version knows."""
     new = NewJob(owner="you", kind="later", options={"steps": 3}, queue="cpu")
-    return [(await create_job(connection, ProcrastinateSlips(), new)).id for _ in range(30)]
+    return [(await create_job(connection, ProcrastinateSlips(), new)).id for _ in range(16)]
 
 
 async def cancel_many(connection: Connection, jobs: list[uuid.UUID]) -> None:
