@@ -204,8 +204,7 @@ def whole_day(root: Path, options: argparse.Namespace) -> dict[str, Any]:
                 upgraded = [upgraded[0] or time.monotonic() - began, time.monotonic() - began]
                 print(f"{time.monotonic() - began:7.1f} s  upgraded", file=sys.stderr, flush=True)
             disturb(fleet, chance, blows)
-            if ended := fleet.ended():
-                raise RuntimeError(f"{ended} ended by itself")
+            blows["started again"] += len(fleet.revive())
             time.sleep(chance.uniform(0.5, 1.5) * options.pause)
         queued_and_done = time.monotonic() - began
         for run in runs.values():

@@ -125,9 +125,12 @@ class Fleet:
             for child in psutil.Process(self._processes[name].pid).children():
                 child.send_signal(signal.SIGKILL)
 
-    def ended(self) -> list[str]:
-        """Names of those that have ended by themselves."""
-        return [name for name, process in self._processes.items() if process.poll() is not None]
+    def revive(self) -> list[str]:
+        """Start workers again that have ended by themselves, as they do without the database; their names."""
+        ended = [name for name in self.workers if self._processes[name].poll() is not None]
+        for name in ended:
+            self.start_worker(name)
+        return ended
 
     def _stop(self, name: str) -> int:
         process = self._processes[name]
@@ -144,7 +147,7 @@ class Fleet:
 
     def _environment(self, root: Path, further: Mapping[str, str]) -> dict[str, str]:
         settings = {
-            **FAST, "KIND_MODULES": KINDS, "DATA": str(self.data), "STORAGE": str(self.data / "store"),
+            **FAST, "HEARTBEAT_SECONDS": "1", "STALE_SECONDS": "12", "KIND_MODULES": KINDS, "DATA": str(self.data), "STORAGE": str(self.data / "store"),
             "FLOOR_BYTES": "0", **further,
         }  # fmt: skip
         return {
