@@ -147,7 +147,8 @@ class Fleet:
 
     def _environment(self, root: Path, further: Mapping[str, str]) -> dict[str, str]:
         settings = {
-            **FAST, "HEARTBEAT_SECONDS": "1", "STALE_SECONDS": "12", "KIND_MODULES": KINDS, "DATA": str(self.data), "STORAGE": str(self.data / "store"),
+            **FAST, "HEARTBEAT_SECONDS": "1", "STALE_SECONDS": "12", "KIND_MODULES": KINDS,
+            "DATA": str(self.data), "STORAGE": str(self.data / "store"),
             "FLOOR_BYTES": "0", **further,
         }  # fmt: skip
         return {
