@@ -243,9 +243,41 @@ def light_after_blending(scene):
     tree.links.new(convert.outputs[0], output.inputs[0])
 
 
+def path_of_views(content):
+    """The places of a run's photographs (its ``views.json``) as a camera path, without distortion."""
+    width, height = (content["views"][0][name] for name in ("width_px", "height_px"))
+    frames = []
+    for view in content["views"]:
+        camera = content["cameras"][view["camera"]]
+        single = camera["model"].startswith(("SIMPLE_", "RADIAL"))
+        fx, fy, cx, cy = [camera["params"][0], *camera["params"][:3]] if single else camera["params"][:4]
+        across, down = width / camera["width_px"], height / camera["height_px"]
+        from_world = Matrix.Translation(view["translation_cam_from_world"])
+        from_world @= Matrix(view["rotation_cam_from_world"]).to_4x4()
+        frames.append(
+            {
+                "camera_to_world": [list(row) for row in from_world.inverted()],
+                "fx": fx * across, "fy": fy * down, "cx": cx * across, "cy": cy * down,
+            }
+        )  # fmt: skip
+    return {
+        "width": width,
+        "height": height,
+        "frames": frames,
+        "names": [v["name"] for v in content["views"]],
+    }
+
+
 def add_cameras(path):
-    """One camera that takes the poses of a camera path (as ``octasplat render --path``) frame by frame."""
+    """One camera that takes the poses of a camera path (as ``octasplat render --path``) frame by frame.
+
+    The ``views.json`` of a run will do, too: its photographs' places, each a marker with its name.
+    """
     content = json.loads(path.read_text(encoding="utf-8"))
+    if "views" in content:
+        content = path_of_views(content)
+    for number, name in enumerate(content.get("names", ()), 1):
+        bpy.context.scene.timeline_markers.new(name, frame=number)
     width, height = content["width"], content["height"]
     scene, camera = bpy.context.scene, new_camera()
     scene.render.resolution_x, scene.render.resolution_y = width, height

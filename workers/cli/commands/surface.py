@@ -64,7 +64,8 @@ def _levels(_context: click.Context, _parameter: click.Parameter, value: str | N
     "--bounds",
     callback=_box,
     metavar="X0,Y0,Z0,X1,Y1,Z1",
-    help="The box to mesh.  [default: what is seen of the space that the cameras surround]",
+    help="The box to mesh; octasplat info tells where the scene lies.  "
+    "[default: what is seen of the space that the cameras surround]",
 )
 @click.option("--voxel", type=click.FloatRange(0, min_open=True), help="Side of a voxel, in scene units.")
 @click.option(
