@@ -36,7 +36,10 @@ from workers.cli.options import quiet_option
 )
 @quiet_option
 def clean(source: Path, output: Path | None, dry_run: bool, quiet: bool, **given: Any) -> None:
-    """Remove Gaussians of IN that cannot be seen, are too large, or float by themselves."""
+    """Remove Gaussians of IN that cannot be seen, are too large, or float by themselves.
+
+    octasplat info IN tells how large and how opaque they are.
+    """
     if (output is None) != dry_run:
         raise click.UsageError("Name the result with -o, or say --dry-run.")
 
@@ -60,6 +63,9 @@ def clean(source: Path, output: Path | None, dry_run: bool, quiet: bool, **given
             f"{report.kept:,} kept."
         )
         if not keep.any():
-            raise ConfigError(f"{source}: nothing of it would be left; ask for less.")
+            raise ConfigError(
+                f"{source}: nothing of it would be left; ask for less (octasplat info tells its sizes and "
+                "opacities)."
+            )
         for target in targets:
             write_scene(gaussians.select(keep), target, say)
