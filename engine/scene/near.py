@@ -16,24 +16,28 @@ from engine.scene.model import PosedView, SparsePoints, Viewpoints
 
 LEAST_POINTS = 50
 """Views that show fewer points say nothing about what is near."""
-PERCENTILE = 2.0
-"""Of the depths of a view's points: the nearest few may be wrong matches."""
-MOST_POINTS = 50_000
+NEAREST = 10
+"""Where so many points are as near, something stands there; fewer may be wrong matches."""
+MOST_POINTS = 200_000
 """Of more points, evenly spaced ones are looked at."""
 
 
 def nearest_depths(scene: Viewpoints, points: SparsePoints) -> Float64[np.ndarray, " v"]:
     """The depth at which what each view shows begins, world units; 0 where too few points say.
 
-    Depths are along the axis of the camera. A point counts for each view whose picture it lies in.
+    Depths are along the axis of the camera. A point counts for each view whose picture it lies in, hidden or
+    not: what hides it is nearer. A tree trunk before a house has few of all points, so that a share of them
+    would pass it over.
     """
-    xyz = points.xyz_world[:: max(1, -(-len(points) // MOST_POINTS))].astype(np.float64)
+    step = max(1, -(-len(points) // MOST_POINTS))
+    xyz = points.xyz_world[::step].astype(np.float64)
+    rank = max(1, NEAREST // step) - 1
     found = np.zeros(len(scene.views))
     for k, view in enumerate(scene.views):
         in_cam = _in_cam(xyz, view)
         depths = in_cam[_is_shown(in_cam, scene.cameras[view.camera_index]), 2]
         if len(depths) >= LEAST_POINTS:
-            found[k] = np.percentile(depths, PERCENTILE)
+            found[k] = np.partition(depths, rank)[rank]
     return found
 
 

@@ -23,7 +23,7 @@ VIEWS_AT_ONCE = 64
 LEAST_VIEWS = 6
 """Among fewer views nobody can say which of them is odd."""
 NEIGHBOURS = 8
-FAR_BELOW_DB, FAR_BELOW_SIGMAS = 3.0, 4.0
+FAR_BELOW_DB, FAR_BELOW_SIGMAS = 3.0, 5.0
 """A view that is so much worse than those around it, also in robust standard deviations, is misplaced."""
 MOST_LEFT_OUT = 0.25
 """No larger share of the training views is left out."""

@@ -14,7 +14,7 @@ from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 SPOILED = ["view_005.png", "view_018.png"]
 SETTINGS = (
-    "iterations=200", "rays=2048", "max_gaussians=1000", "checkpoint_every=50", "probe_rays=512",
+    "iterations=300", "rays=2048", "max_gaussians=1000", "checkpoint_every=50", "probe_rays=512",
 )  # fmt: skip
 
 
@@ -64,7 +64,7 @@ def test_exactly_those_of_wrong_poses_are_named_and_left_out(scene: Path, tmp_pa
     told = run(scene, tmp_path / "without", "leave_out_misfits=true")
     without, better = measured(tmp_path / "without")
     assert without["left_out"] == SPOILED and len(without["views"]) == 26
-    left = [text for text in told if text.startswith("From iteration 1")]
+    left = [text for text in told if text.startswith("From iteration ")]
     assert left and all(any(name in text for text in left) for name in SPOILED)
     assert not any("do not fit the others;" in text for text in told)  # they are not trained on any more
     assert better > psnr

@@ -40,7 +40,7 @@ def seen_from(*positions: tuple[float, float, float]) -> Viewpoints:
 def test_depths_begin_where_the_sparse_points_do() -> None:
     rng = np.random.default_rng(0)
     wall = np.concatenate([rng.uniform(-3, 3, (2000, 2)), np.full((2000, 1), 4.0)], axis=1)
-    strays = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, -1.0]])
+    strays = np.array([[0.0, 0.0, 0.2]] * 5 + [[0.0, 0.0, -1.0]])
     scene = seen_from((0, 0, 0), (0, 0, 1), (90, 0, 0), (0, 0, 2))
     found = nearest_depths(scene, cloud(np.concatenate([wall, strays])))
     assert found == pytest.approx([4.0, 3.0, 0.0, 2.0], abs=1e-6)
