@@ -37,8 +37,12 @@ DEFINITIONS: dict[str, str] = {
     "ssim_valid": "the same formula over the windows that lie wholly inside the image",
     "ms_ssim": "multi-scale SSIM, five scales; null where the smaller side is 160 pixels or less",
     "flip": "mean LDR-FLIP at 67 pixels per degree; 0 is best",
+    "depth_spread": "share of the covered pixels whose mean and median depth differ by more than a tenth: "
+    "haze, clouds and strokes before or behind the surfaces; 0 is best",
     "images": "renders and references are rounded to 8 bits first; pixels that a mask rules out do not count "
     "in PSNR and are replaced by the reference's in the other metrics",
+    "training_views": "PSNR of the views that were trained on, on a fixed grid of 576 pixels of each, "
+    "rendered as held-out ones are; misfits are views far worse than those around them",
     "mean": "the mean of the per-view values, not of pooled errors",
     "mean_psnr_ci95": "95 % bootstrap interval of the mean PSNR over the views",
 }

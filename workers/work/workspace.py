@@ -33,7 +33,7 @@ _LOCK = ".lock"
 _CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
 _ALWAYS_KEPT = (
     "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
-    "run/scene.ply", "run/checkpoints/best.npz",
+    "run/plan.json", "run/scene.ply", "run/checkpoints/best.npz",
 )  # fmt: skip
 _TRIES = 5
 METRICS = "metrics.json"

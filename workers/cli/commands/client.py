@@ -67,6 +67,7 @@ def connected(server: str | None) -> Iterator["Api"]:
 @click.option(
     "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
 )
+@click.option("--minutes", type=click.FloatRange(0.1), metavar="N", help="End the training within N minutes.")
 @exports_option
 @set_option
 @click.option("--label", help="What to call the job.")
@@ -272,7 +273,9 @@ def download(
 def _options(given: dict[str, Any]) -> dict[str, Any]:
     """The options of the job."""
     options: dict[str, Any] = {
-        name: given[name] for name in ("preset", "poses", "max_side") if given.get(name) is not None
+        name: given[name]
+        for name in ("preset", "poses", "max_side", "minutes")
+        if given.get(name) is not None
     }
     exports = export_names(given["exports"])
     if exports is not None:

@@ -6,7 +6,7 @@ from typing import cast
 from pydantic import BaseModel
 
 from engine.light.stage_file import named_files
-from engine.train.config import iteration_count, most_gaussians
+from engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from workers.records.sizes import Sizes
 from workers.work.kinds.demands import Demand
 from workers.work.kinds.estimates import (
@@ -158,8 +158,9 @@ def _reconstruction_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple
     train = asked.train
     pixels = training_pixels(asked, sizes)
     gaussians = most_gaussians(train, pixels)
+    iterations = MOST_PLANNED_ITERATIONS if asked.minutes else iteration_count(train, pixels)
     return (
-        Demand("train.iterations", "iterations", iteration_count(train, pixels)),
+        Demand("train.iterations", "iterations", iterations),
         Demand("train.max_gaussians", "gaussians", gaussians),
         Demand("train.rays", "rays", train.rays),
         Demand("train.probe_rays", "rays", train.probe_rays),

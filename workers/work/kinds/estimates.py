@@ -96,13 +96,16 @@ def estimate_reconstruction(
     trained_on = training_pixels(options, photographs)
     iterations = iteration_count(train, trained_on)
     gaussians = _gaussians(train, trained_on)
+    training_cpu_seconds = iterations * train.rays * _ray_cpu_seconds(train, gaussians)
+    if options.minutes is not None:
+        training_cpu_seconds = 60 * options.minutes * max(1, cores) ** _CORE_POWER
     full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
     cpu_seconds = (
         _START_CPU_SECONDS
         + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels
         + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.lift_pixels
         + _EVALUATE_CPU_SECONDS_PER_PIXEL * pixels * held_out
-        + iterations * train.rays * _ray_cpu_seconds(train, gaussians)
+        + training_cpu_seconds
     )
     training = _gaussian_bytes(train.sh_degree) * gaussians + _RAY_BYTES * max(train.rays, train.probe_rays)
     memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
