@@ -398,5 +398,6 @@ class Deferred:
             )
         if self._window > 1 and settings.smooth_normal_weight > 0:
             smooth_normal_term(sight, self._window, settings.smooth_normal_weight, by_normal)
-        if self._window > 1 and settings.smooth_weight > 0:
-            smoothness_term(sight, self._window, settings.smooth_weight, by_features, by_alpha)
+        smooth = settings.smooth_weights
+        if self._window > 1 and max(smooth) > 0:
+            smoothness_term(sight, self._window, smooth, by_features, by_alpha)

@@ -32,8 +32,8 @@ from flat_world import FlatWorld, small_config
 
 BARE = {
     "learn": True, "environment_height": 16, "ambient_rays": 4, "normal_weight": 0.0,
-    "depth_normal_weight": 0.0, "smooth_weight": 0.0, "smooth_normal_weight": 0.0, "harmonics_weight": 0.0,
-    "white_weight": 0.0, "even_weight": 0.0,
+    "depth_normal_weight": 0.0, "smooth_weight": 0.0, "smooth_gloss_weight": 0.0,
+    "smooth_normal_weight": 0.0, "harmonics_weight": 0.0, "white_weight": 0.0, "even_weight": 0.0,
 }  # fmt: skip
 
 
