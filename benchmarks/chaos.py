@@ -76,7 +76,7 @@ class Run:
     resumed: int = 0
     in_flight_before: list[int] = field(default_factory=list)
 
-    def patiently(self, ask: Any, seconds: float = 120.0) -> Any:
+    def patiently(self, ask: Any, seconds: float = 600.0) -> Any:
         """What a request brings, asked again for as long as the service is away."""
         deadline = time.monotonic() + seconds
         while True:
