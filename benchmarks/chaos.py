@@ -96,9 +96,9 @@ class Run:
         assert job["id"] not in self.accepted, "the same job was accepted twice"
         self.accepted[job["id"]] = job
 
-    def submit_chain(self, steps: int, seconds: float) -> None:
+    def submit_chain(self, steps: int, seconds: float, gate: str = "") -> None:
         """Submit a short job."""
-        options = {"seed": len(self.accepted), "steps": steps, "seconds": seconds}
+        options = {"seed": len(self.accepted), "steps": steps, "seconds": seconds, "gate": gate}
         self.submit({"kind": "chain", "dataset_id": self.dataset, "options": options})
 
     def submit_reconstruction(self) -> None:
