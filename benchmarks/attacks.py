@@ -152,7 +152,7 @@ def attack_uploads(attacker: Attacker) -> None:
     if kept:
         attacker.outcomes["archives that lie"].wrong.append(f"kept: {kept}")
     address = attacker.dataset(photographs())
-    for what, (make, _) in HORRORS.items():
+    for what, (make, *_) in HORRORS.items():
         for name in Model().files():
             attacker.http.delete(f"{address}/files/{name}")
         for name, content in make().files().items():

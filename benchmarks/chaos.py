@@ -76,7 +76,7 @@ class Run:
     resumed: int = 0
     in_flight_before: list[int] = field(default_factory=list)
 
-    def patiently(self, ask: Any, seconds: float = 120.0) -> Any:
+    def patiently(self, ask: Any, seconds: float = 600.0) -> Any:
         """What a request brings, asked again for as long as the service is away."""
         deadline = time.monotonic() + seconds
         while True:
@@ -96,9 +96,9 @@ class Run:
         assert job["id"] not in self.accepted, "the same job was accepted twice"
         self.accepted[job["id"]] = job
 
-    def submit_chain(self, steps: int, seconds: float) -> None:
+    def submit_chain(self, steps: int, seconds: float, gate: str = "") -> None:
         """Submit a short job."""
-        options = {"seed": len(self.accepted), "steps": steps, "seconds": seconds}
+        options = {"seed": len(self.accepted), "steps": steps, "seconds": seconds, "gate": gate}
         self.submit({"kind": "chain", "dataset_id": self.dataset, "options": options})
 
     def submit_reconstruction(self) -> None:

@@ -83,6 +83,7 @@ class Fleet:
             process = subprocess.Popen(
                 [sys.executable, "-m", "service"],
                 cwd=root, env=self._environment(root, {"PORT": "0"}), stdout=subprocess.PIPE, stderr=log,
+                start_new_session=True,
             )  # fmt: skip
         assert process.stdout is not None
         address = process.stdout.readline().decode().strip()
@@ -105,7 +106,9 @@ class Fleet:
         command = [sys.executable, "-m", "workers", "worker", "--queues", "cpu", "--name", name]
         environment = self._environment(root, {"WORK": str(self.data / f"work-{name}")})
         with self._log(name) as log:
-            self._processes[name] = subprocess.Popen(command, cwd=root, env=environment, stderr=log)
+            self._processes[name] = subprocess.Popen(
+                command, cwd=root, env=environment, stderr=log, start_new_session=True
+            )
 
     def drain_worker(self, name: str) -> int:
         """SIGTERM, upon which it hands back its job, and another start; returns the exit code."""

@@ -37,12 +37,12 @@ class Note:
     Attributes:
         id: of the row.
         storage: where.
-        removals: how often contents had been removed before.
+        removals: how often contents had been removed before; None if some were just then.
     """
 
     id: uuid.UUID
     storage: Storage
-    removals: int
+    removals: int | None
 
     async def confirm(self, connection: Connection, contents: Collection[str]) -> None:
         """Make sure that nothing stored meanwhile is collected before the transaction of ``connection`` ends.
@@ -71,7 +71,10 @@ class Note:
 async def storing(pool: Pool, storage: Storage) -> AsyncIterator[Note]:
     """A note for as long as the block runs, in which contents are stored and then named."""
     async with pool.connection() as connection:
-        note = Note(new_id(), storage, await _removals(connection))
+        cursor = await connection.execute("SELECT pg_try_advisory_xact_lock_shared(%s) AS quiet", [_LOCK])
+        row = await cursor.fetchone()
+        is_quiet = row is not None and row["quiet"]
+        note = Note(new_id(), storage, await _removals(connection) if is_quiet else None)
         await connection.execute("INSERT INTO storing (id) VALUES (%s)", [note.id])
     seen = asyncio.create_task(_say_so(pool, note))
     try:
