@@ -90,7 +90,7 @@ class MaterialSettings(BaseModel):
     depth_normal_weight: float = Field(0.1, ge=0)
     smooth_normal_weight: float = Field(0.1, ge=0)
     smooth_weight: float = Field(0.01, ge=0)
-    smooth_gloss_weight: float = Field(0.2, ge=0)
+    smooth_gloss_weight: float = Field(0.08, ge=0)
     white_weight: float = Field(0.01, ge=0)
     even_weight: float = Field(0.03, ge=0)
     harmonics_weight: float = Field(0.01, ge=0)
