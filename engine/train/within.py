@@ -23,7 +23,7 @@ from engine.writing import write_text
 
 WARM, TIMED = 10, 50
 """Iterations before the clock starts, as kernels compile and caches fill, and those that it counts."""
-USED_SHARE = 0.9
+USED_SHARE = 0.8
 """Of the time; the rest is for checkpoints, probes, and a machine that becomes slower."""
 COST_POWER = 0.8
 """Power of the number of Gaussians by which an iteration takes longer, see ``docs/experiments.md``."""

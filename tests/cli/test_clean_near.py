@@ -13,7 +13,7 @@ from engine.scene.views_file import read_views
 def test_a_cloud_before_a_camera_is_taken_away(run, octasplat, tmp_path):
     shutil.copytree(run.output, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
     scene, _ = read_gaussian_ply(run.output / "scene.ply")
-    zones = run_near_zones(run.output, 0.5)
+    zones = run_near_zones(run.output, 0.25)
     assert zones is not None and (zones.depths > 0).any()
     view = int(np.argmax(zones.depths))
     cloud = scene.select(np.arange(40))

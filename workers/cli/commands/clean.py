@@ -38,7 +38,7 @@ from workers.cli.options import quiet_option
     "--near",
     "near_share",
     type=click.FloatRange(0, 1, max_open=True),
-    default=0.5,
+    default=0.25,
     show_default=True,
     metavar="SHARE",
     help="Where IN is the folder of a run: remove those in a training view that are nearer than this share "
