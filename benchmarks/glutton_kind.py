@@ -23,6 +23,7 @@ class GluttonOptions(BaseModel):
 def run(task: Task) -> None:
     """Write, and tell of it, until there is no room."""
     task.listener(StageStarted("train", MOST_PIECES))
+    task.run.mkdir(parents=True, exist_ok=True)
     with (task.run / "glutton").open("wb", buffering=0) as handle:
         for number in range(MOST_PIECES):
             handle.write(os.urandom(PIECE_BYTES))
