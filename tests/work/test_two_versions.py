@@ -65,7 +65,7 @@ def starts(bench: Bench, job_id: object) -> list[int]:
 
 
 def test_what_a_worker_does_not_know_it_leaves_to_a_newer_one(bench: Bench) -> None:
-    bench.worker(name="old", STALE_SECONDS="60")
+    old = bench.worker(name="old", STALE_SECONDS="60")
     bench.up("old")
     many = bench.do(submit_many)
     later = bench.submit("later", options={"steps": 3})
@@ -81,6 +81,8 @@ def test_what_a_worker_does_not_know_it_leaves_to_a_newer_one(bench: Bench) -> N
         job = bench.job(job_id)
         assert (job.state, job.attempt, job.rescues) == ("queued", 0, 0)
         assert [event.kind for event in bench.events(job_id)] == ["state"]
+    old.terminate()
+    assert old.wait(PATIENCE_SECONDS) == 0
     bench.worker(name="new", STALE_SECONDS="60", KIND_MODULES='["later_toy"]')
     for job_id in (later, shaded):
         job = bench.over(job_id)

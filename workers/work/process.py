@@ -64,7 +64,7 @@ ABANDONED_SECONDS = 86_400.0
 ROOM_LOOK_SECONDS = 5.0
 LEFT_POLLS = 3
 """A job that is left to workers of another version is kept from all for so many looks at the queue ..."""
-LEFT_SECONDS = 60.0
+LEFT_SECONDS = 15.0
 """... and for twice as many each further time, up to this time."""
 EXIT_LOST_DATABASE = 69
 
