@@ -57,6 +57,8 @@ from workers.work.workspace import sweep_temporary, sweep_workspaces
 
 logger = logging.getLogger(__name__)
 
+RESCUE_LATE_SECONDS = 60.0
+"""Looking for lost jobs is begun again after this time, so that nothing that hangs keeps them waiting."""
 SWEEP_SECONDS = 60.0
 STORE_SWEEP_SECONDS = 3600.0
 THIN_SECONDS = 600.0
@@ -169,7 +171,7 @@ class _Worker:
             asyncio.create_task(keep_doing(chore))
             for chore in (
                 Chore(self._say_alive, settings.heartbeat_seconds, max(60.0, settings.stale_seconds)),
-                Chore(self._rescue, settings.rescue_seconds),
+                Chore(self._rescue, settings.rescue_seconds, RESCUE_LATE_SECONDS),
                 Chore(self._sweep, SWEEP_SECONDS),
                 Chore(self._sweep_store, STORE_SWEEP_SECONDS),
                 Chore(self._send_webhooks, settings.poll_seconds),
