@@ -61,7 +61,6 @@ from engine.run_folder import (
 from engine.scene import Dataset, write_held_out
 from engine.scene.colmap import has_model
 from engine.scene.load import photograph_folder
-from engine.scene.model import Viewpoints
 from engine.scene.near import NearZones, nearest_depths
 from engine.scene.views_file import ViewsRecord, read_views, write_views
 from engine.stages import StageClock, stage
@@ -181,7 +180,7 @@ def reconstruct(
                     gaussians,
                     output / SCENE,
                     near_world=dataset.near_world,
-                    pixel_rad=trained_pixel_rad(Viewpoints(dataset.views, dataset.cameras)),
+                    pixel_rad=trained_pixel_rad(dataset.viewpoints),
                 )
         unmeasured: Exception | None = None
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
@@ -291,9 +290,8 @@ def _train(
         state.seconds = clock.seconds()
     else:
         clock.add(state.seconds)
-    viewpoints = Viewpoints(dataset.views, dataset.cameras)
-    nearest_world = nearest_depths(viewpoints, dataset.points)
-    zones = NearZones.of(viewpoints, config.near_share * nearest_world, dataset.train_indices)
+    nearest_world = nearest_depths(dataset.viewpoints, dataset.points)
+    zones = NearZones.of(dataset.viewpoints, config.near_share * nearest_world, dataset.train_indices)
     trainer = Trainer(
         dataset,
         config,
@@ -331,7 +329,7 @@ def _train(
 def _scale_floor(dataset: Dataset, config: TrainConfig) -> ScaleFloor | None:
     if config.min_scale_px == 0:
         return None
-    pixel_rad = trained_pixel_rad(Viewpoints(dataset.views, dataset.cameras))
+    pixel_rad = trained_pixel_rad(dataset.viewpoints)
     origins = np.stack([dataset.views[i].origin_world for i in dataset.train_indices.tolist()])
     return ScaleFloor(origins, config.min_scale_px * pixel_rad)
 

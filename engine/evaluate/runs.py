@@ -118,7 +118,7 @@ def evaluate_scales(
     config = _finished(output)
     dataset = _photographs(output, config, scene, threads, listener)
     gaussians, _ = read_gaussian_ply(output / SCENE)
-    extent = read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
+    extent = _extent_world(output, dataset)
     shading = finished_shading(output, config.train, dataset, extent)
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians, shading.features(gaussians))
@@ -159,6 +159,11 @@ def _photographs(
     )
 
 
+def _extent_world(output: Path, dataset: Dataset) -> float:
+    """The extent that the scene was trained with, whichever photographs measure it."""
+    return read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
+
+
 def measure_run(
     dataset: Dataset,
     output: Path,
@@ -170,7 +175,7 @@ def measure_run(
     """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
     truth = _truth(dataset, tell, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
-    extent = read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
+    extent = _extent_world(output, dataset)
     environment = _environment(output, config.train)
     relighter = None
     if truth is not None and truth.relit and environment is not None and has_materials(gaussians):

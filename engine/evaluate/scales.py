@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from engine.colour import composited
-from engine.evaluate.metrics import psnr, rounded_to_8_bits
+from engine.evaluate.metrics import rounded_to_8_bits
+from engine.psnr import psnr
 from engine.rays import ImageRays
 from engine.render.oversampling import render_averaged
 from engine.scene import Dataset

@@ -12,14 +12,13 @@ from jaxtyping import Float32
 from engine.errors import DatasetError
 from engine.evaluate.metrics import (
     DEFINITIONS,
-    colour_corrected,
     filled_outside,
     flip,
     ms_ssim,
-    psnr,
     rounded_to_8_bits,
     ssim_both,
 )
+from engine.psnr import colour_corrected, psnr
 
 FOREGROUND_ALPHA = 0.5
 BOOTSTRAP_DRAWS = 2000

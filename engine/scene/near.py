@@ -18,7 +18,7 @@ LEAST_POINTS = 50
 """Views that show fewer points say nothing about what is near."""
 NEAREST = 10
 """Where so many points are as near, something stands there; fewer may be wrong matches."""
-MOST_POINTS = 200_000
+MOST_POINTS = 50_000
 """Of more points, evenly spaced ones are looked at."""
 
 

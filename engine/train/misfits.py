@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from engine.colour import composited
+from engine.psnr import colour_corrected, psnr
 from engine.scene import View
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
@@ -23,6 +24,8 @@ VIEWS_AT_ONCE = 64
 LEAST_VIEWS = 6
 """Among fewer views nobody can say which of them is odd."""
 NEIGHBOURS = 8
+MOST_DB = 100.0
+"""A view that is shown without an error counts as so many."""
 FAR_BELOW_DB, FAR_BELOW_SIGMAS = 3.0, 5.0
 """A view that is so much worse than those around it, also in robust standard deviations, is misplaced."""
 MOST_LEFT_OUT = 0.25
@@ -60,15 +63,15 @@ def view_fits(
         rgb, alpha, weight = dataset.pixels(view, y, x)
         background = still_background(config)
         developed = shading.develop(Sight(rays, tracer.trace(rays), tracer))
-        render = np.clip(developed.over(background), 0, 1).astype(np.float64)
-        target = composited(rgb, alpha, background).astype(np.float64)
-        shape = (len(some), -1, 3)
-        for shown, photograph, counts in zip(
-            render.reshape(shape), target.reshape(shape), weight.reshape(len(some), -1) > 0, strict=True
+        render = np.clip(developed.over(background), 0, 1)
+        target = composited(rgb, alpha, background)
+        shape, counts = (len(some), -1, 3), (weight > 0).astype(np.float32)
+        for shown, photograph, valid in zip(
+            render.reshape(shape), target.reshape(shape), counts.reshape(len(some), -1), strict=True
         ):
-            plain.append(_psnr(shown[counts], photograph[counts]))
-            corrected.append(_psnr(_corrected(shown[counts], photograph[counts]), photograph[counts]))
-    return ViewFits(indices, np.array(plain), np.array(corrected))
+            plain.append(psnr(shown, photograph, valid))
+            corrected.append(psnr(colour_corrected(shown, photograph, valid), photograph, valid))
+    return ViewFits(indices, *(np.minimum(values, MOST_DB) for values in (plain, corrected)))
 
 
 def misfits(
@@ -138,18 +141,6 @@ def _grid(
     columns = (across * width[:, None] / side).astype(np.int64)
     view = np.broadcast_to(indices[:, None], rows.shape)
     return view.reshape(-1), rows.reshape(-1), columns.reshape(-1)
-
-
-def _corrected(
-    render: Float64[np.ndarray, "p 3"], target: Float64[np.ndarray, "p 3"]
-) -> Float64[np.ndarray, "p 3"]:
-    """The render under the gain and offset of each channel that come closest to the target."""
-    if len(render) == 0:
-        return render
-    x, y = render - render.mean(axis=0), target - target.mean(axis=0)
-    variance = (x * x).mean(axis=0)
-    gain = np.where(variance > 0, (x * y).mean(axis=0) / np.maximum(variance, 1e-12), 0.0)
-    return np.asarray(np.clip(gain * x + target.mean(axis=0), 0, 1))
 
 
 @dataclass(frozen=True)
@@ -230,10 +221,3 @@ class ViewJudge:
             misfits=tuple(names[i] for i in [*found.tolist(), *left_out.tolist()]),
             left_out=tuple(names[i] for i in left_out.tolist()),
         )
-
-
-def _psnr(render: Float64[np.ndarray, "p 3"], target: Float64[np.ndarray, "p 3"]) -> float:
-    """dB; not-a-number without a pixel."""
-    if len(render) == 0:
-        return float("nan")
-    return float(-10 * np.log10(max(float(((render - target) ** 2).mean()), 1e-10)))

@@ -11,7 +11,7 @@ from engine.render.cameras import RenderCamera
 from engine.render.oversampling import pixel_rad, rays_across, render_averaged
 from engine.render.renderer import render_rays
 from engine.shading.plain import PLAIN
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceSettings
 
 BLACK = np.zeros(3, np.float32)

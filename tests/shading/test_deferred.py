@@ -16,7 +16,7 @@ from engine.shading.ambient import ambient_visibility, bounced_light
 from engine.shading.deferred import Deferred
 from engine.shading.material_settings import MaterialSettings
 from engine.shading.protocol import Sight
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceSettings
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint

@@ -18,14 +18,7 @@ from engine.light.companions import companions
 from engine.light.stage import Stage
 from engine.light.stage_file import named_files
 from engine.render.identity import identity_of
-from engine.render.jobs import (
-    Paint,
-    Shot,
-    camera_shots,
-    gaussian_turntable,
-    scene_paint,
-    view_shots,
-)
+from engine.render.jobs import Paint, Shot, camera_shots, gaussian_turntable, scene_paint, view_shots
 from engine.render.kept import RECORD, KeptImages
 from engine.render.names import names_by_number
 from engine.render.path_file import read_camera_path
