@@ -217,8 +217,9 @@ def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
     facts = [f"{views} held-out view{'' if views == 1 else 's'}"]
     resolution = metrics.get("resolution")
     if isinstance(resolution, Mapping):
-        shown = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in _flattened(resolution))
-        facts.append(f"resolution: {shown}")
+        known = {key: value for key, value in resolution.items() if value is not None}
+        shown = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in _flattened(known))
+        facts.append(f"resolution: {shown or 'that of the photographs'}")
     elif resolution is not None:
         facts.append(f"resolution {resolution}")
     if metrics.get("seed") is not None:
