@@ -26,6 +26,7 @@ DOING = {
     "fusing": "Fusing depth",
     "meshing": "Meshing",
     "unwrapping": "Unwrapping",
+    "settling": "Settling",
     "colouring": "Colouring",
     "fitting": "Fitting colours",
 }

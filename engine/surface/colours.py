@@ -45,9 +45,9 @@ def bake(
     mesh: TriangleMesh,
     cameras: Sequence[RenderCamera],
     tracer: Tracer,
+    look: Look,
     tolerance: float,
     progress: Progress = lambda _done, _total: None,
-    look: Look = COLOURS,
 ) -> tuple[Float32[np.ndarray, "n c"], Bool[np.ndarray, " n"]]:
     """Trace the scene along the rays from the best cameras to points on its surface.
 
@@ -60,9 +60,9 @@ def bake(
         mesh: the surface, which hides points from cameras.
         cameras: candidates.
         tracer: with the scene built.
+        look: what.
         tolerance: surface this near to a point (world units) does not hide it.
         progress: told (points done, points in all).
-        look: what; display colours unless something else is asked for.
 
     Returns:
         The means, 0.5 where no camera sees the point, and whether one does.

@@ -4,15 +4,17 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from engine.colour import to_bytes
+from engine.rays import ImageRays
 from engine.render.cameras import RenderCamera
 from engine.render.renderer import RenderedImage, render_rays
-from engine.surface.fitting import Pictures
+from engine.surface.fitting import Picture
 from engine.surface.options import SurfaceOptions
 from engine.trace.protocol import Tracer
 from engine.writing import telling_of_room
@@ -46,7 +48,7 @@ def render_depth_maps(
     options: SurfaceOptions,
     folder: Path,
     progress: Progress = lambda _done, _total: None,
-) -> tuple[DepthMaps, Pictures]:
+) -> tuple[DepthMaps, tuple[Picture, ...]]:
     """Render depth maps and colours from ``cameras`` into a file in ``folder``, 12 bytes a pixel.
 
     The file has no name, so that nothing is left of it whatever happens.
@@ -76,7 +78,13 @@ def render_depth_maps(
         colours[-1][...] = to_bytes(np.concatenate([image.rgb_srgb, image.alpha[..., None]], axis=2))
         progress(number + 1, len(cameras))
     maps = DepthMaps(tuple(cameras), tuple(distances), tuple(cosines))
-    return maps, Pictures(tuple(cameras), tuple(colours))
+    return maps, tuple(partial(_picture, *pair) for pair in zip(cameras, colours, strict=True))
+
+
+def _picture(
+    camera: RenderCamera, stored: UInt8[np.ndarray, "h w 4"]
+) -> tuple[ImageRays, UInt8[np.ndarray, "h w 4"]]:
+    return camera.rays(), np.asarray(stored)
 
 
 def _distances(image: RenderedImage, options: SurfaceOptions) -> Float32[np.ndarray, "h w"]:

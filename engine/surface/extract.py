@@ -14,19 +14,21 @@ from engine.render.cameras import RenderCamera
 from engine.stages import counted_stage, stopping
 from engine.surface.backdrop import with_backdrop
 from engine.surface.clean import decimate, keep_large_components
-from engine.surface.colours import COLOURS, bake
+from engine.surface.colours import COLOURS, Look, bake
 from engine.surface.depth import render_depth_maps
-from engine.surface.fitting import Palette, Pictures, TexturePalette, VertexPalette, fitted
+from engine.surface.fitting import Palette, Picture, TexturePalette, VertexPalette, fitted
 from engine.surface.holes import fill_holes
 from engine.surface.marching import surface_of
 from engine.surface.materials import MATERIALS, with_materials
 from engine.surface.mesh import EdgeReport, TriangleMesh, edge_report
 from engine.surface.options import SurfaceOptions
 from engine.surface.region import Region, choose_region, focus
+from engine.surface.settling import settled
 from engine.surface.texture import lay_out
 from engine.surface.volume import BYTES_PER_BLOCK, Volume, fuse, solid_where_unseen
 from engine.trace.protocol import Tracer
 
+Points = Float32[np.ndarray, "n 3"]
 TOLERANCE_VOXELS = 2.0
 """Surface this near to a point does not hide it when colours are baked."""
 
@@ -59,6 +61,7 @@ def extract_surface(
     *,
     scratch: Path,
     light_frame: Float64[np.ndarray, "3 3"] | None = None,
+    photographs: Sequence[Picture] = (),
     listener: Listener = ignore,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> ExtractedSurface:
@@ -68,7 +71,8 @@ def extract_surface(
     """
     (surface,) = extract_levels(
         tracer, cameras, options, (options.max_triangles,),
-        scratch=scratch, light_frame=light_frame, listener=listener, should_stop=should_stop,
+        scratch=scratch, light_frame=light_frame, photographs=photographs,
+        listener=listener, should_stop=should_stop,
     )  # fmt: skip
     return surface
 
@@ -81,6 +85,7 @@ def extract_levels(
     *,
     scratch: Path,
     light_frame: Float64[np.ndarray, "3 3"] | None = None,
+    photographs: Sequence[Picture] = (),
     listener: Listener = ignore,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[ExtractedSurface, ...]:
@@ -97,7 +102,9 @@ def extract_levels(
         light_frame: bake materials, which the tracer then has as its first features
             (:func:`engine.surface.materials.material_features`), for light with these rows right, up and
             forward in the world; None bakes colours. Needs a texture.
+        photographs: what colours are fitted to; without any, what the scene shows from ``cameras``.
         listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``unwrapping`` (with a texture),
+            ``settling`` (if asked),
             ``colouring`` and ``fitting`` (of colours).
         should_stop: asked now and then.
 
@@ -109,7 +116,7 @@ def extract_levels(
     if not options.unbounded and options.bounds is None:
         focus(cameras)  # complain before the long work
     with counted_stage("depth", tell, len(cameras)) as progress:
-        maps, pictures = render_depth_maps(tracer, cameras, options, scratch, progress)
+        maps, renders = render_depth_maps(tracer, cameras, options, scratch, progress)
     region = choose_region(maps, options)
     with counted_stage("fusing", tell, 2 * len(cameras)) as progress:
         volume: Volume | None = fuse(maps, region, options, progress)
@@ -139,14 +146,19 @@ def extract_levels(
         edges = edge_report(mesh.faces)
         if options.backdrop:
             mesh = with_backdrop(mesh, np.mean([camera.centre_world for camera in cameras], axis=0))
-        coloured = _coloured(tracer, pictures, options, mesh, region, light_frame, tell)
+        if options.settle:
+            with counted_stage("settling", tell, 0) as progress:
+                mesh = settled(mesh, photographs or renders, progress)
+        coloured = _coloured(tracer, cameras, renders, photographs, options, mesh, region, light_frame, tell)
         result.append(ExtractedSurface(coloured, region, volume_bytes, found, closed, edges))
     return tuple(result)
 
 
 def _coloured(
     tracer: Tracer,
-    pictures: Pictures,
+    cameras: Sequence[RenderCamera],
+    renders: Sequence[Picture],
+    photographs: Sequence[Picture],
     options: SurfaceOptions,
     mesh: TriangleMesh,
     region: Region,
@@ -155,37 +167,33 @@ def _coloured(
 ) -> TriangleMesh:
     """The mesh with colours in its vertices, or with textures."""
     tolerance = TOLERANCE_VOXELS * region.voxel_world
+
+    def look_at(points: Points, normals: Points, look: Look) -> tuple[np.ndarray, Bool[np.ndarray, " n"]]:
+        with counted_stage("colouring", tell, 0) as progress:
+            baked, seen = bake(points, normals, mesh, cameras, tracer, look, tolerance, progress)
+            return _spread(points, baked, seen), seen
+
+    def colours(palette: Palette, points: Points, normals: Points) -> Points:
+        if not (options.fit and photographs):
+            rgb, _ = look_at(points, normals, COLOURS)
+        else:  # they show all detail that there is
+            rgb = np.full((len(points), 3), 0.5, np.float32)
+        if not options.fit:
+            return rgb
+        with counted_stage("fitting", tell, 0) as progress:
+            return _spread(points, *fitted(palette, rgb, photographs or renders, progress))
+
     if options.texture_side is None:
         assert light_frame is None, "materials need a texture"
-        with counted_stage("colouring", tell, 0) as progress:
-            points, normals = mesh.vertices_world, mesh.vertex_normals()
-            rgb, seen = bake(points, normals, mesh, pictures.cameras, tracer, tolerance, progress)
-        rgb = _fitted(VertexPalette(mesh), _spread(points, rgb, seen), pictures, options, tell)
+        rgb = colours(VertexPalette(mesh), mesh.vertices_world, mesh.vertex_normals())
         return replace(mesh, rgb_srgb=rgb)
     with counted_stage("unwrapping", tell, 0):
         layout = lay_out(mesh, options.texture_side)
-    with counted_stage("colouring", tell, 0) as progress:
-        points, look = layout.points_world, COLOURS if light_frame is None else MATERIALS
-        normals = layout.normals_world
-        baked, seen = bake(points, normals, mesh, pictures.cameras, tracer, tolerance, progress, look)
-        baked = _spread(points, baked, seen)
+    points, normals = layout.points_world, layout.normals_world
     if light_frame is not None:
-        return with_materials(layout, baked, seen, light_frame)
-    rgb = _fitted(TexturePalette(layout), baked, pictures, options, tell)
+        return with_materials(layout, *look_at(points, normals, MATERIALS), light_frame)
+    rgb = colours(TexturePalette(layout), points, normals)
     return replace(layout.mesh, texture_srgb=to_bytes(layout.image(rgb)))
-
-
-def _fitted(
-    points: Palette,
-    baked: Float32[np.ndarray, "n 3"],
-    pictures: Pictures,
-    options: SurfaceOptions,
-    tell: Listener,
-) -> Float32[np.ndarray, "n 3"]:
-    if not options.fit:
-        return baked
-    with counted_stage("fitting", tell, len(pictures.cameras)) as progress:
-        return fitted(points, baked, pictures, progress)
 
 
 def _large_parts(mesh: TriangleMesh, options: SurfaceOptions) -> TriangleMesh:

@@ -4,16 +4,17 @@ What a pixel shows is a mean of the colours at a few points of the surface, its 
 texture. So all pixels of all pictures make one sparse linear system, solved by least squares.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, Int32, UInt8
-from scipy.sparse import coo_matrix, csr_matrix, diags
+from jaxtyping import Bool, Float32, Int, Int32, UInt8
+from scipy.sparse import csr_matrix, identity
 
-from engine.render.cameras import RenderCamera
+from engine.rays import ImageRays
+from engine.surface.least_squares import conjugate_gradients, differences, share_rows
 from engine.surface.mesh import TriangleMesh, directed_edges
 from engine.surface.texture import TextureLayout
 from engine.trace.meshes import TriangleScene
@@ -117,25 +118,16 @@ class TexturePalette:
         return np.maximum(number, 0), share.astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Pictures:
-    """What cameras see of a scene.
-
-    Attributes:
-        cameras: the cameras.
-        rgba: for each, display values over black and the alpha, as bytes.
-    """
-
-    cameras: tuple[RenderCamera, ...]
-    rgba: tuple[UInt8[np.ndarray, "_h _w 4"], ...]
+Picture = Callable[[], tuple[ImageRays, UInt8[np.ndarray, "_h _w 4"]]]
+"""The rays of a picture, and what they show: display values over black and the alpha, as bytes."""
 
 
 def fitted(
     points: Palette,
     start_srgb: Float32[np.ndarray, "n 3"],
-    pictures: Pictures,
+    pictures: Sequence[Picture],
     progress: Progress = lambda _done, _total: None,
-) -> Float32[np.ndarray, "n 3"]:
+) -> tuple[Float32[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Colours with which the surface looks as like the pictures as it can.
 
     Corrections of ``start_srgb`` are sought, by conjugate gradients on the normal equations with a few steps;
@@ -147,86 +139,50 @@ def fitted(
         start_srgb: display values to begin with.
         pictures: of the scene.
         progress: told (pictures done, pictures in all).
+
+    Returns:
+        The colours, and which points any pixel shows.
     """
     count = len(start_srgb)
     normal, wanted = _normal_equations(points, start_srgb, pictures, progress)
-    pairs = points.neighbours.T
-    beside = coo_matrix((np.ones(pairs.shape[1], np.float32), tuple(pairs)), (count, count)).tocsr()
-    beside = beside + beside.T
-    degree = np.asarray(beside.sum(axis=1)).reshape(-1)
-    system = (normal + SMOOTHNESS * (diags(degree) - beside) + TRUST * diags(np.ones(count))).tocsr()
-    correction = _conjugate_gradients(system.astype(np.float32), wanted)
-    return np.clip(start_srgb + correction, 0.0, 1.0).astype(np.float32)
+    smooth = SMOOTHNESS * differences(points.neighbours, count)
+    system = (normal + smooth + TRUST * identity(count, np.float32)).tocsr().astype(np.float32)
+    correction = conjugate_gradients(lambda x: system @ x, system.diagonal()[:, None], wanted, ROUNDS)
+    return np.clip(start_srgb + correction, 0.0, 1.0).astype(np.float32), normal.diagonal() > 0
 
 
 def _normal_equations(
-    points: Palette, start_srgb: Float32[np.ndarray, "n 3"], pictures: Pictures, progress: Progress
+    points: Palette, start_srgb: Float32[np.ndarray, "n 3"], pictures: Sequence[Picture], progress: Progress
 ) -> tuple[csr_matrix, Float32[np.ndarray, "n 3"]]:
     """Matrix and right side: summed squares of the shares, and what the pixels lack."""
     count = len(start_srgb)
     scene = TriangleScene(points.mesh.vertices_world, points.mesh.faces)
     normal = csr_matrix((count, count), dtype=np.float32)
     wanted = np.zeros((count, 3), np.float32)
-    waiting: list[tuple[csr_matrix, np.ndarray]] = []
-    total = len(pictures.cameras)
+    waiting: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    total = len(pictures)
     progress(0, total)
-    for done, (camera, rgba) in enumerate(zip(pictures.cameras, pictures.rgba, strict=True), 1):
-        waiting.append(_equations(scene, points, camera, np.asarray(rgba)))
-        if sum(len(values) for _, values in waiting) >= RAYS_AT_ONCE or done == total:
-            rows = _stacked([matrix for matrix, _ in waiting], count)
+    for done, picture in enumerate(pictures, 1):
+        waiting.append(_equations(scene, points, *picture()))
+        if sum(len(numbers) for numbers, _, _ in waiting) >= RAYS_AT_ONCE or done == total:
+            numbers, shares, rgb = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
+            rows = share_rows(shares, numbers, count)
             columns = rows.T.tocsr()
             normal = normal + columns @ rows
-            lacking = np.concatenate([values for _, values in waiting]) - rows @ start_srgb
-            wanted += columns @ lacking
+            wanted += columns @ (rgb - rows @ start_srgb)
             waiting.clear()
         progress(done, total)
     return normal, wanted
 
 
 def _equations(
-    scene: TriangleScene, points: Palette, camera: RenderCamera, rgba: UInt8[np.ndarray, "h w 4"]
-) -> tuple[csr_matrix, Float32[np.ndarray, "r 3"]]:
-    """The shares of the points in each pixel that shows surface and scene, and its colour."""
+    scene: TriangleScene, points: Palette, rays: ImageRays, rgba: UInt8[np.ndarray, "h w 4"]
+) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"], Float32[np.ndarray, "r 3"]]:
+    """Points and their shares in each pixel that shows surface and scene, and its colour."""
     seen = rgba.reshape(-1, 4).astype(np.float32) / 255
-    hits = scene.closest(camera.rays().rays)
+    hits = scene.closest(rays.rays)
     used = np.flatnonzero(hits.hit & (seen[:, 3] >= MIN_ALPHA))
     others = hits.barycentrics[used]
     weights = np.concatenate([1 - others.sum(axis=1, keepdims=True), others], axis=1)
     numbers, shares = points.shares(hits.faces[used], weights)
-    starts = np.arange(len(used) + 1, dtype=np.int32) * numbers.shape[1]
-    count = int(numbers.max(initial=-1)) + 1
-    matrix = csr_matrix((shares.reshape(-1), numbers.reshape(-1), starts), (len(used), count))
-    return matrix, np.clip(seen[used, :3] / seen[used, 3:], 0.0, 1.0)
-
-
-def _stacked(matrices: list[csr_matrix], columns: int) -> csr_matrix:
-    """Matrices one above the other, with so many columns."""
-    lengths = np.concatenate([np.diff(matrix.indptr) for matrix in matrices])
-    return csr_matrix(
-        (
-            np.concatenate([matrix.data for matrix in matrices]),
-            np.concatenate([matrix.indices for matrix in matrices]),
-            np.concatenate([[0], np.cumsum(lengths)]),
-        ),
-        (len(lengths), columns),
-    )
-
-
-def _conjugate_gradients(
-    system: csr_matrix, wanted: Float32[np.ndarray, "n c"]
-) -> Float64[np.ndarray, "n c"] | Float32[np.ndarray, "n c"]:
-    """An approximate solution of a positive definite system, for every column (Hestenes and Stiefel 1952)."""
-    scale = (1.0 / system.diagonal())[:, None].astype(np.float32)
-    solution, rest = np.zeros_like(wanted), wanted.copy()
-    step = scale * rest
-    before = (rest * step).sum(axis=0, dtype=np.float64)
-    for _ in range(ROUNDS):
-        moved = system @ step
-        length = before / np.maximum((step * moved).sum(axis=0, dtype=np.float64), 1e-30)
-        solution += (length * step).astype(np.float32)
-        rest -= (length * moved).astype(np.float32)
-        scaled = scale * rest
-        after = (rest * scaled).sum(axis=0, dtype=np.float64)
-        step = (scaled + after / np.maximum(before, 1e-30) * step).astype(np.float32)
-        before = after
-    return solution
+    return numbers, shares, np.clip(seen[used, :3] / seen[used, 3:], 0.0, 1.0)

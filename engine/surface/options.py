@@ -32,7 +32,8 @@ class SurfaceOptions(BaseModel):
         min_component: parts with less than this share of the largest part's area are removed.
         fill_holes: holes whose rim is shorter than this many voxels are closed; None closes all, 0 none.
         max_triangles: decimate to at most this many; None keeps all.
-        fit: correct the baked colours so that the mesh looks as like the scene from the cameras as it can.
+        settle: move vertices along their normals to where the pictures agree.
+        fit: of all colours, those with which the mesh looks as like the pictures as it can.
         texture_side: bake colours into a square texture of this side, px; None bakes them into the vertices.
         max_memory_gb: refuse a volume that takes more, GB.
     """
@@ -55,6 +56,7 @@ class SurfaceOptions(BaseModel):
     min_component: float = Field(0.01, ge=0, le=1)
     fill_holes: float | None = Field(0.0, ge=0)
     max_triangles: int | None = Field(None, ge=4)
+    settle: bool = False
     fit: bool = True
     texture_side: int | None = Field(None, ge=64, le=16384)
     max_memory_gb: float = Field(4.0, gt=0)

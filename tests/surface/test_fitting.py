@@ -1,14 +1,17 @@
 """Colours fitted to pictures, where the right ones are known; what closes a mesh beyond what was seen."""
 
+from functools import partial
+
 import numpy as np
 from surface_shapes import cameras_on_sphere, sphere, volume_of
 
 from engine.colour import to_bytes
 from engine.rays import RayBatch
 from engine.surface.backdrop import with_backdrop
-from engine.surface.fitting import Pictures, TexturePalette, VertexPalette, fitted
+from engine.surface.fitting import Picture, TexturePalette, VertexPalette, fitted
 from engine.surface.marching import surface_of
 from engine.surface.mesh import TriangleMesh, edge_report
+from engine.surface.settling import settled
 from engine.surface.texture import lay_out
 from engine.surface.volume import solid_where_unseen
 from engine.trace.meshes import TriangleScene
@@ -19,18 +22,17 @@ def painted(points_world: np.ndarray) -> np.ndarray:
     return (0.5 + 0.4 * np.sin(2 * points_world)).astype(np.float32)
 
 
-def pictures_of(mesh: TriangleMesh, count: int = 20) -> Pictures:
+def pictures_of(mesh: TriangleMesh, count: int = 20) -> list[Picture]:
     """Of the painted surface, before nothing; alpha is one where there is surface."""
-    scene, cameras, images = TriangleScene(mesh.vertices_world, mesh.faces), [], []
+    scene, pictures = TriangleScene(mesh.vertices_world, mesh.faces), []
     for camera in cameras_on_sphere(count, 3.0, 96):
         rays = camera.rays()
         hits = scene.closest(rays.rays)
         rgba = np.zeros((len(hits.hit), 4), np.float32)
         at = rays.origin_world + hits.distances[hits.hit, None] * rays.rays.directions_world[hits.hit]
         rgba[hits.hit, :3], rgba[hits.hit, 3] = painted(at), 1.0
-        cameras.append(camera)
-        images.append(to_bytes(rgba).reshape(96, 96, 4))
-    return Pictures(tuple(cameras), tuple(images))
+        pictures.append(partial(lambda *both: both, rays, to_bytes(rgba).reshape(96, 96, 4)))
+    return pictures
 
 
 def ball() -> TriangleMesh:
@@ -42,24 +44,39 @@ def test_wrong_colours_of_vertices_are_put_right():
     mesh = ball()
     wrong = np.random.default_rng(0).random((len(mesh.vertices_world), 3)).astype(np.float32)
     right = painted(mesh.vertices_world)
-    found = fitted(VertexPalette(mesh), wrong, pictures_of(mesh))
+    found, _ = fitted(VertexPalette(mesh), wrong, pictures_of(mesh))
     assert np.abs(found - right).mean() < 0.03 < 0.2 < np.abs(wrong - right).mean()
-    np.testing.assert_allclose(fitted(VertexPalette(mesh), right, pictures_of(mesh)), right, atol=0.03)
+    np.testing.assert_allclose(fitted(VertexPalette(mesh), right, pictures_of(mesh))[0], right, atol=0.03)
 
 
 def test_wrong_colours_of_a_texture_are_put_right():
     layout = lay_out(ball(), 128)
     right = painted(layout.points_world)
     wrong = np.full_like(right, 0.5)
-    found = fitted(TexturePalette(layout), wrong, pictures_of(layout.mesh))
+    found, _ = fitted(TexturePalette(layout), wrong, pictures_of(layout.mesh))
     assert np.abs(found - right).mean() < 0.03 < 0.2 < np.abs(wrong - right).mean()
 
 
 def test_what_no_picture_shows_stays_as_it_was():
     mesh = ball()
     start = np.full((len(mesh.vertices_world), 3), 0.25, np.float32)
-    none = Pictures((), ())
-    np.testing.assert_array_equal(fitted(VertexPalette(mesh), start, none), start)
+    found, seen = fitted(VertexPalette(mesh), start, [])
+    np.testing.assert_array_equal(found, start)
+    assert not seen.any()
+
+
+def test_a_surface_settles_where_its_pictures_agree():
+    mesh = ball()
+    radii = np.linalg.norm(mesh.vertices_world, axis=1, keepdims=True)
+    bumps = 1 + 0.03 * np.sin(5 * mesh.vertices_world[:, :1]) * np.cos(4 * mesh.vertices_world[:, 1:2])
+    bumpy = TriangleMesh((mesh.vertices_world / radii * bumps).astype(np.float32), mesh.faces)
+
+    def off(surface: TriangleMesh) -> float:
+        return float(np.abs(np.linalg.norm(surface.vertices_world, axis=1) - 1).mean())
+
+    better = settled(bumpy, pictures_of(mesh))
+    assert off(better) < 0.7 * off(bumpy)
+    np.testing.assert_array_equal(better.faces, bumpy.faces)
 
 
 def test_unseen_space_is_closed_where_it_is_solid():

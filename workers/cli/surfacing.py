@@ -3,25 +3,40 @@
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
+from jaxtyping import UInt8
 from pydantic import ValidationError
 
+from engine.colour import to_bytes
 from engine.config import read_config
-from engine.errors import ConfigError, OutputError
+from engine.errors import ConfigError, DatasetError, OutputError
+from engine.events import Listener
 from engine.files import check_surface_path, write_surface
 from engine.files.gaussian_ply import read_near_world
 from engine.gaussians.materials import require_materials
 from engine.gaussians.model import FlatGaussians
+from engine.rays import ImageRays
 from engine.render.cameras import RenderCamera
-from engine.run_folder import CONFIG, ENVIRONMENT, SCENE, is_run, run_viewpoints
-from engine.scene import load_scene
+from engine.run_folder import (
+    CONFIG,
+    ENVIRONMENT,
+    SCENE,
+    found_model,
+    is_run,
+    open_photographs,
+    photographs_folder,
+    run_viewpoints,
+)
+from engine.scene import Dataset, load_scene
 from engine.shading.environment_frame import environment_frame
 from engine.surface.cameras import cameras_around, photograph_cameras
 from engine.surface.extract import ExtractedSurface, extract_levels
+from engine.surface.fitting import Picture
 from engine.surface.materials import material_features
 from engine.surface.options import SurfaceOptions
 from engine.trace.make import make_tracer
@@ -38,10 +53,11 @@ ROOM: Mapping[str, object] = {
     "unbounded": True,
     "unseen": "solid",
     "backdrop": True,
-    "resolution": 900,
+    "resolution": 720,
     "truncation": 3.0,
     "min_weight": 0.3,
-    "depth_side": 480,
+    "depth_side": 320,
+    "settle": True,
 }
 """What suits pictures of a room, measured on one; see docs/surface.md."""
 
@@ -113,9 +129,11 @@ def run_surface(
     tracer = make_tracer(settings, threads=threads, build_quality=2)
     tracer.build(gaussians, features)
     with show_progress(quiet=quiet, should_stop=should_stop) as listener:
+        photographs = _photographs(source, asked.scene, threads, listener) if options.fit else ()
         surfaces = extract_levels(
             tracer, cameras, options, tuple(asked.levels.values()) or (options.max_triangles,),
-            scratch=output.parent, light_frame=frame, listener=listener, should_stop=should_stop,
+            scratch=output.parent, light_frame=frame, photographs=photographs,
+            listener=listener, should_stop=should_stop,
         )  # fmt: skip
     for surface, place in zip(surfaces, asked.outputs, strict=True):
         files = write_surface(surface.mesh, place)
@@ -183,6 +201,27 @@ def _cameras(
         near_world = read_near_world(source)
         return photograph_cameras(photographs, every, options.depth_side, near_world), TraceSettings()
     return cameras_around(gaussians, options.depth_side), TraceSettings()
+
+
+def _photographs(source: Path, scene: Path | None, threads: int, listener: Listener) -> tuple[Picture, ...]:
+    """The training photographs of a run, if they are on this machine and were all taken alike."""
+    if not (is_run(source) and (source / CONFIG).exists()):
+        return ()
+    config = read_config(source / CONFIG)
+    if config.train.exposure or config.train.materials.learn:
+        return ()
+    try:
+        folder, model = photographs_folder(source, scene), found_model(source)
+        dataset = open_photographs(folder, source, config, threads, listener, model_folder=model)
+    except (DatasetError, OutputError):
+        return ()
+    return tuple(partial(_photograph, dataset, int(index)) for index in dataset.train_indices)
+
+
+def _photograph(dataset: Dataset, index: int) -> tuple[ImageRays, UInt8[np.ndarray, "h w 4"]]:
+    rgb, alpha, weight = dataset.view_image(index)
+    solid = (alpha * weight)[..., None]
+    return dataset.view_rays(index), to_bytes(np.concatenate([rgb * solid, solid], axis=2))
 
 
 def _summary(extracted: ExtractedSurface) -> str:

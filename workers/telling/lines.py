@@ -36,8 +36,9 @@ _DONE = {
     "fusing": ("Fused the depth maps", ""),
     "meshing": ("Made the mesh", ""),
     "unwrapping": ("Cut the mesh open for the texture", ""),
+    "settling": ("Moved the vertices to where the pictures agree", ""),
     "colouring": ("Coloured", "point"),
-    "fitting": ("Fitted the colours to the renders", ""),
+    "fitting": ("Fitted the colours", ""),
 }
 
 
