@@ -31,6 +31,8 @@ HALF_TURN_ABOUT_X = [1.0, 0.0, 0.0, 0.0]
 """x, y, z, w, as glTF writes quaternions; brings COLMAP's frame (y down, z forward) to glTF's (y up)."""
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+CORES = "octasplat_cores"
+"""Says in the extras of a primitive that it shows octagons a second time."""
 MAX_DEPTH = 256
 CHANNELS = "octasplat_channels"
 DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError)
@@ -114,7 +116,7 @@ class GlbFile:
         return content
 
     def primitives(self) -> Iterator[tuple[Float64[np.ndarray, "4 4"], dict[str, Any]]]:
-        """Every primitive of the default scene with the matrix of its node."""
+        """Every primitive of the default scene with the matrix of its node, but for the cores of octagons."""
         nodes = self.document.get("nodes", [])
         scenes = self.document.get("scenes", [])
         roots = scenes[self.document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
@@ -127,7 +129,8 @@ class GlbFile:
             matrix = parent @ _node_matrix(node)
             if "mesh" in node:
                 for primitive in self.document["meshes"][node["mesh"]]["primitives"]:
-                    yield matrix, primitive
+                    if not primitive.get("extras", {}).get(CORES):
+                        yield matrix, primitive
             waiting += [(child, matrix, depth + 1) for child in reversed(node.get("children", []))]
 
 

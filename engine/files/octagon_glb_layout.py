@@ -8,6 +8,7 @@ import numpy as np
 from engine.files.gltf import (
     ARRAY_BUFFER,
     CLAMP_TO_EDGE,
+    CORES,
     ELEMENT_ARRAY_BUFFER,
     FLOAT,
     HALF_TURN_ABOUT_X,
@@ -125,9 +126,9 @@ class GlbLayout:
                 used[CORNER.semantic] = len(accessors)
                 accessors.append(accessor(2, FLOAT, size * SIDES, CORNER.type))
             accessors.append(accessor(1, UNSIGNED_INT, size * len(FAN) * 3, "SCALAR"))
-            meshes.append(
-                {"primitives": [{"attributes": used, "indices": len(accessors) - 1, "material": 0}]}
-            )
+            blended = {"attributes": used, "indices": len(accessors) - 1, "material": 0}
+            solid = {**blended, "material": 1, "extras": {CORES: True}}
+            meshes.append({"primitives": [blended] if self._options.cores is None else [solid, blended]})
         chunks = range(len(self._chunk_sizes))
         lit = self._options.light_up is not None
         turn = light_turn(environment_frame(np.array(self._options.light_up))) if lit else HALF_TURN_ABOUT_X
@@ -146,7 +147,14 @@ class GlbLayout:
             "scenes": [{"nodes": [0]}],
             "nodes": nodes,
             "meshes": meshes,
-            "materials": [_material(self._options.opaque, lit)],
+            "materials": [
+                _material(OPAQUE_CUTOFF if self._options.opaque else None, lit),
+                *(
+                    []
+                    if self._options.cores is None
+                    else [_material(self._options.cores, lit, "octagon_cores")]
+                ),
+            ],
             "textures": [{"sampler": 0, "source": number} for number in range(len(images))],
             "samplers": [
                 {"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}
@@ -158,17 +166,17 @@ class GlbLayout:
         }
 
 
-def _material(opaque: bool, lit: bool) -> dict[str, object]:
+def _material(cutoff: float | None, lit: bool, name: str = "octagons") -> dict[str, object]:
     transparency: dict[str, object] = {"alphaMode": "BLEND"}
-    if opaque:
-        transparency = {"alphaMode": "MASK", "alphaCutoff": OPAQUE_CUTOFF}
+    if cutoff is not None:
+        transparency = {"alphaMode": "MASK", "alphaCutoff": cutoff}
     shading: dict[str, object] = {"baseColorTexture": {"index": 0}}
     if lit:
         shading["metallicRoughnessTexture"] = {"index": 1, "texCoord": 1}
     else:
         shading |= {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     return {
-        "name": "octagons",
+        "name": name,
         "pbrMetallicRoughness": shading,
         **({} if lit else {"extensions": {"KHR_materials_unlit": {}}}),
         **transparency,

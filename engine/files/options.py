@@ -19,6 +19,9 @@ class ExportOptions(BaseModel):
             its Gaussians.
         chunks: GLB: most spatial chunks, a power of two or rounded down to one; viewers sort the chunks.
         opaque: GLB: cut alpha at a threshold instead of blending it, so that viewers have nothing to sort.
+        cores: GLB: first draw solid what has at least this alpha, with the same vertices, so that what lies
+            behind is hidden in any order of drawing; the blended octagons follow. Our readers pass over the
+            former. None draws no cores.
         light_up: GLB: lit by the materials of the scene, for light whose up is this in the world; None writes
             colours as they are, to be seen without light. What is lit carries no ids.
         spz_version: SPZ: 3 (gzip), which every viewer reads, or 4 (Zstandard).
@@ -33,5 +36,6 @@ class ExportOptions(BaseModel):
     ids: bool = True
     chunks: int = Field(default=64, ge=1, le=4096)
     opaque: bool = False
+    cores: float | None = Field(default=None, gt=0.0, lt=1.0)
     light_up: tuple[float, float, float] | None = None
     spz_version: Literal[3, 4] = 3

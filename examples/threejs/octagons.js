@@ -9,7 +9,7 @@ const BUCKETS = 1 << 16;
 export function mergeOctagons(gltf) {
   gltf.scene.updateMatrixWorld(true);
   const parts = [];
-  gltf.scene.traverse((node) => node.isMesh && parts.push(node));
+  gltf.scene.traverse((node) => node.isMesh && node.material.name !== "octagon_cores" && parts.push(node));
   if (!parts.length || parts.some((part) => part.geometry.attributes.position.count % SIDES)) {
     throw new Error("This GLB does not hold octagons of octasplat.");
   }

@@ -10,6 +10,8 @@ import pytest
 from engine.files import read_scene
 from engine.files.gaussian_ply import read_gaussian_ply
 from engine.files.ply_container import PlyWriteElement, write_ply
+from engine.render.draw_order import AGREEMENT, common_order
+from engine.run_folder import run_viewpoints
 
 
 def test_scene_to_glb(run, octasplat, tmp_path):
@@ -123,3 +125,25 @@ def test_the_one_colour_of_a_format_without_harmonics_is_chosen(run, octasplat, 
     for text in ("red", "1,2", "0,0,0"):
         result = octasplat("export", run.output, tmp_path / "x.splat", "--colour", text)
         assert result.exit_code == 2 and not (tmp_path / "x.splat").exists()
+
+
+def test_for_viewers_puts_a_run_in_the_order_of_its_cameras(run, octasplat, tmp_path):
+    result = octasplat("export", run.output, tmp_path / "a.glb", "--for-viewers", "--chunks", 4)
+    assert result.exit_code == 0, result.output
+    data = (tmp_path / "a.glb").read_bytes()
+    document = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+    first = document["meshes"][0]["primitives"]
+    assert [document["materials"][each["material"]]["alphaMode"] for each in first] == ["MASK", "BLEND"]
+    assert "_GID" not in first[1]["attributes"]
+    back, _ = read_scene(tmp_path / "a.glb")
+    seen = run_viewpoints(run.output)
+    centres = np.stack([seen.views[index].origin_world for index in seen.train_indices])
+    order, agreement = common_order(back.means_world, centres)
+    in_order = bool((order == np.arange(len(back))).all())
+    assert in_order == (len(document["meshes"]) == 1) == (agreement >= AGREEMENT)
+
+
+def test_for_viewers_is_for_octagon_glb(run, octasplat, tmp_path):
+    for extra in (("a.ply",), ("a.glb", "--opaque")):
+        result = octasplat("export", run.output, tmp_path / extra[0], *extra[1:], "--for-viewers")
+        assert result.exit_code == 2 and "--for-viewers" in result.output

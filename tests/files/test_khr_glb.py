@@ -9,7 +9,7 @@ import pytest
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
-from engine.files import ExportOptions, export_scene, importer_for, read_scene
+from engine.files import ExportOptions, export_scene, importer_for, read_mesh, read_scene
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians
@@ -251,6 +251,22 @@ def test_octagons_are_a_scene_with_one_colour_each(make_scene: Make, tmp_path: P
     radii = octagon_radii(kept.opacities)
     corners = octagon_corners_world(kept, radii)
     np.testing.assert_allclose(octagon_corners_world(back, radii), corners, atol=1e-4 * kept.scales.max())
+
+
+def test_cores_are_the_same_octagons_once_more_and_are_passed_over(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(60)
+    export_scene(scene, tmp_path / "plain.glb", ExportOptions(chunks=2))
+    export_scene(scene, tmp_path / "cores.glb", ExportOptions(chunks=2, cores=0.3))
+    document, _ = parts(tmp_path / "cores.glb")
+    for mesh in document["meshes"]:
+        solid, blended = mesh["primitives"]
+        assert solid["attributes"] == blended["attributes"] and solid["indices"] == blended["indices"]
+        materials = [document["materials"][each["material"]] for each in (solid, blended)]
+        assert [material["alphaMode"] for material in materials] == ["MASK", "BLEND"]
+        assert materials[0]["alphaCutoff"] == pytest.approx(0.3)
+    one, other = (read_scene(tmp_path / name)[0] for name in ("plain.glb", "cores.glb"))
+    np.testing.assert_array_equal(one.means_world, other.means_world)
+    assert len(read_mesh(tmp_path / "cores.glb")) == len(read_mesh(tmp_path / "plain.glb"))
 
 
 def test_octagons_that_were_edited_are_refused_as_a_scene(make_scene: Make, tmp_path: Path) -> None:

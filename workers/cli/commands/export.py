@@ -10,7 +10,12 @@ from workers.cli.camera_options import AXES
 from workers.cli.options import quiet_option
 
 if TYPE_CHECKING:
+    from engine.files import ExportOptions
     from engine.gaussians.model import FlatGaussians
+
+
+CORES_OF_CHUNKS, CORES_IN_ORDER = 0.3, 0.5
+"""Where ``--for-viewers`` draws solid, in chunks and in one order (docs/opening/threejs.md)."""
 
 
 class _ExportCommand(click.Command):
@@ -60,6 +65,12 @@ class _ExportCommand(click.Command):
     help="GLB: cut alpha at a threshold instead of blending, for programs that cannot sort.",
 )
 @click.option(
+    "--for-viewers",
+    is_flag=True,
+    help="GLB: for programs that sort chunks at best: solid middles beneath, and in a run whose photographs "
+    "were taken from one side, the order that is right from most of them. Carries no numbers for edits.",
+)
+@click.option(
     "--materials",
     is_flag=True,
     help="GLB: base colour, metallic and roughness instead of colours that have their light in them.",
@@ -101,6 +112,7 @@ def export(
     sh_pad: int | None,
     spz_version: str,
     opaque: bool,
+    for_viewers: bool,
     materials: bool,
     up: str | None,
     chunks: int,
@@ -128,6 +140,8 @@ def export(
         raise click.UsageError(f"--opaque is for GLB; {target} is written as {exporter.name}.")
     if materials and exporter.name != "glb":
         raise click.UsageError(f"--materials is for octagon GLB; {target} is written as {exporter.name}.")
+    if for_viewers and (exporter.name != "glb" or opaque or materials):
+        raise click.UsageError("--for-viewers is for octagon GLB, without --opaque and --materials.")
     chosen = _colour(colour, source)
     gaussians = open_scene(source, quiet=quiet)
     light = None
@@ -142,7 +156,8 @@ def export(
         opaque=opaque,
         chunks=chunks,
         texture_size=texture_size,
-        ids=not no_ids,
+        ids=not (no_ids or for_viewers),
+        cores=CORES_OF_CHUNKS if for_viewers else None,
         light_up=light,
         spz_version=4 if spz_version == "4" else 3,
     )
@@ -151,9 +166,30 @@ def export(
     with orderly_termination():
         if not (exporter.holds_harmonics or materials):
             gaussians = _one_colour(gaussians, source, chosen)
+        if for_viewers:
+            gaussians, options = _drawn_in_order(gaussians, source, options)
         files = export_scene(gaussians, target, options, exporter.name)
     for path in () if quiet else files:
         click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")
+
+
+def _drawn_in_order(
+    gaussians: "FlatGaussians", source: Path, options: "ExportOptions"
+) -> "tuple[FlatGaussians, ExportOptions]":
+    """In one chunk and in the order of most photographs' cameras, where these agree; else as it was."""
+    import numpy as np
+
+    from engine.render.draw_order import AGREEMENT, common_order
+    from engine.run_folder import CONFIG, is_run, run_viewpoints
+
+    if not (is_run(source) and (source / CONFIG).exists()):
+        return gaussians, options
+    seen = run_viewpoints(source)
+    centres = np.stack([seen.views[index].origin_world for index in seen.train_indices])
+    order, agreement = common_order(gaussians.means_world, centres)
+    if agreement < AGREEMENT:
+        return gaussians, options
+    return gaussians.select(order), options.model_copy(update={"chunks": 1, "cores": CORES_IN_ORDER})
 
 
 def _colour(text: str | None, source: Path) -> "str | tuple[float, float, float]":
