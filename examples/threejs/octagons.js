@@ -5,11 +5,14 @@ const SIDES = 8;
 const FAN = [1, 2, 3, 4, 5, 6].flatMap((corner) => [0, corner, corner + 1]);
 const BUCKETS = 1 << 16;
 
+// Solid middles, which a file made --for-viewers draws first: the same octagons once more.
+export const isCore = (node) => node.material.name === "octagon_cores";
+
 // The chunks of a loaded GLB as one mesh, for only within one mesh can the octagons of all chunks be sorted.
 export function mergeOctagons(gltf) {
   gltf.scene.updateMatrixWorld(true);
   const parts = [];
-  gltf.scene.traverse((node) => node.isMesh && node.material.name !== "octagon_cores" && parts.push(node));
+  gltf.scene.traverse((node) => node.isMesh && !isCore(node) && parts.push(node));
   if (!parts.length || parts.some((part) => part.geometry.attributes.position.count % SIDES)) {
     throw new Error("This GLB does not hold octagons of octasplat.");
   }
