@@ -131,7 +131,6 @@ def trace_reference(
     t32 = t.detach().float()
     hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0)
 
-    basis = sh_basis(d, p.sh.shape[1])
     out: list[list[Tensor]] = []
     hit_ids = []
     for ray in range(len(d)):
@@ -143,7 +142,10 @@ def trace_reference(
         al = alpha[ray, ids]
         through = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1 - al, 0)])
         weight = al * through[:-1]  # alpha_k T_k
-        colour = torch.clamp(0.5 + torch.einsum("k,nkc->nc", basis[ray], p.sh[ids]), min=0)
+        # One colour for all rays from one origin: that in the direction from there to the mean.
+        view = to_mean[ray, ids]
+        basis = sh_basis(view / view.norm(dim=-1, keepdim=True), p.sh.shape[1])
+        colour = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
         facing = -torch.sign(cosine[ray, ids].detach())
         crossing = torch.nonzero((through[:-1] > 0.5) & (through[1:] <= 0.5)).squeeze(-1)
         median = t[ray, ids[crossing[0]]] if len(crossing) else torch.zeros((), dtype=torch.float64)

@@ -86,7 +86,10 @@ class Outputs(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """Hits in order along each ray: those of ray r from ``starts[r]`` on."""
+    """Hits in order along each ray: those of ray r from ``starts[r]`` on.
+
+    ``rgb`` is for rays that go alone; packets keep a Gaussian's colour once.
+    """
 
     starts: Int64[np.ndarray, " r"]
     ids: Int32[np.ndarray, " h"]
@@ -100,13 +103,15 @@ class PacketHits(NamedTuple):
 
     ``us`` and ``vs`` are the hits in standard deviations. ``slots`` numbers the Gaussians of each packet in
     the order in which it met them: the Gaussian in slot s of the packet that begins with ray f is
-    ``slot_ids[f * max_hits + s]``, and packet p has ``slot_counts[p]`` of them.
+    ``slot_ids[first_place(f) + s]``, its colour is in ``slot_rgb``, and packet p has ``slot_counts[p]`` of
+    them.
     """
 
     us: Float32[np.ndarray, " h"]
     vs: Float32[np.ndarray, " h"]
     slots: Int32[np.ndarray, " h"]
     slot_ids: Int32[np.ndarray, " h"]
+    slot_rgb: Float32[np.ndarray, "h 3"]
     slot_counts: Int32[np.ndarray, " p"]
 
 

@@ -4,6 +4,9 @@ import numpy as np
 
 from engine.trace.kernels_native import lean
 
+SPARE = 8
+"""Places for hits beyond the most that a ray can have, as they are written eight at a time."""
+
 
 @lean(forceinline=True)
 def ray_origin(rays, r):
@@ -26,3 +29,9 @@ def ray_direction(rays, r):
 def ray_limits(rays, r):
     """Between which distances ray ``r`` sees; a single limit stands for all rays."""
     return rays.t_min[r if len(rays.t_min) > 1 else 0], rays.t_max[r if len(rays.t_max) > 1 else 0]
+
+
+@lean(forceinline=True)
+def first_place(r, limits):
+    """Where the hits of ray ``r`` may be stored from: each ray before it has room for its own."""
+    return r * (limits.max_hits + SPARE)

@@ -127,37 +127,6 @@ def broadcast(builder, scalar):
 
 
 @intrinsic
-def meet_block(typingctx, block, dx, dy, dz):
-    """Bit k: the ray meets the octagon of candidate k of a block of rows; leaves its t, u and v there.
-
-    A ray that makes a cosine below 1e-6 with the normal runs inside the plane and meets nothing.
-    """
-    signature = types.int64(types.uintp, types.float64, types.float64, types.float64)
-
-    def codegen(context, builder, sig, args):
-        rows = Lanes(builder, args[0], DOUBLE8)
-        d = [broadcast(builder, component) for component in args[1:]]
-
-        def along(row):
-            return rows[row] * d[0] + rows[row + 1] * d[1] + rows[row + 2] * d[2]
-
-        cosine = along(0)
-        one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
-        inverse = one / cosine
-        u = along(3) * inverse
-        v = along(6) * inverse
-        rows[12] = rows[9] * inverse
-        rows[13] = u
-        rows[14] = v
-        cos_22, sin_22 = 0.9238795325112867, 0.3826834323650898
-        farthest = (abs(u) * cos_22 + abs(v) * sin_22).larger(abs(u) * sin_22 + abs(v) * cos_22)
-        met = (farthest <= rows[10]) & (abs(cosine) >= 1e-6)
-        return met.mask()
-
-    return signature, codegen
-
-
-@intrinsic
 def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
     """Bit k: box k of a node reaches into the pyramid with apex o and the five inward ``planes``.
 
@@ -290,4 +259,3 @@ def _reinterpret(source, target):
 
 float32_bits = _reinterpret(types.float32, types.uint32)
 float32_from_bits = _reinterpret(types.uint32, types.float32)
-float64_from_bits = _reinterpret(types.int64, types.float64)

@@ -9,6 +9,7 @@ from engine.rays import RayBatch
 from engine.threads import use_threads
 from engine.trace.cpu.bundles import Forward, Hits, Limits, Parameters, Rays, Scene
 from engine.trace.cpu.kernels_hit import RECORD_WORDS
+from engine.trace.cpu.kernels_rays import SPARE
 from engine.trace.cpu.kernels_records import outgrown_boxes, refresh_records, write_boxes, write_records
 from engine.trace.cpu.memory import Pool, aligned_empty, empty_result, output_gradients, outputs
 from engine.trace.cpu.packets import PacketTracer, Ways, find_packets
@@ -154,7 +155,7 @@ class CpuTracer:
 
     def _room(self, rays: int) -> Hits:
         """Memory for the hits of so many recorded rays."""
-        places = rays * self._limits.max_hits
+        places = rays * (self._limits.max_hits + SPARE)
         return Hits(
             starts=np.empty(rays, np.int64),
             ids=self._pool.empty((places,), np.int32),
