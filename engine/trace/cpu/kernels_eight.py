@@ -1,7 +1,7 @@
 """Eight hits of a ray at a time, as explicit vectors: where they are, how opaque, and what light is left.
 
-Addresses point to doubles, eight to a vector, unless said otherwise; stores may write up to eight values where
-fewer count, so that arrays have room for eight more. No flag allows the compiler to change a result.
+Addresses point to doubles, eight to a vector, unless said otherwise; stores may write up to eight values
+where fewer count, so that arrays have room for eight more. No flag allows the compiler to change a result.
 """
 
 import llvmlite.ir as ir
@@ -24,12 +24,12 @@ ROWS = 12
 def meet_block(
     typingctx, block, dx, dy, dz, t_min, t_max, first, tail, keys, powers, opacities, us, vs, numbers
 ):
-    """Test the eight candidates of a block, of which ``first`` is the first; how many octagons the ray meets.
+    """Test the eight candidates of a block, from ``first`` on; how many octagons the ray meets.
 
     Of each that it meets between the two distances writes from place ``tail`` on, without gaps: a key, the
     float32 distance in the upper half and the place in the lower (uint64); the exponent -(u^2 + v^2)/2;
-    and as 32-bit words the opacity, u, v and the candidate's number. A ray that makes a cosine below 1e-6 with
-    the normal runs inside the plane and meets nothing.
+    and as 32-bit words the opacity, u, v and the number of the candidate. A ray that makes a cosine below
+    1e-6 with the normal runs inside the plane and meets nothing.
     """
     double, single, address = types.float64, types.float32, types.uintp
     signature = types.int64(
@@ -79,7 +79,7 @@ def meet_block(
 
 @intrinsic
 def write_alphas(typingctx, powers, opacities, place, alpha_max):
-    """Eight exponents from ``place`` on become alphas, rounded to float32: opacity exp(power), at most the max.
+    """Eight exponents from ``place`` on become alphas: opacity exp(power), at most the max, as float32.
 
     The exponential is right to a relative 1e-8 for |power| < 700.
     """
@@ -106,9 +106,7 @@ def weigh(typingctx, alphas, count, t, stop_below, weights, after):
     changes anything. The bits of the result: those behind which it is below ``stop_below``; and, eight bits
     higher, those behind which it is one half or less.
     """
-    signature = types.int64(
-        types.uintp, types.int64, types.float64, types.float64, types.uintp, types.uintp
-    )
+    signature = types.int64(types.uintp, types.int64, types.float64, types.float64, types.uintp, types.uintp)
 
     def codegen(context, builder, sig, args):
         alphas, count, t, stop_below, weights, after = args
@@ -161,9 +159,7 @@ def share_out(typingctx, alphas, through, values, count, behind, alpha_max, weig
     An alpha of ``alpha_max`` (float32) was clamped: its h is zero.
     """
     address, double = types.uintp, types.float64
-    signature = double(
-        address, address, address, types.int64, double, types.float32, address, address
-    )
+    signature = double(address, address, address, types.int64, double, types.float32, address, address)
 
     def codegen(context, builder, sig, args):
         alphas, through, values, count, behind, alpha_max, weights, shares = args
@@ -278,7 +274,7 @@ def _store(builder, value, address):
 
 
 def _exponential(builder, x):
-    """exp of eight doubles: 2^n times a polynomial of what is left, at most half of ln 2."""
+    """Exponentials of eight doubles: 2^n times a polynomial of what is left, at most half of ln 2."""
     shift = 6755399441055744.0  # 1.5 * 2^52: adding it rounds to a whole number, which the low bits then are
     moved = x * 1.4426950408889634 + shift
     n = moved - shift

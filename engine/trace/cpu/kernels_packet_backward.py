@@ -194,7 +194,7 @@ def replay_from_counter(rays, packets, hits, kept, counts, parameters, features,
         )
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def replay_packets(
     rays, packets, hits, kept, counts, parameters, features, limits, g, workers, counter, rows
 ):
@@ -273,7 +273,7 @@ def sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, 
         out.counts[segment] = np.int32(sums[COUNT])
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def sum_packets(rays, packets, parameters, scene, by_gaussian, rows, chunks, out):
     """:func:`sum_chunk` on all Gaussians that were hit."""
     segments = len(by_gaussian.starts) - 1

@@ -109,10 +109,10 @@ def order_ties(candidates, head, tail):
 
 
 @lean(forceinline=True)
-def meet_blocks(candidates, bit, first, last, direction, limits, tail):
-    """Test the blocks ``first`` to ``last`` that the packet's ray ``bit`` may meet; how many hits there are then.
+def meet_blocks(candidates, bit, first, direction, limits, tail):
+    """Test the ``STRIDE`` blocks from ``first`` on that the packet's ray ``bit`` may meet.
 
-    ``tail`` are known already; blocks ``first`` to ``last`` have their bits in one word.
+    Returns how many hits there are then; ``tail`` are known already. The blocks' bits lie in one word.
     """
     dx, dy, dz = direction
     t_min, t_max = limits
@@ -162,8 +162,9 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
     ``slots``, which ``kept`` lists from ``slot_base`` on.
     """
     limits, hits, out, features = forward.limits, forward.hits, forward.out, forward.scene.features
-    pending, ids, numbers, slot_of = candidates.pending, candidates.ids, candidates.numbers, candidates.slot_of
-    shown, feature_count, recording = candidates.shown, features.shape[1], forward.recording
+    pending, ids, numbers = candidates.pending, candidates.ids, candidates.numbers
+    slot_of, shown = candidates.slot_of, candidates.shown
+    feature_count, recording = features.shape[1], forward.recording
     direction, span = ray_direction(forward.rays, r), ray_limits(forward.rays, r)
     if recording:
         hits.starts[r] = place
@@ -179,7 +180,7 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
     while b0 < block_count and not stop:
         b1 = min(b0 + STRIDE, block_count)
         known = tail
-        tail = meet_blocks(candidates, bit, b0, b1, direction, span, tail)
+        tail = meet_blocks(candidates, bit, b0, direction, span, tail)
         if tail > known:
             know_alphas(candidates, known, tail, limits.alpha_max)
             sort_pending(pending, scratch.ranked, scratch.ranks, head, tail)
@@ -289,7 +290,7 @@ def trace_from_counter(forward, packets, tree, kept, counter):
             kept.slot_counts[packet] = slots
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def trace_packets(rays, scene, limits, out, hits, recording, packets, tree, kept, workers, counter):
     """:func:`trace_from_counter` on ``workers`` threads; ``counter`` holds one zero.
 
@@ -307,8 +308,7 @@ def absorb_ray(r, bit, rays, candidates, count, limits):
     block_count = (count + WIDTH - 1) // WIDTH
     left = 1.0
     for b0 in range(0, block_count, STRIDE):
-        b1 = min(b0 + STRIDE, block_count)
-        tail = meet_blocks(candidates, bit, b0, b1, direction, span, 0)
+        tail = meet_blocks(candidates, bit, b0, direction, span, 0)
         know_alphas(candidates, 0, tail, limits.alpha_max)
         for m in range(tail):
             left *= 1.0 - candidates.alphas[m]

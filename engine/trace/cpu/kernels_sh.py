@@ -51,9 +51,9 @@ def colour(sh, i, basis):
 
 @lean(forceinline=True, fastmath={"contract"})
 def write_view(basis, count, x, y, z):
-    """The first ``count`` harmonics for a mean at (x, y, z) from the origin; returns the way there, unit length.
+    """The first ``count`` harmonics for a mean at (x, y, z) from the origin.
 
-    A mean at the origin is seen from everywhere: all but the constant harmonic are zero.
+    Returns the direction there, and one over the distance. A mean at the origin has the direction zero.
     """
     length = math.sqrt(x * x + y * y + z * z)
     scale = 1.0 / length if length > 0.0 else 0.0
@@ -76,16 +76,35 @@ def slope_by_mean(sh, i, count, view, by_colour):
     """
     x, y, z, scale = view
 
-    gx, gy, gz = -SH_C1 * _by(sh, i, 3, by_colour), -SH_C1 * _by(sh, i, 1, by_colour), SH_C1 * _by(sh, i, 2, by_colour)
+    gx, gy, gz = (
+        -SH_C1 * _by(sh, i, 3, by_colour),
+        -SH_C1 * _by(sh, i, 1, by_colour),
+        SH_C1 * _by(sh, i, 2, by_colour),
+    )
     if count > 4:
-        a, b, c, d, e = SH_C2[0] * _by(sh, i, 4, by_colour), SH_C2[1] * _by(sh, i, 5, by_colour), SH_C2[2] * _by(sh, i, 6, by_colour), SH_C2[3] * _by(sh, i, 7, by_colour), SH_C2[4] * _by(sh, i, 8, by_colour)
+        a, b, c, d, e = (
+            SH_C2[0] * _by(sh, i, 4, by_colour),
+            SH_C2[1] * _by(sh, i, 5, by_colour),
+            SH_C2[2] * _by(sh, i, 6, by_colour),
+            SH_C2[3] * _by(sh, i, 7, by_colour),
+            SH_C2[4] * _by(sh, i, 8, by_colour),
+        )
         gx += a * y - 2.0 * c * x + d * z + 2.0 * e * x
         gy += a * x + b * z - 2.0 * c * y - 2.0 * e * y
         gz += b * y + 4.0 * c * z + d * x
         if count > 9:
             xx, yy, zz = x * x, y * y, z * z
-            a, b, c, d = SH_C3[0] * _by(sh, i, 9, by_colour), SH_C3[1] * _by(sh, i, 10, by_colour), SH_C3[2] * _by(sh, i, 11, by_colour), SH_C3[3] * _by(sh, i, 12, by_colour)
-            e, f, g = SH_C3[4] * _by(sh, i, 13, by_colour), SH_C3[5] * _by(sh, i, 14, by_colour), SH_C3[6] * _by(sh, i, 15, by_colour)
+            a, b, c, d = (
+                SH_C3[0] * _by(sh, i, 9, by_colour),
+                SH_C3[1] * _by(sh, i, 10, by_colour),
+                SH_C3[2] * _by(sh, i, 11, by_colour),
+                SH_C3[3] * _by(sh, i, 12, by_colour),
+            )
+            e, f, g = (
+                SH_C3[4] * _by(sh, i, 13, by_colour),
+                SH_C3[5] * _by(sh, i, 14, by_colour),
+                SH_C3[6] * _by(sh, i, 15, by_colour),
+            )
             gx += a * 6.0 * x * y + b * y * z - c * 2.0 * x * y - d * 6.0 * x * z
             gx += e * (4.0 * zz - 3.0 * xx - yy) + f * 2.0 * x * z + g * 3.0 * (xx - yy)
             gy += a * 3.0 * (xx - yy) + b * x * z + c * (4.0 * zz - xx - 3.0 * yy) - d * 6.0 * y * z

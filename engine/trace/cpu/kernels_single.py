@@ -70,9 +70,9 @@ def write_query(ray, ray_i32, context_i32, origin, direction, t_near, t_far):
 def trace_from_counter(embree, forward, which, rays_per_chunk, counter, basis):
     """Trace the rays ``which``, in ascending order, until the ``counter`` has passed the last chunk.
 
-    The hits of ray r are stored from ``first_place(r)`` on, or behind those of ray r - 1 where its chunk has it. A
-    ray's result depends on nothing but the ray, so it is the same for every number of threads. ``basis`` has
-    room for the harmonics.
+    The hits of ray r are stored from ``first_place(r)`` on, or behind those of ray r - 1 where its chunk has
+    it. A ray's result depends on nothing but the ray, so it is the same for every number of threads.
+    ``basis`` has room for the harmonics.
     """
     rays, scene, limits = forward.rays, forward.scene, forward.limits
     chunk_count = (len(which) + rays_per_chunk - 1) // rays_per_chunk
