@@ -2,15 +2,16 @@
 
     python -m benchmarks.iteration SCENE --state state.npz [--max-side 480] [--threads 1 2] [--rounds 4]
 
-Training goes on from the checkpoint ``state.npz``, which is made first where there is none; every round begins
-there anew, so that all see the same rays and Gaussians. CPU ms are those of all threads, which other programs
-on the machine hardly change; wall ms they do. Serial is what the calling thread works beyond the others'
-mean share, over all work: what would remain on any number of threads.
+Training goes on from the checkpoint ``state.npz``, which is made first where there is none; every round
+begins there anew, so that all see the same rays and Gaussians. CPU ms are those of all threads, which other
+programs on the machine hardly change; wall ms they do. Serial is what the calling thread works beyond the
+others' mean share: what would remain on any number of threads.
 """
 
 import argparse
 import copy
 import os
+import shutil
 import tempfile
 import time
 from collections import defaultdict
@@ -77,13 +78,13 @@ class TimedTracer:
 
 def made(dataset: Dataset, config: TrainConfig, path: Path, iterations: int) -> None:
     """A checkpoint of a training after so many iterations."""
-    state = fresh_state(initial_gaussians(dataset, config, threads=0), config.seed)
+    state = fresh_state(initial_gaussians(dataset, config, threads=2), config.seed)
     with tempfile.TemporaryDirectory() as folder:
         Trainer(
             dataset, config.model_copy(update={"iterations": iterations}), state,
             folder=Path(folder), fingerprint="iteration", listener=lambda _event: None,
         ).run()  # fmt: skip
-        save_checkpoint(state, Path(folder), "iteration").rename(path)
+        shutil.move(save_checkpoint(state, Path(folder), "iteration"), path)
 
 
 def spent(
