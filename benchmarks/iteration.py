@@ -5,7 +5,8 @@
 Training goes on from the checkpoint ``state.npz``, which is made first where there is none; every round
 begins there anew, so that all see the same rays and Gaussians. CPU ms are those of all threads, which other
 programs on the machine hardly change; wall ms they do. Serial is what the calling thread works beyond the
-others' mean share: what would remain on any number of threads.
+others' mean share: what would remain on any number of threads. The batch is a stage of its own here; in a
+training it is drawn beside the iteration before.
 """
 
 import argparse

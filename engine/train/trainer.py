@@ -10,7 +10,7 @@ from engine.gaussians.order import morton_order
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
-from engine.train.batches import BatchSource, TrainingData
+from engine.train.batches import BatchSource, DrawnAhead, TrainingData
 from engine.train.checkpoint import save_checkpoint
 from engine.train.config import TrainConfig, most_gaussians
 from engine.train.densify import make_densifier
@@ -98,6 +98,10 @@ class Trainer:
             TrainingFailure: parameters became not-a-number, or nothing is left to see.
             Cancelled: stopped as asked; a checkpoint is on disk.
         """
+        with DrawnAhead(self._batches) as batches:
+            return self._run(batches)
+
+    def _run(self, batches: DrawnAhead) -> FlatGaussians:
         state, schedule, machinery = self.state, self.schedule, self._machinery
         watch, began_at = Stopwatch(state.seconds), state.iteration
         stale = True  # whether the hierarchy is of other Gaussians
@@ -110,7 +114,9 @@ class Trainer:
                 self._build()
             if schedule.ends(state.iteration):
                 return self._judge.choose(state, machinery.tracer, machinery.shading)
-            batch = self._batches.draw(state.rng)
+            batch = batches.draw(state.rng)
+            if not self._draws_or_stops(state.iteration + 1):
+                batches.begin(state.rng)
             progress = schedule.progress(state.iteration)
             found = iterate(state, batch, machinery, self._config, progress=progress, extent=self._extent)
             stale = schedule.may_densify(state.iteration) and self._densify()
@@ -119,6 +125,12 @@ class Trainer:
             if self._onlooker is not None and not stale:
                 with watch.held():
                     self._onlooker(state.iteration, machinery.tracer)
+
+    def _draws_or_stops(self, done: int) -> bool:
+        """Whether, that far, anything but a batch draws from the generator or keeps its state."""
+        schedule = self.schedule
+        densifies = schedule.may_densify(done) and self._machinery.densifier.due(done)
+        return densifies or schedule.ends(done) or schedule.rebuilds(done, len(self.state.gaussians))
 
     def _build(self) -> None:
         gaussians, machinery = self.state.gaussians, self._machinery
