@@ -1,7 +1,7 @@
 """Everything is killed, frozen and starved at random while short jobs run; nothing may be lost by it.
 
     python -m benchmarks.chaos --minutes 10     # prints a report as JSON; exit code 1 if there are faults
-    python -m benchmarks.chaos --minutes 60 --seed 7 --reconstructions 6
+    python -m benchmarks.chaos --minutes 60 --seed 7 --reconstructions 6 --gluttons 12
 
 What must hold at the end, for every job that was accepted:
 
@@ -10,7 +10,9 @@ What must hold at the end, for every job that was accepted:
 * they are byte for byte those of a run that nobody disturbed;
 * no attempt began anew once there was a checkpoint.
 
-Needs root for the disk that fills up; without, that blow is left out.
+Gluttons, which write until the disk is full, have failed instead, for that reason.
+
+Needs root for the disk that fills up; without, that blow and the gluttons are left out.
 """
 
 import argparse
@@ -41,6 +43,7 @@ from workers.work.kinds.options import resolve_reconstruction
 
 IN_FLIGHT = 20
 OVER = ("succeeded", "failed", "canceled")
+GLUTTON = "glutton"
 TRAIN = {
     "iterations": 150, "rays": 256, "sh_degree": 1, "max_gaussians": 300, "initial_points": 250,
     "fit_iterations": 10, "rebuild_every": 25, "checkpoint_every": 25, "probe_rays": 256,
@@ -73,12 +76,12 @@ class Run:
     resumed: int = 0
     in_flight_before: list[int] = field(default_factory=list)
 
-    def patiently(self, ask: Any, seconds: float = 120.0) -> Any:
+    def patiently(self, ask: Any, seconds: float = 600.0) -> Any:
         """What a request brings, asked again for as long as the service is away."""
         deadline = time.monotonic() + seconds
         while True:
             try:
-                with Api(self.machine.address) as api:
+                with Api(self.machine.address, self.machine.token) as api:
                     return ask(api)
             except (Unreachable, ServiceError, httpx.HTTPError) as error:
                 refused = isinstance(error, ServiceError) and error.status not in (500, 502, 503, 504, 507)
@@ -93,14 +96,18 @@ class Run:
         assert job["id"] not in self.accepted, "the same job was accepted twice"
         self.accepted[job["id"]] = job
 
-    def submit_chain(self, steps: int, seconds: float) -> None:
+    def submit_chain(self, steps: int, seconds: float, gate: str = "") -> None:
         """Submit a short job."""
-        options = {"seed": len(self.accepted), "steps": steps, "seconds": seconds}
+        options = {"seed": len(self.accepted), "steps": steps, "seconds": seconds, "gate": gate}
         self.submit({"kind": "chain", "dataset_id": self.dataset, "options": options})
 
     def submit_reconstruction(self) -> None:
         """Submit a small one of the real kind."""
         self.submit({"dataset_id": self.dataset, "options": RECONSTRUCTION})
+
+    def submit_glutton(self) -> None:
+        """Submit a job that fills the disk."""
+        self.submit({"kind": GLUTTON, "dataset_id": self.dataset})
 
     def in_flight(self) -> int:
         """Accepted jobs that are not over."""
@@ -137,18 +144,20 @@ class Run:
         """What is wrong, in sentences."""
         found: list[str] = []
         storage = open_storage(self.machine.data / "store", floor_bytes=0)
-        with Api(self.machine.address) as api:
+        with Api(self.machine.address, self.machine.token) as api:
             listed = {job["id"]: job for job in api.pages("/v1/jobs", "jobs", limit=200)}
             if set(listed) != set(self.accepted):
                 found.append(f"{len(self.accepted)} jobs were accepted and {len(listed)} are there")
             for job_id in self.accepted:
                 job = listed.get(job_id)
-                if job is None or job["state"] != "succeeded":
+                if job is None or not _ended_well(job):
                     found.append(f"job {job_id} ended {job and (job['state'], job['error'])}")
                     continue
-                events = _timeline(api, job_id)
+                events = timeline(api, job_id)
                 self.resumed += sum(event["kind"] == "resumed" for event in events)
                 found += [f"job {job_id}: {fault}" for fault in journal_faults(events, self.retried[job_id])]
+                if job["kind"] == GLUTTON:
+                    continue
                 results: dict[str, str] = {}
                 for artifact in api.get(f"/v1/jobs/{job_id}/artifacts")["artifacts"]:
                     content = api.request("GET", f"/v1/jobs/{job_id}/artifacts/{artifact['name']}").content
@@ -168,7 +177,7 @@ class Run:
 
     def report(self) -> dict[str, Any]:
         """Numbers of the run, after :meth:`faults`."""
-        with Api(self.machine.address) as api:
+        with Api(self.machine.address, self.machine.token) as api:
             jobs = list(api.pages("/v1/jobs", "jobs", limit=200))
         return {
             "jobs": len(self.accepted),
@@ -224,7 +233,8 @@ def journal_faults(events: list[dict[str, Any]], retries: int = 0) -> list[str]:
     return found
 
 
-def _timeline(api: Api, job_id: str) -> list[dict[str, Any]]:
+def timeline(api: Api, job_id: str) -> list[dict[str, Any]]:
+    """All events of a job."""
     events: list[dict[str, Any]] = []
     after = 0
     while True:
@@ -233,6 +243,12 @@ def _timeline(api: Api, job_id: str) -> list[dict[str, Any]]:
         if not page["events"]:
             return events
         after = page["next"]
+
+
+def _ended_well(job: dict[str, Any]) -> bool:
+    if job["kind"] == GLUTTON:
+        return job["state"] == "failed" and job["error"]["type"] == "no_space"
+    return bool(job["state"] == "succeeded")
 
 
 def _is_poison(job: dict[str, Any]) -> bool:
@@ -276,6 +292,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--slots", type=int, default=4, help="jobs at once")
     parser.add_argument("--reconstructions", type=int, default=4, help="real ones among the jobs")
+    parser.add_argument("--gluttons", type=int, default=6, help="jobs that fill the disk, one after another")
     parser.add_argument("--disk-mib", type=int, default=400)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="octasplat-chaos-") as name:
@@ -307,8 +324,13 @@ def _whole(root: Path, small: bool, options: argparse.Namespace) -> tuple[dict[s
 
         busy = threading.Thread(target=keep_busy)
         busy.start()
+        gluttons = options.gluttons if small else 0
+        feasts = [began + options.minutes * 60 * number / gluttons for number in range(gluttons)]
         try:
             while time.monotonic() - began < options.minutes * 60:
+                while feasts and time.monotonic() > feasts[0]:
+                    feasts.pop(0)
+                    run.submit_glutton()
                 blow = run.chance.choice(BLOWS)
                 print(f"{time.monotonic() - began:7.1f} s  {blow.__name__}", file=sys.stderr, flush=True)
                 run.strike(blow)

@@ -24,7 +24,8 @@ FAST = {
     "POLL_SECONDS": "0.2",
     "GRACE_SECONDS": "10",
     "THREADS": "1",
-    "KIND_MODULES": '["benchmarks.chaos_kind"]',
+    "FULL_DISK_SECONDS": "0.5",
+    "KIND_MODULES": '["benchmarks.chaos_kind", "benchmarks.glutton_kind"]',
 }
 MIB = 1 << 20
 
@@ -73,11 +74,16 @@ class Machine:
         return f"http://127.0.0.1:{self.port}"
 
     @property
+    def token(self) -> str:
+        """What it made for its own user."""
+        return (self.data / "token").read_text().strip()
+
+    @property
     def log(self) -> Path:
         """What everything said; not on the small disk."""
         return self.data.with_name(f"{self.data.name}.log")
 
-    def start(self, seconds: float = 90) -> None:
+    def start(self, seconds: float = 240) -> None:
         """Start everything and wait until requests are taken."""
         given = {**FAST, "FLOOR_BYTES": str(8 * MIB if self.small else 0), **self.settings}
         environment = {
@@ -99,7 +105,7 @@ class Machine:
                 raise RuntimeError(f"octasplat serve does not start:\n{self.log.read_text()[-4000:]}")
             time.sleep(0.05)
 
-    def stop(self, seconds: float = 60) -> int:
+    def stop(self, seconds: float = 120) -> int:
         """Ask everything to end; returns the exit code."""
         assert self.process is not None
         if self.process.poll() is None:

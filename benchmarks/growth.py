@@ -21,7 +21,7 @@ from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
 from engine.rays import RayBatch
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceGradients
 from engine.train.config import McmcConfig, TrainConfig
 from engine.train.state import fresh_state

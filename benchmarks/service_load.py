@@ -23,7 +23,7 @@ import httpx
 import psutil
 
 from benchmarks.chaos import make_scene
-from workers.client.api import TOKEN, Api, find_address
+from workers.client.api import Api, find_address, find_token
 from workers.client.upload import upload_scene
 
 TERMINAL = ('"state": "canceled"', '"state": "succeeded"', '"state": "failed"')
@@ -148,7 +148,8 @@ def main() -> None:
     parser.add_argument("--listeners", type=int, default=100)
     parser.add_argument("--parallel", type=int, default=8, help="requests at once")
     options = parser.parse_args()
-    address, token = find_address(os.environ), os.environ.get(TOKEN)
+    address = find_address(os.environ)
+    token = find_token(os.environ, address)
     with tempfile.TemporaryDirectory() as folder, Api(address, token) as api:
         dataset = upload_scene(api, make_scene(Path(folder) / "scene"))["id"]
     print(json.dumps(asyncio.run(measure(address, token, dataset, options)), indent=1))

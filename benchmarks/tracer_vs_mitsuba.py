@@ -20,7 +20,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import CHI2_3_99, octagon_radii
 from engine.rays import RayBatch
 from engine.render.renderer import tile_order
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
 
 SIDE = 256

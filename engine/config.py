@@ -26,6 +26,8 @@ class ReconstructionConfig(BaseModel):
             features, matching and mapping; ``missing`` does so only where the scene holds no model.
         masks: ``ignore`` leaves masked pixels out of the loss, ``alpha`` takes the mask as the alpha.
         evaluate_background: what lies behind renders and photographs with alpha when they are compared.
+        minutes: the training is to end within so many, which decides its iterations and Gaussians by the pace
+            of the machine that begins it; None leaves them to ``train``.
         exports: files to write besides ``scene.ply``; their names say the format.
         train: the training, fully resolved.
     """
@@ -39,6 +41,7 @@ class ReconstructionConfig(BaseModel):
     poses: Literal["given", "auto", "missing"] = "given"
     masks: Literal["ignore", "alpha"] = "ignore"
     evaluate_background: Literal["black", "white"] = "black"
+    minutes: float | None = Field(None, ge=0.1, le=100_000)
     exports: tuple[str, ...] = ("mesh.ply", "mesh.obj", "mesh.glb")
     train: TrainConfig = TrainConfig()
 

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
 from engine.config import ReconstructionConfig, read_config
 from engine.errors import (
     Cancelled,
@@ -39,6 +41,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.plain_colours import PlainScene
 from engine.poses import find_poses
 from engine.render.environment_map import write_environment
+from engine.render.jobs import trained_pixel_rad
 from engine.run_folder import (
     CACHE,
     CHECKPOINTS,
@@ -46,6 +49,7 @@ from engine.run_folder import (
     ENVIRONMENT,
     EVENTS,
     HELD_OUT,
+    PLAN,
     POSES,
     SCENE,
     TRAINING,
@@ -57,6 +61,7 @@ from engine.run_folder import (
 from engine.scene import Dataset, write_held_out
 from engine.scene.colmap import has_model
 from engine.scene.load import photograph_folder
+from engine.scene.near import NearZones, nearest_depths
 from engine.scene.views_file import ViewsRecord, read_views, write_views
 from engine.stages import StageClock, stage
 from engine.threads import use_threads
@@ -65,10 +70,12 @@ from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig, iteration_count
 from engine.train.fingerprint import run_fingerprint
+from engine.train.floors import ScaleFloor
 from engine.train.initialise import initial_gaussians, with_first_materials
 from engine.train.shading import deferred_of
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
+from engine.train.within import make_plan, read_plan, write_plan
 from engine.versions import versions
 from engine.writing import write_json
 
@@ -166,9 +173,15 @@ def reconstruct(
                         output.rmdir()
             raise
         if not (output / SCENE).exists():
-            with stage("train", tell, iteration_count(config.train, dataset.train_pixel_count)) as clock:
-                gaussians = _train(dataset, output, config.train, threads, tell, should_stop, clock, watch)
-                write_gaussian_ply(gaussians, output / SCENE, near_world=dataset.near_world)
+            steps = 0 if config.minutes else iteration_count(config.train, dataset.train_pixel_count)
+            with stage("train", tell, steps) as clock:
+                gaussians = _train(dataset, output, config, threads, tell, should_stop, clock, watch)
+                write_gaussian_ply(
+                    gaussians,
+                    output / SCENE,
+                    near_world=dataset.near_world,
+                    pixel_rad=trained_pixel_rad(dataset.viewpoints),
+                )
         unmeasured: Exception | None = None
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
             try:
@@ -258,7 +271,7 @@ def _find_poses(
 def _train(
     dataset: Dataset,
     output: Path,
-    config: TrainConfig,
+    settings: ReconstructionConfig,
     threads: int,
     tell: Listener,
     should_stop: Callable[[], bool],
@@ -266,6 +279,7 @@ def _train(
     watch: Watcher | None,
 ) -> FlatGaussians:
     folder = output / CHECKPOINTS
+    config = _planned(dataset, output, settings, threads, should_stop, clock)
     fingerprint = run_fingerprint(dataset, config)
     state = _resume(folder, fingerprint, tell)
     if state is None:
@@ -276,6 +290,8 @@ def _train(
         state.seconds = clock.seconds()
     else:
         clock.add(state.seconds)
+    nearest_world = nearest_depths(dataset.viewpoints, dataset.points)
+    zones = NearZones.of(dataset.viewpoints, config.near_share * nearest_world, dataset.train_indices)
     trainer = Trainer(
         dataset,
         config,
@@ -285,6 +301,8 @@ def _train(
         listener=tell,
         threads=threads,
         should_stop=should_stop,
+        scale_floor=_scale_floor(dataset, config),
+        near_zones=zones if config.near_share > 0 else None,
         onlooker=None if watch is None else lambda iteration, tracer: watch(iteration, dataset, tracer),
     )
     gaussians = trainer.run()
@@ -297,8 +315,45 @@ def _train(
                     "environment are guesses, and relighting will show it."
                 )
             )
-    write_json(output / TRAINING, {"seconds": clock.stop(), "iterations": trainer.state.iteration})
+    record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
+    if trainer.views is not None:
+        record["training_views"] = trainer.views.as_dict()
+    if config.near_share > 0:
+        record["taken_near"] = trainer.state.taken_near
+    depths = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
+    record["nearest_world"] = {name: depth for name, depth in depths.items() if depth > 0}
+    write_json(output / TRAINING, record)
     return gaussians
+
+
+def _scale_floor(dataset: Dataset, config: TrainConfig) -> ScaleFloor | None:
+    if config.min_scale_px == 0:
+        return None
+    pixel_rad = trained_pixel_rad(dataset.viewpoints)
+    origins = np.stack([dataset.views[i].origin_world for i in dataset.train_indices.tolist()])
+    return ScaleFloor(origins, config.min_scale_px * pixel_rad)
+
+
+def _planned(
+    dataset: Dataset,
+    output: Path,
+    settings: ReconstructionConfig,
+    threads: int,
+    should_stop: Callable[[], bool],
+    clock: StageClock,
+) -> TrainConfig:
+    """The settings of the training; those that the time decides are written down the first time."""
+    config = settings.train
+    if settings.minutes is None:
+        return config
+    if not (output / PLAN).exists():
+        first = initial_gaussians(dataset, config, threads=use_threads(threads))
+        if config.materials.learn:
+            first = with_first_materials(first, config.materials)
+        left = 60 * settings.minutes - 2 * clock.seconds()  # the first Gaussians are made once more
+        plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
+        write_plan(output / PLAN, plan)
+    return read_plan(output / PLAN).applied(config)
 
 
 def _resume(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None:

@@ -4,16 +4,20 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from engine.config import ReconstructionConfig, read_config
 from engine.errors import ConfigError, DatasetError
 from engine.events import Listener, StageProgress, Warned
 from engine.scene import Dataset, load_scene
+from engine.scene.near import NearZones
 from engine.scene.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
 )  # fmt: skip
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
+PLAN = "plan.json"
 ENVIRONMENT = "environment.hdr"
 ON = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
@@ -76,6 +80,25 @@ def run_viewpoints(
         photographs_folder(output, scene), max_side=max_side, model_folder=found_model(output)
     )
     return scene_viewpoints(photographs, config.test_every, config.held_out)
+
+
+def run_near_zones(output: Path, share: float) -> NearZones | None:
+    """Where nothing of a run's scene should stand, see :mod:`engine.scene.near`.
+
+    Args:
+        output: folder of the run.
+        share: of the depth at which the sparse points of each view begin.
+
+    Returns:
+        None where the run does not know these depths, as runs of old, or keeps no cameras.
+    """
+    try:
+        known = json.loads((output / TRAINING).read_text(encoding="utf-8"))["nearest_world"]
+        scene = read_views(output / VIEWS).viewpoints(None)
+        depths = np.array([share * float(known.get(view.name, 0.0)) for view in scene.views])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
+        return None
+    return NearZones.of(scene, depths, scene.train_indices)
 
 
 def found_model(output: Path) -> Path | None:

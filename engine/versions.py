@@ -18,6 +18,11 @@ PACKAGES = (
 )
 
 
+RESULTS = 1
+"""Raised whenever the same settings give other results than before: what was begun under one number is begun
+anew under another, rather than gone on with."""
+
+
 def versions() -> dict[str, str]:
     """Version of the project and of each package that it computes with, by name."""
     return {"octasplat": engine.__version__, **{name: importlib.metadata.version(name) for name in PACKAGES}}

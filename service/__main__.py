@@ -15,6 +15,8 @@ from fastapi import FastAPI
 from engine.errors import OctasplatError
 from service.app import create_app
 from service.settings import ServiceSettings
+from workers.isolation.abilities import tell_what_lacks
+from workers.isolation.hiding import hide_memory
 from workers.logs import log_to_stderr
 from workers.parent import die_with_server
 from workers.settings import load_settings
@@ -49,8 +51,10 @@ class _Server(uvicorn.Server):
 
 def main() -> int:
     """Serve until asked to stop; the address goes to stdout once requests are taken."""
+    hide_memory()
     log_to_stderr()
-    die_with_server()
+    if not die_with_server():
+        tell_what_lacks()
     try:
         settings = load_settings(ServiceSettings)
         app = create_app(settings)

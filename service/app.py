@@ -2,6 +2,7 @@
 
 import asyncio
 import importlib
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -9,19 +10,25 @@ from fastapi import FastAPI
 
 import engine
 from engine.errors import OctasplatError
+from service.auditing import AuditTrail
+from service.forwarding import ProxyHeaders
+from service.gate import Gate
 from service.guards import BodyGuard, HostGuard, OriginGuard, SafeHeaders
+from service.guesses import Guesses
 from service.hub import EventHub
 from service.making_room import RoomMaker
 from service.problems import ProblemDocument, add_problem_handlers
-from service.routes import artifacts, datasets, estimates, jobs, journal, metrics, system, webhooks
+from service.routes import artifacts, audit, datasets, estimates, jobs, journal, metrics, system, webhooks
 from service.settings import ServiceSettings
 from service.state import Service
 from service.web import mount_pages
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.records.database import open_pool
 from workers.records.migrate import migrate
-from workers.records.tokens import add_token, any_token
+from workers.records.tokens import add_environment_token, any_token
 from workers.store.opening import open_storage
+
+logger = logging.getLogger(__name__)
 
 DESCRIPTION = """Photographs in, scenes of flat Gaussians and their octagon meshes out.
 
@@ -73,17 +80,20 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
     for module_router in (
         datasets.router, jobs.router, estimates.router,
         journal.router, artifacts.router, webhooks.router, system.router,
-        system.health_router, metrics.router,
+        system.health_router, metrics.router, audit.router,
     ):  # fmt: skip
         app.include_router(module_router)
     mount_pages(app)
     add_problem_handlers(app)
     _describe_problems(app)
+    app.add_middleware(AuditTrail)
     app.add_middleware(BodyGuard, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(OriginGuard)
     if settings.is_private:
         app.add_middleware(HostGuard, names=settings.allowed_hosts)
     app.add_middleware(SafeHeaders)
+    if settings.proxies:
+        app.add_middleware(ProxyHeaders, proxies=settings.proxies, dialect=settings.proxy_headers)
     return app
 
 
@@ -98,24 +108,37 @@ async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
     async with open_pool(conninfo, max_size=settings.pool_size, wait_seconds=10) as pool:
         async with pool.connection() as connection:
             if settings.token is not None:
-                await add_token(
-                    connection,
-                    settings.token.get_secret_value(),
-                    owner="admin",
-                    name="OCTASPLAT_TOKEN",
-                    scopes=["admin"],
-                )
+                token = await add_environment_token(connection, settings.token.get_secret_value())
+                if token.revoked_at is not None:
+                    logger.warning("the token of OCTASPLAT_TOKEN was revoked and stays so; set another one")
             settings.check_public(await any_token(connection))
         hub = EventHub(conninfo, listen=settings.listen)
         listening = asyncio.create_task(hub.run())
         room = RoomMaker(pool, storage)
         try:
-            yield Service(settings, pool, ProcrastinateSlips(), storage, hub, room)
+            guesses = Guesses(settings.wrong_token_seconds)
+            yield Service(
+                settings,
+                pool,
+                ProcrastinateSlips(),
+                storage,
+                hub,
+                room,
+                guesses,
+                settings.spool(),
+                _checks(settings),
+            )
         finally:
             await room.close()
             hub.close()
             listening.cancel()
             await asyncio.gather(listening, return_exceptions=True)
+
+
+def _checks(settings: ServiceSettings) -> Gate:
+    """Lets in those whose datasets are checked; half of the places are there for other owners."""
+    at_once, waiting = settings.max_checks, settings.max_waiting_checks
+    return Gate("datasets", at_once=at_once, waiting=waiting, of_one_owner=-(-(at_once + waiting) // 2))
 
 
 def _describe_problems(app: FastAPI) -> None:

@@ -1,28 +1,40 @@
-"""Who asks, and what they may do: bearer tokens with scopes, or nobody in particular on one's own machine."""
+"""Who asks, and what they may do: tokens with scopes, sessions begun with one, or nobody in particular.
+
+Nobody in particular is whoever sits at this machine while there never was a token; see :func:`_is_open`.
+"""
 
 import time
+import uuid
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
+from service.forwarding import passed_through_proxy
 from service.problems import Problem
 from service.state import Service, ServiceDep
-from workers.records.tokens import any_token, find_token
+from workers.records.audit import add_entry
+from workers.records.rows import Token
+from workers.records.sessions import find_session
+from workers.records.tokens import LOCAL_OWNER, any_token, find_token, get_token
 
 Scope = Literal["read", "write", "admin"]
-LOCAL_OWNER = "local"
-COOKIE = "octasplat_token"
+COOKIE = "octasplat_session"
+SECURE_COOKIE = f"__Host-{COOKIE}"
+"""Where there is TLS: browsers take it from this very host only, and send it nowhere else."""
 _IMPLIED: dict[str, frozenset[str]] = {
     "read": frozenset({"read", "write", "admin"}),
     "write": frozenset({"write", "admin"}),
     "admin": frozenset({"admin"}),
 }
 _OPEN_SECONDS = 2.0
+_GUESS_SECONDS = 5
 
 _bearer = HTTPBearer(auto_error=False, description="A token made with `octasplat token create`.")
-_cookie = APIKeyCookie(name=COOKIE, auto_error=False, description="The same token, for browsers.")
+_cookie = APIKeyCookie(
+    name=COOKIE, auto_error=False, description=f"A browser's session; with TLS it is called {SECURE_COOKIE}."
+)
 
 
 @dataclass(frozen=True)
@@ -32,10 +44,14 @@ class Principal:
     Attributes:
         owner: whose things they see and make.
         scopes: what they may do.
+        token_id: the token that was shown, or that the session was begun with.
+        session_id: the session of a browser.
     """
 
     owner: str
     scopes: frozenset[str]
+    token_id: uuid.UUID | None = None
+    session_id: uuid.UUID | None = None
 
     def may(self, scope: Scope) -> bool:
         """Whether they may do what needs ``scope``."""
@@ -55,24 +71,74 @@ async def principal(
     request: Request,
     service: ServiceDep,
     bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)],
-    cookie: Annotated[str | None, Security(_cookie)],
+    _described: Annotated[str | None, Security(_cookie)],
 ) -> Principal:
     """Who asks.
 
     Raises:
-        Problem: 401 without a valid token where one is needed.
+        Problem: 401 without a valid token or session where one is needed, 403 for what came by way of a proxy
+            where none is needed, 429 after too many wrong tokens.
     """
-    secret = bearer.credentials if bearer is not None else cookie
-    if secret is None and request.headers.get("authorization") is None and await _is_open(service):
-        return Principal(LOCAL_OWNER, frozenset({"admin"}))
-    token = None
-    if secret is not None:
-        async with service.pool.connection() as connection:
-            token = await find_token(connection, secret)
-    if token is None:
+    who = None
+    if bearer is not None:
+        token = await token_of(request, service, bearer.credentials)
+        who = None if token is None else Principal(token.owner, frozenset(token.scopes), token.id)
+    elif (secret := session_secret(request)) is not None:
+        who = await principal_of_session(service, secret)
+    elif request.headers.get("authorization") is None and await _is_open(service):
+        if passed_through_proxy(request.headers):
+            detail = (
+                "This request came by way of a proxy, and without tokens whoever comes may do everything; "
+                "make one with octasplat token create, and name the proxy in OCTASPLAT_PROXIES."
+            )
+            raise Problem(403, "open-behind-proxy", detail)
+        who = Principal(LOCAL_OWNER, frozenset({"admin"}))
+    if who is None:
         detail = "A valid token is needed: send the header Authorization: Bearer <token>."
         raise Problem(401, "unauthorized", detail, headers={"WWW-Authenticate": 'Bearer realm="octasplat"'})
-    return Principal(token.owner, frozenset(token.scopes))
+    request.state.who = who  # for the audit
+    return who
+
+
+async def token_of(request: Request, service: Service, secret: str) -> Token | None:
+    """The valid token of that secret, or after a while None.
+
+    Raises:
+        Problem: 429 while too many wrong ones of the same address wait for their answer.
+    """
+    address = address_of(request)
+    with service.guesses.attempt(address, secret) as is_looked_at:
+        if not is_looked_at:
+            detail = "Too many wrong tokens came from this address; try again in a moment."
+            raise Problem(429, "too-many-guesses", detail, retry_seconds=_GUESS_SECONDS)
+        async with service.pool.connection() as connection:
+            token = await find_token(connection, secret)
+        if token is not None:
+            service.guesses.was_right(secret)
+        elif await service.guesses.was_wrong(address):
+            async with service.pool.connection() as connection:
+                await add_entry(connection, address=address, action="wrong token", status=401)
+    return token
+
+
+def address_of(request: Request) -> str:
+    """Where a request comes from, as a trusted proxy says if there is one."""
+    return request.client.host if request.client is not None else "unknown"
+
+
+def session_secret(request: Request) -> str | None:
+    """What the cookie of a browser holds; where there is TLS, only that of this very host counts."""
+    return request.cookies.get(SECURE_COOKIE if request.url.scheme == "https" else COOKIE)
+
+
+async def principal_of_session(service: Service, secret: str) -> Principal | None:
+    """Who has the session of that secret, or None if it is over."""
+    async with service.pool.connection() as connection:
+        session = await find_session(connection, secret)
+        token = None if session is None else await get_token(connection, session.token_id)
+    if session is None or token is None:
+        return None
+    return Principal(token.owner, frozenset(token.scopes), token.id, session.id)
 
 
 class _Needs:
@@ -92,12 +158,15 @@ Admin = Annotated[Principal, Depends(_Needs("admin"))]
 
 
 async def _is_open(service: Service) -> bool:
-    """Whether whoever reaches the service may use it: only from this machine, and only without any tokens."""
-    if not service.settings.is_private:
+    """Whether whoever reaches the service may use it: from this machine, before there was any token.
+
+    Tokens that have expired or were shut out count: that the last of them has ended opens nothing.
+    """
+    if not service.settings.is_private or service.settings.proxies:
         return False
     now = time.monotonic()
     if now - service.tokens_seen > _OPEN_SECONDS:
         async with service.pool.connection() as connection:
-            service.has_tokens = await any_token(connection)
+            service.has_tokens = await any_token(connection, valid=False)
         service.tokens_seen = now
     return not service.has_tokens

@@ -12,7 +12,7 @@ from service.intake.receive import format_digest
 from service.problems import Problem
 from service.state import Service
 
-_RANGE = re.compile(r"bytes=(\d*)-(\d*)")
+_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 _INLINE = ("image/png", "image/jpeg", "application/json", "text/plain", "model/gltf-binary")
 _SANDBOX = "sandbox; default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'none'"
 

@@ -7,7 +7,9 @@ import uuid
 from collections.abc import Iterator
 
 import psycopg
+from psycopg.conninfo import make_conninfo
 
+from workers.records.database import KEEPALIVES
 from workers.records.journal import CHANNEL
 
 logger = logging.getLogger(__name__)
@@ -63,12 +65,14 @@ class EventHub:
                 await self._listen_once()
             except (psycopg.Error, OSError) as error:
                 logger.info("not hearing of events for a moment: %s", error)
+            except Exception:
+                logger.exception("listening to events failed and is begun again")
             self._wake_all()
             await asyncio.sleep(_RECONNECT_SECONDS)
 
     async def _listen_once(self) -> None:
         connection = await psycopg.AsyncConnection.connect(
-            self._conninfo, autocommit=True, connect_timeout=10
+            make_conninfo(self._conninfo, **KEEPALIVES), autocommit=True, connect_timeout=10
         )
         async with connection:
             await connection.execute(f"LISTEN {CHANNEL}")

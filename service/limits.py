@@ -25,6 +25,9 @@ def check_ceilings(
     Raises:
         Problem: 422, with each such option and its ceiling.
     """
+    found = excesses(kind.demands(options, sizes), settings.ceilings)
+    # What it takes on disk follows from the others, so that it is told only if none of them is too much.
+    found = [excess for excess in found if excess.demand.of != "workspace_bytes"] or found
     faults = [
         {
             "pointer": f"#/options/{excess.demand.path.replace('.', '/')}",
@@ -32,7 +35,7 @@ def check_ceilings(
             "ceiling": excess.ceiling,
             "setting": f"{PREFIX}MAX_{excess.demand.of.upper()}",
         }
-        for excess in excesses(kind.demands(options, sizes), settings.ceilings)
+        for excess in found
     ]
     if faults:
         raise Problem(422, "ceiling", str(faults[0]["detail"]), errors=faults)
@@ -63,7 +66,7 @@ def ceilings_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]
     numbers = [
         demand
         for demand in kind.demands(options, ())
-        if demand.of not in ("exports", "render_pixels", "render_paths")
+        if demand.of not in ("exports", "render_pixels", "render_paths", "workspace_bytes")
     ]
     return {
         demand.path: settings.ceilings[demand.of] for demand in numbers if demand.path != "train.patch_side"
@@ -96,6 +99,13 @@ def limit_notes(
         notes.append(
             f"It may need {known.memory_bytes / 1e9:.1f} GB of memory, and its workers allow "
             f"{max(allowed) / 1e9:.1f} GB; ask for fewer Gaussians, rays or pixels."
+        )
+    disks = [row.facts.get("disk_bytes") for row in workers]
+    rooms = [int(room) for room in disks if isinstance(room, int)]
+    if rooms and len(rooms) == len(disks) and known.disk_bytes > max(rooms):
+        notes.append(
+            f"It needs at least {known.disk_bytes / 1e9:.1f} GB of disk, and no worker has more than "
+            f"{max(rooms) / 1e9:.1f} GB."
         )
     hours = settings.max_job_hours
     if hours and known.seconds > 3600 * hours:

@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 import psycopg
 from psycopg_pool import PoolTimeout
 
+from service.threads import Threads, in_thread
 from workers.queue.storing import Note, storing
 from workers.records.database import Pool
 from workers.store.errors import StorageError, StorageFull
@@ -45,13 +46,13 @@ class RoomMaker:
             StorageFull: it does not fit even without all that nobody names.
         """
         try:
-            await asyncio.to_thread(self._storage.ensure_room, size_bytes or 0)
+            await in_thread(Threads.UPLOADS, self._storage.ensure_room, size_bytes or 0)
         except StorageFull:
             self._short = True
             await self._make()
-            await asyncio.to_thread(self._storage.ensure_room, size_bytes or 0)
+            await in_thread(Threads.UPLOADS, self._storage.ensure_room, size_bytes or 0)
         try:
-            async with storing(self._pool) as note:
+            async with storing(self._pool, self._storage) as note:
                 yield note
         except StorageFull:  # only now, as nothing goes while it is being stored; the next try may fit
             self._short = True
@@ -72,12 +73,12 @@ class RoomMaker:
 
     async def _make_if_short(self) -> None:
         try:
-            free = await asyncio.to_thread(self._storage.free_bytes)
+            free = await in_thread(Threads.LOOKS, self._storage.free_bytes)
         except StorageError:
             return
         if self._short or (free is not None and free < SHORT_BYTES):
             await self._make()
-            free = await asyncio.to_thread(self._storage.free_bytes)
+            free = await in_thread(Threads.LOOKS, self._storage.free_bytes)
             self._short = self._short and (free is None or free < SHORT_BYTES)
 
     async def _make(self) -> None:

@@ -45,6 +45,16 @@ def read_id_cursor(cursor: str | None) -> uuid.UUID | None:
         raise Problem(422, "cursor", "The cursor is none that this service gave out.") from None
 
 
+def read_number_cursor(cursor: str | None) -> int | None:
+    """As :func:`read_cursor`, for a list that is ordered by a number that counts up."""
+    place = read_cursor(cursor)
+    if place is None:
+        return None
+    if not (place.isascii() and place.isdigit() and len(place) < 19):
+        raise Problem(422, "cursor", "The cursor is none that this service gave out.")
+    return int(place)
+
+
 def next_cursor(request: Request, response: Response, following: str | None) -> str | None:
     """The cursor of the next part, which the header ``Link`` names as well; None at the end."""
     if following is None:

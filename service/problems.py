@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from engine.errors import OctasplatError
 from engine.light.stage_file import stage_complaint, stage_keys
 from service.intake.faults import IntakeRefused
-from workers.records.errors import Conflict
+from workers.records.errors import Conflict, Missing
 from workers.records.quotas import QuotaExceeded
 from workers.store.errors import (
     BlobMissing,
@@ -125,6 +125,7 @@ def add_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(psycopg.DataError, _on_data_error)
+    app.add_exception_handler(psycopg.IntegrityError, _on_integrity_error)
     for kind in (psycopg.OperationalError, PoolTimeout):
         app.add_exception_handler(kind, _on_database_error)
     app.add_exception_handler(Exception, _on_exception)
@@ -140,6 +141,8 @@ def problem_of(error: OctasplatError) -> Problem:
         # Bytes come back by deleting only, the others also by waiting.
         status = 413 if error.of == "bytes" else 429
         return Problem(status, f"quota-{error.of}", detail, retry_seconds=again if status == 429 else None)
+    if isinstance(error, Missing):
+        return not_found(error.what)
     if isinstance(error, Conflict):
         return Problem(409, "conflict", detail)
     if isinstance(error, StorageFull):
@@ -199,6 +202,13 @@ async def _on_data_error(_request: Request, error: Exception) -> JSONResponse:
     logger.warning("the database took a value for impossible: %s", " ".join(str(error).split()))
     detail = "The request holds a value that cannot be stored, such as a NUL character or too large a number."
     return Problem(422, "request", detail).response()
+
+
+async def _on_integrity_error(_request: Request, error: Exception) -> JSONResponse:
+    """Two requests at once, of which the other came first."""
+    logger.info("the database refused what contradicts it: %s", " ".join(str(error).split()))
+    detail = "Something that this builds on was changed or deleted at the same time; look again."
+    return Problem(409, "conflict", detail).response()
 
 
 async def _on_exception(request: Request, error: Exception) -> JSONResponse:

@@ -53,7 +53,13 @@ def check_writable(kind: JobKind, options: BaseModel, queue: str, workers: Seque
 def waiting_notes(kind: JobKind, options: BaseModel, queue: str, workers: Sequence[WorkerRow]) -> list[str]:
     """What the owner of a job that waits should know, in sentences."""
     if workers:
-        return []
+        takers = [row for row in workers if kind.name in row.facts.get("kinds", (kind.name,))]
+        if takers:
+            return []
+        return [
+            f"No worker of the queue {queue} knows jobs of the kind {kind.name}; the job waits for one of a "
+            "newer version."
+        ]
     notes = [f"No worker takes jobs from the queue {queue} now; the job waits for one."]
     needy = [name for name in kind.writes(options) if "needs" in exporter_for(Path(name)).description]
     if needy:

@@ -2,10 +2,14 @@
 
 import ipaddress
 
-from pydantic import Field, SecretStr
+from pydantic import Field, IPvAnyNetwork, SecretStr
 
 from engine.errors import ConfigError
+from service.forwarding import Dialect
+from service.intake.dataset import DatasetLimits
+from service.intake.model_check import ModelLimits
 from service.intake.receive import UploadLimits
+from service.intake.spool import Spool
 from workers.records.quotas import Quota
 from workers.settings import PREFIX, WorkerSettings
 from workers.work.kinds.demands import CEILINGS
@@ -19,12 +23,23 @@ class ServiceSettings(WorkerSettings):
     Attributes:
         host: address to listen at.
         port: port to listen at; 0 takes a free one.
-        token: a token that lets its owner do everything; any other is made with ``octasplat token``.
+        token: a token that lets its owner do everything; any other is made with ``octasplat token``. Another
+            one here shuts out the one that was here before.
+        token_hours: for how long a new token is valid unless its maker says otherwise; 0 is for ever.
+        session_hours: for how long a browser stays signed in.
+        wrong_token_seconds: how long the first wrong token of an address waits for its answer; each further
+            one half as long again.
+        proxies: addresses or networks of proxies whose word is taken for where a request comes from and
+            whether it came by TLS, e.g. ``["10.0.0.1", "fd00::/8"]``.
+        proxy_headers: how they say so: ``x-forwarded`` (``X-Forwarded-For``, ``-Proto`` and ``-Host``) or
+            ``forwarded`` (RFC 7239). The proxy must set or remove what clients send of them.
         allowed_hosts: further names under which the service is reached while it listens at this machine only.
         max_upload_bytes: length of one uploaded file.
         max_archive_bytes: length of an uploaded archive.
+        max_spool_bytes: of all archives that are being read, on this machine's disk.
+        max_checks: datasets that are checked at once.
+        max_waiting_checks: requests that wait for their dataset to be checked; further ones are refused.
         max_body_bytes: length of any other request.
-        quota_bytes: contents that an owner may store, unless ``octasplat quota`` says otherwise.
         quota_datasets: datasets that an owner may have.
         quota_jobs: jobs of an owner that may be queued or running.
         max_iterations: ceiling of the iterations of a training.
@@ -37,17 +52,23 @@ class ServiceSettings(WorkerSettings):
         max_priority: highest priority that whoever is no administrator may give.
         ping_seconds: how often a quiet stream of events gives a sign of life.
         max_streams: streams of events at once.
-        pool_size: connections to the database.
     """
 
     host: str = "127.0.0.1"
     port: int = Field(DEFAULT_PORT, ge=0, le=65535)
     token: SecretStr | None = None
+    token_hours: float = Field(0.0, ge=0)
+    session_hours: float = Field(168.0, gt=0)
+    wrong_token_seconds: float = Field(0.25, ge=0)
+    proxies: tuple[IPvAnyNetwork, ...] = ()
+    proxy_headers: Dialect = "x-forwarded"
     allowed_hosts: tuple[str, ...] = ()
     max_upload_bytes: int = Field(4 << 30, gt=0)
     max_archive_bytes: int = Field(64 << 30, gt=0)
+    max_spool_bytes: int = Field(64 << 30, gt=0)
+    max_checks: int = Field(2, gt=0)
+    max_waiting_checks: int = Field(24, ge=0)
     max_body_bytes: int = Field(1 << 20, gt=0)
-    quota_bytes: int | None = Field(None, ge=0)
     quota_datasets: int | None = Field(None, ge=0)
     quota_jobs: int | None = Field(None, ge=0)
     max_iterations: int = Field(100_000, ge=1)
@@ -60,7 +81,6 @@ class ServiceSettings(WorkerSettings):
     max_priority: int = Field(10, ge=-100, le=100)
     ping_seconds: float = Field(15.0, gt=0)
     max_streams: int = Field(500, gt=0)
-    pool_size: int = Field(12, gt=1)
 
     @property
     def is_private(self) -> bool:
@@ -80,19 +100,36 @@ class ServiceSettings(WorkerSettings):
     @property
     def ceilings(self) -> dict[str, int]:
         """By the names of :data:`workers.work.kinds.demands.CEILINGS`."""
-        return {name: getattr(self, f"max_{name}") for name in CEILINGS}
+        found = {name: getattr(self, f"max_{name}") for name in CEILINGS}
+        return found if self.max_workspace_bytes else {**found, "workspace_bytes": 1 << 62}
 
     def upload_limits(self) -> UploadLimits:
         """What the intake takes."""
         return UploadLimits(max_file_bytes=self.max_upload_bytes, max_archive_bytes=self.max_archive_bytes)
 
+    def dataset_limits(self) -> DatasetLimits:
+        """What the check of a dataset may take, and see."""
+        return DatasetLimits(model=ModelLimits(hidden=self.own_folders))
+
+    def spool(self) -> Spool:
+        """Room for archives."""
+        folder = self.work_folder / "archives"
+        return Spool(folder, max_bytes=self.max_spool_bytes, floor_bytes=self.floor_bytes)
+
     def check_public(self, has_token: bool) -> None:
         """Refuse to be reached from elsewhere by everybody.
 
         Raises:
-            ConfigError: the address is public and nobody has a token.
+            ConfigError: the address is public, or there is a proxy before it, and nobody has a token.
         """
-        if not self.is_private and not has_token and self.token is None:
+        if has_token:
+            return
+        if self.proxies:
+            raise ConfigError(
+                f"{PREFIX}PROXIES names proxies, so a token is needed: set {PREFIX}TOKEN, or make one with "
+                "octasplat token create."
+            )
+        if not self.is_private:
             raise ConfigError(
                 f"{self.host} can be reached from other machines, so a token is needed: set {PREFIX}TOKEN, "
                 "or make one with octasplat token create, or listen at 127.0.0.1."

@@ -1,12 +1,16 @@
 """What all requests share."""
 
+import asyncio
 import time
 from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Request
 
+from service.gate import Gate
+from service.guesses import Guesses
 from service.hub import EventHub
+from service.intake.spool import Spool
 from service.making_room import RoomMaker
 from service.metrics import Metrics
 from service.settings import ServiceSettings
@@ -26,8 +30,12 @@ class Service:
         storage: the store.
         hub: tells of events.
         room: makes room in the store.
+        guesses: counts wrong tokens.
+        spool: room for archives while they are read.
+        checks: lets in those whose datasets are checked.
+        storage_look: what the store was last found to be, or is being.
         metrics: counts what this process does.
-        has_tokens: whether anybody has a token, as of ``tokens_seen``.
+        has_tokens: whether anybody ever had a token, as of ``tokens_seen``.
         tokens_seen: monotonic time.
         draining: whether it is about to stop.
         started: monotonic time.
@@ -39,6 +47,10 @@ class Service:
     storage: Storage
     hub: EventHub
     room: RoomMaker
+    guesses: Guesses
+    spool: Spool
+    checks: Gate
+    storage_look: "asyncio.Future[str] | None" = None
     metrics: Metrics = field(default_factory=Metrics)
     has_tokens: bool = True
     tokens_seen: float = -1e9

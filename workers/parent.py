@@ -1,26 +1,25 @@
 """Processes that do not outlive the one that started them."""
 
 import contextlib
-import ctypes
 import os
 import signal
-import sys
+
+from workers.isolation.kernel import PR_SET_PDEATHSIG, prctl
 
 PARENT = "OCTASPLAT_PARENT_PID"
-_PR_SET_PDEATHSIG = 1
 
 
 def die_with(parent_pid: int, how: signal.Signals) -> None:
     """Ask Linux to send this process ``how`` when its parent dies; ends it at once if that has happened."""
-    if sys.platform.startswith("linux"):
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, how, 0, 0, 0)
+    with contextlib.suppress(OSError):
+        prctl(PR_SET_PDEATHSIG, how)
     if os.getppid() != parent_pid:
         os._exit(70)
 
 
-def die_with_server() -> None:
-    """As :func:`die_with`, in good order, for processes that ``octasplat serve`` starts."""
+def die_with_server() -> bool:
+    """As :func:`die_with`, in good order, if ``octasplat serve`` has started this; returns whether it has."""
     parent = os.environ.pop(PARENT, "")
     if parent.isdigit():
         die_with(int(parent), signal.SIGTERM)
+    return parent.isdigit()

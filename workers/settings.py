@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, TypeVar
+from urllib.parse import urlsplit
 
 import platformdirs
 from pydantic import AliasChoices, Field, SecretStr, ValidationError
@@ -16,6 +17,8 @@ from workers.postgres.embedded import EmbeddedPostgres
 PREFIX = "OCTASPLAT_"
 ADDRESS_FILE = "serve.json"
 """In the data folder while ``octasplat serve`` runs: where the service is."""
+TOKEN_FILE = "token"  # noqa: S105 - a name
+"""In the data folder: the token that ``octasplat serve`` made for itself, readable by its user only."""
 
 
 S = TypeVar("S", bound="WorkerSettings")
@@ -62,10 +65,17 @@ class WorkerSettings(BaseSettings):
         grace_seconds: how long a program may take to write its checkpoint when its worker has to stop.
         memory_limit_bytes: a job's program that needs more is stopped; None gives each job of a worker its
             share of the machine's memory, 0 sets no limit.
+        max_workspace_bytes: a job whose folder takes more on the worker's disk fails, and one that is sure to
+            is not accepted; 0 sets no limit.
+        full_disk_seconds: a job that filled a disk itself is tried again after this time, after four times as
+            long the second time, and so on.
+        recover_seconds: how often a worker that takes no jobs, as its machine ails, looks at it again.
+        quota_bytes: contents that an owner may store, unless ``octasplat quota`` says otherwise.
         max_job_hours: a job whose program has run for so long, over all of its attempts, is ended with what
             it has finished; 0 sets no limit.
         absent_queue_hours: a job that waits so long in a queue that no worker takes fails; 0 lets it wait.
         threads: of one job's program; 0 takes all cores.
+        pool_size: connections of a front end to the database.
         listen: hear of new jobs at once; False behind a pooler in transaction mode.
         kind_modules: further modules that register kinds of jobs.
         webhook_hosts: hosts of an inner network that webhooks may be sent to, also without TLS.
@@ -75,6 +85,7 @@ class WorkerSettings(BaseSettings):
         keep_open_datasets_hours: the same for datasets that were never committed.
         keep_unused_hours: contents of the store that nothing names are removed after this time; at once, but
             for what is being stored, where room is short.
+        keep_audit_hours: how long it is kept who asked for what; 0 keeps it for ever.
         collect_seconds: how often they are looked for.
     """
 
@@ -94,9 +105,14 @@ class WorkerSettings(BaseSettings):
     silent_seconds: float = Field(600.0, gt=0)
     grace_seconds: float = Field(30.0, gt=0)
     memory_limit_bytes: int | None = Field(None, ge=0)
+    max_workspace_bytes: int = Field(64 << 30, ge=0)
+    full_disk_seconds: float = Field(60.0, ge=0)
+    recover_seconds: float = Field(30.0, gt=0)
+    quota_bytes: int | None = Field(None, ge=0)
     max_job_hours: float = Field(48.0, ge=0)
     absent_queue_hours: float = Field(72.0, ge=0)
     threads: int = Field(0, ge=0)
+    pool_size: int = Field(12, gt=1)
     listen: bool = True
     kind_modules: tuple[str, ...] = ()
     webhook_hosts: tuple[str, ...] = ()
@@ -105,6 +121,7 @@ class WorkerSettings(BaseSettings):
     keep_datasets_hours: float = Field(0.0, ge=0)
     keep_open_datasets_hours: float = Field(720.0, ge=0)
     keep_unused_hours: float = Field(24.0, gt=0)
+    keep_audit_hours: float = Field(8760.0, ge=0)
     collect_seconds: float = Field(3600.0, gt=0)
 
     @property
@@ -116,6 +133,13 @@ class WorkerSettings(BaseSettings):
     def work_folder(self) -> Path:
         """Where work under way lies."""
         return (self.work or self.data / "work").absolute()
+
+    @property
+    def own_folders(self) -> tuple[Path, ...]:
+        """Folders that only the service itself may open: its data, its store and the work under way."""
+        address = urlsplit(self.storage_address)
+        store = (Path(address.path).absolute(),) if address.scheme in ("", "file") else ()
+        return (self.data.absolute(), self.work_folder, *store)
 
     @property
     def retention(self) -> Retention:
@@ -150,6 +174,11 @@ class WorkerSettings(BaseSettings):
                 "would be taken from live workers."
             )
         return self
+
+
+def worker_connections(queues: Mapping[str, int]) -> int:
+    """The most connections of a worker that takes so many jobs at once from these queues."""
+    return 6 + 4 * sum(queues.values())
 
 
 def load_settings(model: type[S], *, data: Path | None = None, **changes: object) -> S:

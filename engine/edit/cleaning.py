@@ -1,4 +1,4 @@
-"""Gaussians that a user would rather not see: faint ones, oversized ones, and floaters."""
+"""Gaussians that a user would rather not see: faint, oversized, too near to a camera, and floaters."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from engine.gaussians.model import FlatGaussians
+from engine.scene.near import NearZones
 
 WIDEST_LINK = 8.0
 """A Gaussian reaches no further than this many times the distance to its nearest neighbours, so that one huge
@@ -49,6 +50,7 @@ class CleanReport:
         faint: below the least opacity.
         small: below the least scale.
         large: above the largest scale.
+        near: nearer to a camera than what its photograph shows.
         floating: in groups too small.
         groups: number of such groups.
         kept: those that stay.
@@ -57,21 +59,28 @@ class CleanReport:
     faint: int
     small: int
     large: int
+    near: int
     floating: int
     groups: int
     kept: int
 
 
-def clean(gaussians: FlatGaussians, options: CleanOptions) -> tuple[Bool[np.ndarray, " n"], CleanReport]:
+def clean(
+    gaussians: FlatGaussians, options: CleanOptions, near_zones: NearZones | None = None
+) -> tuple[Bool[np.ndarray, " n"], CleanReport]:
     """Which Gaussians stay, and why the others do not.
 
-    Floaters are looked for among those that pass the thresholds.
+    Floaters are looked for among those that pass the thresholds and lie outside of ``near_zones``.
     """
     largest = gaussians.scales.max(axis=1, initial=0.0)
     faint = gaussians.opacities < options.min_opacity
     small = ~faint & (largest < options.min_scale)
     large = ~faint & (largest > options.max_scale)
     keep = ~(faint | small | large)
+    near = np.zeros(len(gaussians), np.bool_)
+    if near_zones is not None:
+        near = keep & near_zones.holds(gaussians.means_world)
+        keep &= ~near
     floating, groups = 0, 0
     if options.floaters and keep.any():
         rows = np.flatnonzero(keep)
@@ -81,7 +90,13 @@ def clean(gaussians: FlatGaussians, options: CleanOptions) -> tuple[Bool[np.ndar
         floating = int(loose.sum())
         groups = int((sizes < min(options.min_group, sizes.max())).sum())
     report = CleanReport(
-        int(faint.sum()), int(small.sum()), int(large.sum()), floating, groups, int(keep.sum())
+        int(faint.sum()),
+        int(small.sum()),
+        int(large.sum()),
+        int(near.sum()),
+        floating,
+        groups,
+        int(keep.sum()),
     )
     return keep, report
 

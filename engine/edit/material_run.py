@@ -13,7 +13,7 @@ from engine.config import read_config
 from engine.edit.choices import MaterialChange, Selection
 from engine.edit.material_change import with_harmonics_following, with_materials
 from engine.errors import ConfigError, OutputError
-from engine.files.gaussian_ply import read_near_world, write_gaussian_ply
+from engine.files.gaussian_ply import read_near_world, read_pixel_rad, write_gaussian_ply
 from engine.gaussians.materials import require_materials
 from engine.gaussians.model import FlatGaussians
 from engine.render.environment_map import read_environment
@@ -113,7 +113,12 @@ def write_changed_run(
                     shutil.copyfile(source / name, partial / name)
             if (source / POSES).is_dir():
                 shutil.copytree(source / POSES, partial / POSES)
-            write_gaussian_ply(gaussians, partial / SCENE, near_world=read_near_world(source / SCENE))
+            write_gaussian_ply(
+                gaussians,
+                partial / SCENE,
+                near_world=read_near_world(source / SCENE),
+                pixel_rad=read_pixel_rad(source / SCENE),
+            )
             write_json(partial / EDITS, [*_edits(source), dict(note)])
             partial.replace(target)
     except OSError as error:

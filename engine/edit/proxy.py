@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
 from engine.edit.apply import ROWS_AT_ONCE, blocks
-from engine.edit.kernels_proxy import blend, mean_value_weights, triangle_weights, winding_numbers
+from engine.edit.kernels_mean_value import mean_value_weights, winding_numbers
+from engine.edit.kernels_proxy import blend, triangle_weights
 from engine.edit.mirroring import was_mirrored
 from engine.errors import SceneFileError
 
@@ -205,6 +206,7 @@ class MeanValueBinding:
                 faded = _fade(distances, reach_world).reshape(-1, corners_world.shape[1])
                 self._influence[block] = np.maximum(self._influence[block], faded)
         self._rows = np.flatnonzero(self._influence.max(axis=1) > 0)
+        self._edges, self._opposite = _edges(proxy.triangles)
         numbers_a_row = corners_world.shape[1] * len(proxy.vertices_world)
         self._rows_at_once = max(1, min(ROWS_AT_ONCE, BLOCK_NUMBERS // numbers_a_row))
         self._stored: list[np.ndarray] | None = None
@@ -240,9 +242,11 @@ class MeanValueBinding:
         """The coordinates of the corners of some Gaussians."""
         points = self._corners[rows].reshape(-1, 3)
         weights = np.empty((len(points), len(self._proxy.vertices_world)))
+        proxy = self._proxy
         mean_value_weights(
-            points, self._proxy.vertices_world, self._proxy.triangles, self._proxy.diagonal, weights
-        )
+            points, proxy.vertices_world, proxy.triangles, self._edges, self._opposite, proxy.diagonal,
+            weights,
+        )  # fmt: skip
         return weights
 
 
@@ -290,6 +294,16 @@ def _spread_samples(
         samples.append(np.einsum("sk,tkc->tsc", barycentric, corners[rows]).reshape(-1, 3))
         owners.append(np.repeat(rows, len(barycentric)))
     return np.concatenate(samples), np.concatenate(owners)
+
+
+def _edges(
+    triangles: Int64[np.ndarray, "t 3"],
+) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, "t 3"]]:
+    """Each edge once, and the number of the edge opposite of each corner of each triangle."""
+    both = np.sort(triangles[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2), axis=1)
+    size = int(both.max()) + 1
+    keys, number = np.unique(both[:, 0] * size + both[:, 1], return_inverse=True)
+    return np.stack([keys // size, keys % size], axis=1), number.reshape(-1, 3)
 
 
 def _area_vectors(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:

@@ -13,7 +13,14 @@ from engine.evaluate.gallery import ViewImages, WorstAndBest
 from engine.evaluate.layers import shown_environment, shown_layers
 from engine.evaluate.report import write_report
 from engine.evaluate.truth import Truth
-from engine.evaluate.views import MeasuredView, RenderedView, ViewMetrics, measure_view, summarise
+from engine.evaluate.views import (
+    MeasuredView,
+    RenderedView,
+    ViewMetrics,
+    depth_spread,
+    measure_view,
+    summarise,
+)
 from engine.events import Listener, StageProgress
 from engine.gaussians.materials import ALBEDO
 from engine.gaussians.model import FlatGaussians
@@ -132,6 +139,7 @@ def _rendered(
             weight,
             alpha if dataset.has_alpha else None,
             shown_layers(image),
+            depth_spread(image.depth, image.depth_median),
         )
 
 

@@ -37,8 +37,12 @@ DEFINITIONS: dict[str, str] = {
     "ssim_valid": "the same formula over the windows that lie wholly inside the image",
     "ms_ssim": "multi-scale SSIM, five scales; null where the smaller side is 160 pixels or less",
     "flip": "mean LDR-FLIP at 67 pixels per degree; 0 is best",
+    "depth_spread": "share of the covered pixels whose mean and median depth differ by more than a tenth: "
+    "haze, clouds and strokes before or behind the surfaces; 0 is best",
     "images": "renders and references are rounded to 8 bits first; pixels that a mask rules out do not count "
     "in PSNR and are replaced by the reference's in the other metrics",
+    "training_views": "PSNR of the views that were trained on, on a fixed grid of 576 pixels of each, "
+    "rendered as held-out ones are; misfits are views far worse than those around them",
     "mean": "the mean of the per-view values, not of pooled errors",
     "mean_psnr_ci95": "95 % bootstrap interval of the mean PSNR over the views",
 }
@@ -69,54 +73,6 @@ def filled_outside(
     """
     w = weight[..., None]
     return np.asarray(render * w + reference * (1 - w), dtype=np.float32)
-
-
-def psnr(
-    render: Float32[np.ndarray, "h w 3"],
-    reference: Float32[np.ndarray, "h w 3"],
-    weight: Float32[np.ndarray, "h w"] | None = None,
-) -> float:
-    """Peak signal-to-noise ratio in dB, for a peak of 1.
-
-    Args:
-        render: Display values.
-        reference: Display values.
-        weight: How much each pixel counts, 0 for invalid; ``None`` counts all alike.
-
-    Returns:
-        The PSNR; infinite for images that agree wherever they count, not-a-number when no pixel counts.
-    """
-    squared = np.square(render.astype(np.float64) - reference).mean(axis=-1)
-    if weight is None:
-        error = float(squared.mean())
-    else:
-        total = float(weight.sum(dtype=np.float64))
-        if total <= 0:
-            return float("nan")
-        error = float((squared * weight).sum()) / total
-    return float("inf") if error == 0 else float(-10.0 * np.log10(error))
-
-
-def colour_corrected(
-    render: Float32[np.ndarray, "h w 3"],
-    reference: Float32[np.ndarray, "h w 3"],
-    weight: Float32[np.ndarray, "h w"],
-) -> Float32[np.ndarray, "h w 3"]:
-    """The render under the gain and offset of each channel that come closest to the reference.
-
-    Weighted least squares, then cut to [0, 1]; without a pixel that counts, the render as it is.
-    """
-    corrected = render.copy()
-    if weight.sum(dtype=np.float64) <= 0:
-        return corrected
-    for channel in range(3):
-        x, y = render[..., channel].astype(np.float64), reference[..., channel].astype(np.float64)
-        x_mean, y_mean = np.average(x, weights=weight), np.average(y, weights=weight)
-        x -= x_mean
-        variance = np.average(x * x, weights=weight)
-        gain = np.average(x * (y - y_mean), weights=weight) / variance if variance > 0 else 0.0
-        corrected[..., channel] = np.clip(gain * x + y_mean, 0.0, 1.0)
-    return corrected
 
 
 def ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float:

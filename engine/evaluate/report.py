@@ -49,6 +49,7 @@ COLUMNS = (
     Column("ssim_valid", "SSIM valid", 4, True),
     Column("ms_ssim", "MS-SSIM", 4, True),
     Column("flip", "FLIP", 4, False),
+    Column("depth_spread", "Spread", 3, False),
 )
 
 EXPOSURE_MATTERS_DB = 0.3
@@ -66,6 +67,7 @@ _NOTES = {
     "psnr_colour_corrected": "exposure left out",
     "ssim": "as in 3DGS, zero padding",
     "flip": "lower is better",
+    "depth_spread": "of depth, share of pixels; lower is better",
 }
 
 
@@ -186,6 +188,14 @@ def _tiles(
             unit = "dB" if column.key.startswith("psnr") else ""
             value = _shown(mean[column.key], column.decimals)
             tiles.append({"label": column.heading, "value": value, "unit": unit, "note": note})
+    trained = _mapping(metrics.get("training_views"))
+    if trained.get("psnr") is not None:
+        note = f"worst {_shown(trained.get('worst_psnr'), 2)} dB: {trained.get('worst')}"
+        if left := trained.get("left_out"):
+            note += f"; {len(left) if isinstance(left, list) else 0} left out"
+        tiles.append(
+            {"label": "Training views", "value": _shown(trained["psnr"], 2), "unit": "dB", "note": note}
+        )
     known = _mapping(_mapping(metrics.get("truth")).get("mean"))
     for key, label, decimals, unit in _TRUTH_TILES:
         if known.get(key) is not None:
@@ -207,12 +217,15 @@ def _facts(metrics: Mapping[str, object], views: int) -> list[str]:
     facts = [f"{views} held-out view{'' if views == 1 else 's'}"]
     resolution = metrics.get("resolution")
     if isinstance(resolution, Mapping):
-        shown = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in _flattened(resolution))
-        facts.append(f"resolution: {shown}")
+        known = {key: value for key, value in resolution.items() if value is not None}
+        shown = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in _flattened(known))
+        facts.append(f"resolution: {shown or 'that of the photographs'}")
     elif resolution is not None:
         facts.append(f"resolution {resolution}")
     if metrics.get("seed") is not None:
         facts.append(f"seed {metrics['seed']}")
+    if taken := metrics.get("taken_near"):
+        facts.append(f"{_thousands(int(_number(taken, 0)))} Gaussians too near to a camera were taken away")
     return facts
 
 

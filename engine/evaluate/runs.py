@@ -1,6 +1,7 @@
 """The scene of a run measured: on the photographs that it held out, or on those of another folder."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from engine.config import ReconstructionConfig, read_config
 from engine.errors import ConfigError, OutputError
 from engine.evaluate.held_out import evaluate_held_out
+from engine.evaluate.scales import measure_scales
 from engine.evaluate.truth import Truth, find_truth
 from engine.events import Listener, StageProgress, Warned
 from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
@@ -16,6 +18,7 @@ from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.poses.find import read_record
 from engine.render.environment_map import read_environment
+from engine.render.renderer import background_colour
 from engine.run_folder import (
     CACHE,
     CONFIG,
@@ -32,11 +35,17 @@ from engine.run_folder import (
 from engine.scene import Dataset
 from engine.scene.views_file import read_views, write_views
 from engine.shading.protocol import ShadingModel
-from engine.stages import stage
+from engine.stages import counted_stage, stage
 from engine.threads import use_threads
+from engine.trace.make import make_tracer
 from engine.train.config import TrainConfig
 from engine.train.shading import deferred_of, make_shading
 from engine.versions import versions
+from engine.writing import write_json
+
+SCALES = "scales.json"
+RAYS_ACROSS = (1, 2, 4)
+"""Rays across a pixel with which smaller sizes are measured."""
 
 
 def evaluate(
@@ -67,21 +76,10 @@ def evaluate(
         OutputError: there is no scene yet, or other photographs of that name were measured before.
     """
     use_threads(threads)
-    config = read_config(output / CONFIG)
-    if not (output / SCENE).exists():
-        raise OutputError(
-            f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."
-        )
+    config = _finished(output)
     if on is not None:
         return _evaluate_on(on, output, config, threads, listener)
-    dataset = open_photographs(
-        photographs_folder(output, scene),
-        output,
-        config,
-        threads,
-        listener,
-        model_folder=found_model(output),
-    )
+    dataset = _photographs(output, config, scene, threads, listener)
     if (output / VIEWS).exists():
         difference = read_views(output / VIEWS).difference(dataset.record)
         if difference is not None:
@@ -89,6 +87,81 @@ def evaluate(
     with stage("evaluate", listener, len(dataset.test_indices)):
         measure_run(dataset, output, config, threads, listener)
     return output / "metrics.json"
+
+
+def evaluate_scales(
+    output: Path,
+    scales: Sequence[int],
+    *,
+    scene: Path | None = None,
+    threads: int = 0,
+    listener: Listener = lambda _event: None,
+) -> dict[str, dict[str, float]]:
+    """Measure a finished run at smaller sizes, see :mod:`engine.evaluate.scales`; writes ``scales.json``.
+
+    Args:
+        output: folder of the run.
+        scales: by how much pixels are larger than those of the training.
+        scene: where the photographs are now; None takes the folder that the run was made from.
+        threads: for everything; 0 means all cores.
+        listener: hears the progress.
+
+    Returns:
+        Mean PSNR of the held-out views, by scale and by rays a pixel.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+        DatasetError: the photographs cannot be used.
+        OutputError: there is no scene yet.
+    """
+    use_threads(threads)
+    config = _finished(output)
+    dataset = _photographs(output, config, scene, threads, listener)
+    gaussians, _ = read_gaussian_ply(output / SCENE)
+    extent = _extent_world(output, dataset)
+    shading = finished_shading(output, config.train, dataset, extent)
+    tracer = make_tracer(config.train.trace, threads=threads)
+    tracer.build(gaussians, shading.features(gaussians))
+    with counted_stage("evaluate", listener, len(dataset.test_indices)) as progress:
+        found = measure_scales(
+            dataset,
+            tracer,
+            shading,
+            background_colour(config.evaluate_background),
+            scales,
+            RAYS_ACROSS,
+            on_view=lambda done: progress(done, len(dataset.test_indices)),
+        )
+    write_json(output / SCALES, found)
+    return found
+
+
+def _finished(output: Path) -> ReconstructionConfig:
+    """The settings of a run that has a scene."""
+    config = read_config(output / CONFIG)
+    if not (output / SCENE).exists():
+        raise OutputError(
+            f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."
+        )
+    return config
+
+
+def _photographs(
+    output: Path, config: ReconstructionConfig, scene: Path | None, threads: int, listener: Listener
+) -> Dataset:
+    return open_photographs(
+        photographs_folder(output, scene),
+        output,
+        config,
+        threads,
+        listener,
+        model_folder=found_model(output),
+    )
+
+
+def _extent_world(output: Path, dataset: Dataset) -> float:
+    """The extent that the scene was trained with, whichever photographs measure it."""
+    return read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
 
 
 def measure_run(
@@ -102,7 +175,7 @@ def measure_run(
     """Measure the scene of ``output``; the results go ``into`` another folder or that one."""
     truth = _truth(dataset, tell, needed=into is not None)
     gaussians, _ = read_gaussian_ply(output / SCENE)
-    extent = read_views(output / VIEWS).extent_world if (output / VIEWS).exists() else dataset.extent
+    extent = _extent_world(output, dataset)
     environment = _environment(output, config.train)
     relighter = None
     if truth is not None and truth.relit and environment is not None and has_materials(gaussians):
@@ -125,6 +198,7 @@ def measure_run(
             "resolution": {"max_side": config.max_side},
             "background": config.evaluate_background,
             "versions": versions(),
+            **{key: training[key] for key in ("training_views", "taken_near") if key in training},
             **_placed(output),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),

@@ -12,17 +12,20 @@ from jaxtyping import Float32
 from engine.errors import DatasetError
 from engine.evaluate.metrics import (
     DEFINITIONS,
-    colour_corrected,
     filled_outside,
     flip,
     ms_ssim,
-    psnr,
     rounded_to_8_bits,
     ssim_both,
 )
+from engine.psnr import colour_corrected, psnr
 
 FOREGROUND_ALPHA = 0.5
 BOOTSTRAP_DRAWS = 2000
+OPTIONAL = ("psnr_foreground", "depth_spread")
+"""Metrics that are left out where no view has them."""
+SPREAD = 0.1
+"""Share of the depth by which mean and median differ where there is more than a surface."""
 
 
 class RenderedView(NamedTuple):
@@ -35,6 +38,7 @@ class RenderedView(NamedTuple):
         weight: 1 where the photograph is valid, 0 where a mask rules it out.
         alpha: Coverage of the photograph's foreground, for photographs that have one.
         layers: What lies behind the render, as display values by name.
+        depth_spread: See :func:`depth_spread`; ``None`` where depths are not known.
     """
 
     name: str
@@ -43,6 +47,7 @@ class RenderedView(NamedTuple):
     weight: Float32[np.ndarray, "h w"]
     alpha: Float32[np.ndarray, "h w"] | None = None
     layers: Mapping[str, Float32[np.ndarray, "h w 3"]] = MappingProxyType({})
+    depth_spread: float | None = None
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,7 @@ class ViewMetrics:
     ms_ssim: float | None
     flip: float
     psnr_foreground: float | None = None
+    depth_spread: float | None = None
 
 
 class MeasuredView(NamedTuple):
@@ -96,12 +102,12 @@ class Metrics:
         Returns:
             JSON-ready values; infinite and undefined numbers become ``None``.
         """
-        has_foreground = "psnr_foreground" in self.mean
         views = {}
         for view in self.views:
             row = {key: _finite(value) for key, value in asdict(view).items() if key != "name"}
-            if not has_foreground:
-                del row["psnr_foreground"]
+            for key in OPTIONAL:
+                if key not in self.mean:
+                    del row[key]
             views[view.name] = row
         interval = self.mean_psnr_ci95
         return {
@@ -146,8 +152,26 @@ def measure_view(view: RenderedView) -> MeasuredView:
         ms_ssim=ms_ssim(filled, reference),
         flip=mean_flip,
         psnr_foreground=_psnr_foreground(render, reference, view.weight, view.alpha),
+        depth_spread=view.depth_spread,
     )
     return MeasuredView(metrics, flip_map)
+
+
+def depth_spread(depth: Float32[np.ndarray, "h w"], depth_median: Float32[np.ndarray, "h w"]) -> float | None:
+    """Share of the covered pixels that show more than one surface: haze, clouds and strokes at other depths.
+
+    Args:
+        depth: Expected distances.
+        depth_median: Distances at which half of the light is gone, 0 where it never is: not covered.
+
+    Returns:
+        The share of pixels whose two distances differ by more than a tenth; ``None`` where none is covered.
+    """
+    covered = depth_median > 0
+    if not covered.any():
+        return None
+    apart = np.abs(depth - depth_median) > SPREAD * depth_median
+    return float(apart[covered].mean())
 
 
 def summarise(views: Iterable[ViewMetrics]) -> Metrics:
@@ -162,8 +186,7 @@ def summarise(views: Iterable[ViewMetrics]) -> Metrics:
         twice = next(name for name in names if names.count(name) > 1)
         raise DatasetError(f"Two measured views are named {twice}; names must differ.")
     keys = ["psnr", "psnr_colour_corrected", "ssim", "ssim_valid", "ms_ssim", "flip"]
-    if any(row.psnr_foreground is not None for row in rows):
-        keys.append("psnr_foreground")
+    keys += [key for key in OPTIONAL if any(getattr(row, key) is not None for row in rows)]
     mean = {key: _mean([getattr(row, key) for row in rows]) for key in keys}
     return Metrics(rows, mean, bootstrap_interval([row.psnr for row in rows]))
 

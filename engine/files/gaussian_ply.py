@@ -4,7 +4,8 @@ One element ``vertex``, all float32: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..
 channel-major (all red, then green, then blue), ``opacity`` (logit), ``scale_0..2`` (ln of the standard
 deviations) and ``rot_0..3`` (w, x, y, z). The flat axis, the normal r1, is axis 0 with scale ln 1e-5, so that
 every viewer of 3DGS files shows the scene. A comment ``near_world`` gives the distance from a camera at which
-it begins to be seen, as in training, so that one file is one picture.
+it begins to be seen, as in training, and ``pixel_rad`` the angle of a pixel that it was trained with, so that
+one file is one picture.
 
 Named channels come last, ``metallic`` or ``albedo_0..2``, and a comment ``octasplat_channel albedo 3`` says
 of each that it is one.
@@ -35,7 +36,7 @@ from engine.gaussians.model import FlatGaussians
 
 MAX_SH_DEGREE = 3
 ROWS_AT_ONCE = 65536
-_NEAR = "near_world"
+_NEAR, _PIXEL = "near_world", "pixel_rad"
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -44,7 +45,12 @@ _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 
 def write_gaussian_ply(
-    gaussians: FlatGaussians, path: Path, *, sh_pad_degree: int | None = None, near_world: float = 0.0
+    gaussians: FlatGaussians,
+    path: Path,
+    *,
+    sh_pad_degree: int | None = None,
+    near_world: float = 0.0,
+    pixel_rad: float = 0.0,
 ) -> None:
     """Write ``gaussians`` as a 3DGS PLY, atomically and in blocks.
 
@@ -54,6 +60,7 @@ def write_gaussian_ply(
         sh_pad_degree: write at least this degree of spherical harmonics, the missing ones zero; some
             importers accept only degree 3.
         near_world: the distance from a camera at which the scene begins to be seen, kept as a comment.
+        pixel_rad: the angle of a pixel in the middle of a training view, likewise.
 
     Raises:
         SceneFileError: nothing to write, a parameter is not finite, or the file cannot be written.
@@ -70,8 +77,8 @@ def write_gaussian_ply(
     names += [column for name, width in widths.items() for column in column_names(name, width)]
     dtype = np.dtype([(name, "<f4") for name in names])
     element = PlyWriteElement("vertex", len(gaussians), dtype, _row_blocks(gaussians, degree, dtype))
-    near = [f"{_NEAR} {near_world!r}"] if near_world > 0 else []
-    write_ply(path, [element], [*near, *channel_comments(widths)])
+    known = [f"{name} {value!r}" for name, value in ((_NEAR, near_world), (_PIXEL, pixel_rad)) if value > 0]
+    write_ply(path, [element], [*known, *channel_comments(widths)])
 
 
 def read_near_world(path: Path) -> float:
@@ -80,16 +87,29 @@ def read_near_world(path: Path) -> float:
     Raises:
         SceneFileError: a PLY is damaged.
     """
+    return _commented(path, _NEAR)
+
+
+def read_pixel_rad(path: Path) -> float:
+    """The angle of a pixel that the scene in a file was trained with, radians; 0 where nothing says so.
+
+    Raises:
+        SceneFileError: a PLY is damaged.
+    """
+    return _commented(path, _PIXEL)
+
+
+def _commented(path: Path, wanted: str) -> float:
     if path.suffix.lower() != ".ply":
         return 0.0
     for comment in read_ply_header(path).comments:
         name, _, value = comment.partition(" ")
-        if name == _NEAR:
+        if name == wanted:
             try:
                 return max(float(value), 0.0)
             except ValueError:
                 raise SceneFileError(
-                    f"{path}: its comment {_NEAR} is {value!r}, which is no number."
+                    f"{path}: its comment {wanted} is {value!r}, which is no number."
                 ) from None
     return 0.0
 

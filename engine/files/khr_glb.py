@@ -27,6 +27,7 @@ from engine.files.encodings import (
     unit_quats,
 )
 from engine.files.gltf import FLOAT, UNSIGNED_BYTE, GlbFile, padded, write_glb
+from engine.files.octagon_glb_reading import octagon_q, read_octagons
 from engine.files.options import ExportOptions
 from engine.files.registry import Exporter, Importer, register
 from engine.files.selection import blocks, check_scales, selected
@@ -44,15 +45,15 @@ SIMILARITY = 1e-4
 
 
 def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
-    """Read all splats of the default scene, node transforms applied.
+    """Read all splats of the default scene, node transforms applied, or else its octagons.
 
     Args:
         path: the file.
         channels: which of the attributes that begin with _ become channels, by their names in lower case.
 
     Raises:
-        SceneFileError: the file is no GLB, is damaged, holds no splats (an octagon mesh, say) or compressed
-            ones, scales them unevenly, or has no such channel.
+        SceneFileError: the file is no GLB, is damaged, holds neither splats nor octagons of ours, compressed
+            splats or edited octagons, scales them unevenly, or has no such channel.
     """
     file = GlbFile(path)
     clouds = []
@@ -72,6 +73,9 @@ def read(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
             named = Channels({name: _channel(file, columns, own) for name, own in wanted.items()})
             clouds.append(replace(cloud, channels=named))
         if not clouds:
+            q = octagon_q(file)
+            if q is not None:
+                return read_octagons(file, path, q, channels)
             raise SceneFileError(
                 f"{path}: holds no splats ({EXTENSION}); if it is an edited octagon mesh, use octasplat edit."
             )

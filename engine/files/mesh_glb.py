@@ -378,7 +378,7 @@ register(
     Exporter(
         "glb",
         ("*.glb",),
-        "octagon mesh as GLB with opacity and fall-off, for looking at",
+        "octagon mesh as GLB with opacity and fall-off, for looking at objects (rooms: splats or a surface)",
         write_octagons,
         holds_channels=True,
     )

@@ -14,9 +14,10 @@ from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.framing import fitting_distance, seen_bounds
 from engine.render.images import exr_layers, write_exr, write_png
 from engine.render.names import render_names
+from engine.render.oversampling import rays_across, render_averaged
 from engine.render.paths import Turntable, fit_turntable
-from engine.render.renderer import render_rays
 from engine.scene import Camera, PosedView, Viewpoints
+from engine.shading.plain import PLAIN
 from engine.trace.protocol import Tracer
 
 DEFAULT_FOV_Y_DEGREES = 50.0
@@ -129,7 +130,13 @@ def gaussian_turntable(
     return Turntable(bounds.centre_world, bounds.up_world, float(radius), float(height))
 
 
-def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"], *, transparent: bool = False) -> Paint:
+def scene_paint(
+    tracer: Tracer,
+    background: Float32[np.ndarray, "3"],
+    *,
+    transparent: bool = False,
+    trained_rad: float = 0.0,
+) -> Paint:
     """What renders a shot of a scene to a file.
 
     ``.exr`` gets linear R, G, B, alpha A, the expected distance Z (0 where nothing is) and the world normal
@@ -139,10 +146,13 @@ def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"], *, transpa
         tracer: with the scene built.
         background: display colour behind the scene.
         transparent: PNG get straight colours and alpha; the background should be black.
+        trained_rad: angle of a pixel of the training views; larger pixels get several rays, so that what is
+            smaller than they neither sparkles nor breaks up. 0 where it is not known: one ray each.
     """
 
     def paint(shot: Shot, path: Path, _part: Callable[[float], None]) -> None:
-        image = render_rays(tracer, shot.rays(), background)
+        rays = shot.rays()
+        image = render_averaged(tracer, rays, background, PLAIN, rays_across(rays, trained_rad))
         if path.suffix.lower() == ".exr":
             layers = exr_layers(
                 image.rgb_srgb, alpha=image.alpha, depth=image.depth, normals_world=image.normal_world
@@ -155,6 +165,15 @@ def scene_paint(tracer: Tracer, background: Float32[np.ndarray, "3"], *, transpa
             write_png(path, image.rgb_srgb)
 
     return paint
+
+
+def trained_pixel_rad(scene: Viewpoints) -> float:
+    """The angle of a pixel in the middle of the first view of a training."""
+    camera = scene.cameras[scene.views[0].camera_index]
+    x, y = camera.width_px / 2, camera.height_px / 2
+    ways = camera.directions_cam(np.array([[x, y], [x + 1, y]]))
+    angle = float(np.linalg.norm(np.cross(ways[0], ways[1])))
+    return angle if np.isfinite(angle) else 0.0
 
 
 def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:

@@ -21,7 +21,7 @@ from engine.scene.directions import (
     rows_at_once,
 )
 from engine.scene.load import load_scene
-from engine.scene.model import SceneModel, SparsePoints, View
+from engine.scene.model import SceneModel, SparsePoints, View, Viewpoints
 from engine.scene.split import measured_views, split_views
 from engine.scene.views_file import ViewsRecord, views_record
 
@@ -192,6 +192,11 @@ class Dataset:
         cache = open_pixel_cache(scene, cache_dir, threads=threads, progress=progress)
         tables = open_ray_tables(scene.cameras, cache_dir, MAX_TABLE_BYTES)
         return cls(scene, cache, tables, masks=masks, near_world=near_world)
+
+    @property
+    def viewpoints(self) -> Viewpoints:
+        """Where all of them were taken from, and through which lenses."""
+        return Viewpoints(self.views, self.cameras)
 
     @property
     def train_pixel_count(self) -> int:

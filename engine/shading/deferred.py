@@ -340,7 +340,7 @@ class Deferred:
             return surface, _Reflection(mirrored.trace, mirrored, facets)
         rays = reflected_rays(sight.rays, buffer, self._gap)
         if seed:
-            rays = RayBatch(rays.origins_world, rays.directions_world, rays.t_min, SEED_REACH)
+            rays = rays.up_to(SEED_REACH)
         seen = sight.tracer.trace(rays, record=record)
         visibility = (seen.transmittance > HIDDEN if seed else seen.transmittance).astype(np.float64)
         indirect = np.zeros_like(surface.indirect_linear)
@@ -398,5 +398,6 @@ class Deferred:
             )
         if self._window > 1 and settings.smooth_normal_weight > 0:
             smooth_normal_term(sight, self._window, settings.smooth_normal_weight, by_normal)
-        if self._window > 1 and settings.smooth_weight > 0:
-            smoothness_term(sight, self._window, settings.smooth_weight, by_features, by_alpha)
+        smooth = settings.smooth_weights
+        if self._window > 1 and max(smooth) > 0:
+            smoothness_term(sight, self._window, smooth, by_features, by_alpha)

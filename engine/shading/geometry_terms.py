@@ -115,11 +115,14 @@ def smooth_normal_term(
 def smoothness_term(
     sight: Sight,
     window_rays: int,
-    weight: float,
+    weights: tuple[float, ...],
     by_features: Float64[np.ndarray, "r f"],
     by_alpha: Float64[np.ndarray, " r"],
 ) -> None:
-    """Differences of materials between neighbouring rays: their size, rounded off near zero."""
+    """Differences of materials between neighbouring rays: their size, rounded off near zero.
+
+    Each of the five columns of materials has its weight.
+    """
     side, first = _grid(sight, window_rays)
     if first is None:
         return
@@ -129,10 +132,11 @@ def smoothness_term(
     material = flat.reshape(-1, side, side, 5)
     opaque = (alpha > OPAQUE).reshape(-1, side, side)
     gradient = np.zeros_like(material)
+    share = np.array(weights) / len(sight.seen.transmittance)
     for one, other in _NEIGHBOURS:
         difference = material[one] - material[other]
         slope = difference / np.sqrt(difference**2 + EDGE**2)
-        slope = _where(opaque[one] & opaque[other], slope) * (weight / len(sight.seen.transmittance))
+        slope = _where(opaque[one] & opaque[other], slope) * share
         gradient[one] += slope
         gradient[other] -= slope
     by_flat = gradient.reshape(-1, 5)

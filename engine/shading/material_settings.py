@@ -48,7 +48,9 @@ class MaterialSettings(BaseModel):
         normal_weight: of the spread of the normals along a ray.
         depth_normal_weight: of the angle between normals and the surface that the depths span.
         smooth_normal_weight: of the angle between the normals of neighbouring rays.
-        smooth_weight: of differences of materials between neighbouring rays.
+        smooth_weight: of differences of albedo between neighbouring rays.
+        smooth_gloss_weight: of differences of metallic and roughness between neighbouring rays, which change
+            less over a thing than its colour does.
         white_weight: of the environment's colours; of their logarithms.
         even_weight: of differences between neighbouring texels; of their logarithms.
         harmonics_weight: of the harmonics' distance to what was shaded, once they are no longer seen.
@@ -88,6 +90,7 @@ class MaterialSettings(BaseModel):
     depth_normal_weight: float = Field(0.1, ge=0)
     smooth_normal_weight: float = Field(0.1, ge=0)
     smooth_weight: float = Field(0.01, ge=0)
+    smooth_gloss_weight: float = Field(0.08, ge=0)
     white_weight: float = Field(0.01, ge=0)
     even_weight: float = Field(0.03, ge=0)
     harmonics_weight: float = Field(0.01, ge=0)
@@ -106,6 +109,11 @@ class MaterialSettings(BaseModel):
         if isinstance(given, dict) and given.get("secondary_share") == 1:
             given = {name: value for name, value in given.items() if name != "secondary_share"}
         return given
+
+    @property
+    def smooth_weights(self) -> tuple[float, ...]:
+        """Of the smoothness of each column of materials."""
+        return (self.smooth_weight,) * 3 + (self.smooth_gloss_weight,) * 2
 
     def is_seed_deferred(self, progress: float) -> bool:
         """Whether the seed's second stage has begun."""

@@ -62,10 +62,35 @@ def extract_surface(
 ) -> ExtractedSurface:
     """Fuse the depth that ``cameras`` see into a mesh, clean it up and colour it.
 
+    Arguments and errors are those of :func:`extract_levels`.
+    """
+    (surface,) = extract_levels(
+        tracer, cameras, options, (options.max_triangles,),
+        scratch=scratch, light_frame=light_frame, listener=listener, should_stop=should_stop,
+    )  # fmt: skip
+    return surface
+
+
+def extract_levels(
+    tracer: Tracer,
+    cameras: Sequence[RenderCamera],
+    options: SurfaceOptions,
+    levels: Sequence[int | None],
+    *,
+    scratch: Path,
+    light_frame: Float64[np.ndarray, "3 3"] | None = None,
+    listener: Listener = ignore,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[ExtractedSurface, ...]:
+    """One surface in several levels of detail: what is fused once is decimated to each and coloured.
+
+    Each is what :func:`extract_surface` gives with that many triangles.
+
     Args:
         tracer: with the scene built.
         cameras: where depth and colours are rendered from.
-        options: all settings.
+        options: all settings; ``max_triangles`` is passed over.
+        levels: at most so many triangles; None keeps all.
         scratch: folder for a temporary file of 8 bytes for every pixel of the depth maps.
         light_frame: bake materials, which the tracer then has as its first features
             (:func:`engine.surface.materials.material_features`), for light with these rows right, up and
@@ -89,35 +114,53 @@ def extract_surface(
     del maps
     assert volume is not None
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
-    with counted_stage("meshing", tell, 4) as progress:
+    steps = 3 + len(levels)
+    with counted_stage("meshing", tell, steps) as progress:
         mesh = surface_of(volume, options.min_weight)
         volume, found = None, len(mesh.faces)
-        progress(1, 4)
+        progress(1, steps)
         mesh = _large_parts(mesh, options)
-        progress(2, 4)
+        progress(2, steps)
         max_rim = None if options.fill_holes is None else options.fill_holes * region.voxel_world
         mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
-        progress(3, 4)
-        if options.max_triangles is not None:
+        progress(3, steps)
+        meshes = []
+        for done, level in enumerate(levels, 4):
             # Thin parts may come apart.
-            mesh = _large_parts(decimate(mesh, options.max_triangles), options)
-        progress(4, 4)
-    edges = edge_report(mesh.faces)
+            meshes.append(mesh if level is None else _large_parts(decimate(mesh, level), options))
+            progress(done, steps)
+    del mesh
+    result = []
+    for mesh in meshes:
+        edges = edge_report(mesh.faces)
+        coloured = _coloured(tracer, cameras, options, mesh, region, light_frame, tell)
+        result.append(ExtractedSurface(coloured, region, volume_bytes, found, closed, edges))
+    return tuple(result)
+
+
+def _coloured(
+    tracer: Tracer,
+    cameras: Sequence[RenderCamera],
+    options: SurfaceOptions,
+    mesh: TriangleMesh,
+    region: Region,
+    light_frame: Float64[np.ndarray, "3 3"] | None,
+    tell: Listener,
+) -> TriangleMesh:
+    """The mesh with colours in its vertices, or with textures."""
     tolerance = TOLERANCE_VOXELS * region.voxel_world
     if options.texture_side is None:
         assert light_frame is None, "materials need a texture"
         with counted_stage("colouring", tell, 0) as progress:
             normals = mesh.vertex_normals()
             rgb, seen = bake(mesh.vertices_world, normals, mesh, cameras, tracer, tolerance, progress)
-            mesh = replace(mesh, rgb_srgb=_spread(mesh.vertices_world, rgb, seen))
-    else:
-        with counted_stage("unwrapping", tell, 0):
-            layout = lay_out(mesh, options.texture_side)
-        with counted_stage("colouring", tell, 0) as progress:
-            points, look = layout.points_world, COLOURS if light_frame is None else MATERIALS
-            baked, seen = bake(points, layout.normals_world, mesh, cameras, tracer, tolerance, progress, look)
-            mesh = _textured(layout, _spread(points, baked, seen), seen, light_frame)
-    return ExtractedSurface(mesh, region, volume_bytes, found, closed, edges)
+            return replace(mesh, rgb_srgb=_spread(mesh.vertices_world, rgb, seen))
+    with counted_stage("unwrapping", tell, 0):
+        layout = lay_out(mesh, options.texture_side)
+    with counted_stage("colouring", tell, 0) as progress:
+        points, look = layout.points_world, COLOURS if light_frame is None else MATERIALS
+        baked, seen = bake(points, layout.normals_world, mesh, cameras, tracer, tolerance, progress, look)
+        return _textured(layout, _spread(points, baked, seen), seen, light_frame)
 
 
 def _large_parts(mesh: TriangleMesh, options: SurfaceOptions) -> TriangleMesh:

@@ -25,7 +25,10 @@ PIXELS_PER_VOXEL = 1.5
 SAMPLES_PER_SIDE = 160
 STRAY_SHARE = 1e-3
 MARGIN_SHARE = 0.05
-NOTHING_SEEN = "No surface lies in the region to mesh; name another with --bounds, or use --unbounded."
+NOTHING_SEEN = (
+    "No surface lies in the region to mesh; name another with --bounds (octasplat info tells where the scene "
+    "lies), or use --unbounded."
+)
 _ANY_AXIS = np.array([0.36, 0.48, 0.8])
 
 

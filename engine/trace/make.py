@@ -24,6 +24,6 @@ def make_tracer(
         from engine.trace.reference_tracer import ReferenceTracer
 
         return ReferenceTracer(settings)
-    from engine.trace.cpu import CpuTracer
+    from engine.trace.cpu.tracer import CpuTracer
 
     return CpuTracer(settings, threads=threads, box_padding=box_padding, build_quality=build_quality)

@@ -108,6 +108,7 @@ def trace_reference(
     d = torch.tensor(rays.directions_world, dtype=torch.float64)
     o = torch.tensor(rays.origins_world, dtype=torch.float64).expand_as(d)
     t_min, t_max = (torch.tensor(limit).expand(len(d))[:, None] for limit in (rays.t_min, rays.t_max))
+    viewers = torch.tensor(rays.t_viewer, dtype=torch.float64).expand(len(d))
     frames = rotation_matrices(p.quats_wxyz)
     r1, r2, r3 = frames.unbind(-1)
     s2, s3 = p.log_scales.exp().unbind(-1)
@@ -142,8 +143,10 @@ def trace_reference(
         al = alpha[ray, ids]
         through = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1 - al, 0)])
         weight = al * through[:-1]  # alpha_k T_k
-        # One colour for all rays from one origin: that in the direction from there to the mean.
-        view = to_mean[ray, ids]
+        # The direction from the viewer to the mean, the ray's own from infinitely far away.
+        view = d[ray].expand(len(ids), 3)
+        if viewers[ray].isfinite():
+            view = to_mean[ray, ids] - viewers[ray] * view
         basis = sh_basis(view / view.norm(dim=-1, keepdim=True), p.sh.shape[1])
         colour = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
         facing = -torch.sign(cosine[ray, ids].detach())

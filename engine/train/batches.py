@@ -169,6 +169,11 @@ class BatchSource:
         self._window_side_px = window_side_px(config, self.sampler.longest_side_px)
         self._patches = self._patch_count()
 
+    def leave_out(self, views: Int64[np.ndarray, " m"]) -> None:
+        """Draw nothing of these views any more."""
+        kept = np.setdiff1d(self._dataset.train_indices, views)
+        self.sampler = PixelSampler(kept, view_sizes_px(self._dataset))
+
     def draw(self, rng: np.random.Generator) -> Batch:
         """The next batch."""
         config, sampler, side = self._config, self.sampler, self._config.patch_side

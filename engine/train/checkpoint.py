@@ -17,7 +17,7 @@ from engine.train.optimiser import Adam
 from engine.train.state import TrainState
 from engine.writing import replacing
 
-FORMAT = 3
+FORMAT = 4
 KEEP = 2
 _PREFIX = "iteration_"
 _GROUPS = ("gaussians", "adam", "densifier", "shading")
@@ -56,6 +56,8 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         "running_mse": state.running_mse,
         "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
         "best_iteration": state.best_iteration,
+        "left_out": state.left_out.tolist(),
+        "taken_near": state.taken_near,
     }
     arrays: dict[str, Any] = {
         f"gaussians.{name}": array for name, array in row_arrays(state.gaussians).items()
@@ -108,6 +110,8 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         running_mse=meta["running_mse"],
         best_psnr=-np.inf if meta["best_psnr"] is None else meta["best_psnr"],
         best_iteration=meta["best_iteration"],
+        left_out=np.array(meta["left_out"], np.int64),
+        taken_near=meta["taken_near"],
     )
 
 

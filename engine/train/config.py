@@ -15,6 +15,9 @@ from engine.gaussians.octagon import CHI2_3_99
 from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import TraceSettings
 
+MOST_PLANNED_ITERATIONS = 30_000
+"""Where a time decides their number, see :mod:`engine.train.within`."""
+
 PresetName = Literal["fast", "standard", "paper"]
 
 
@@ -144,11 +147,27 @@ class TrainConfig(_Frozen):
     exposure: bool = Field(
         False, description="learn a gain and an offset for each channel of each training view"
     )
+    leave_out_misfits: bool = Field(
+        False, description="train without the views that do not fit the others, as it becomes clear which"
+    )
+    misfits_after: float = Field(
+        0.3, ge=0, le=1, description="share of the iterations after which checkpoints look for them"
+    )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
     trace: TraceSettings = TraceSettings()
     materials: MaterialSettings = MaterialSettings()
     near: float = Field(0.01, ge=0, description="nearest distance at which a Gaussian is seen, of the extent")
+    near_share: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="nothing stays in a view nearer than this share of the depth at which its sparse points "
+        "begin; 0 lets everything stay",
+    )
+    min_scale_px: float = Field(
+        0.0, ge=0, description="least standard deviation, in pixels of the nearest training camera"
+    )
     densify: McmcConfig | PaperConfig = Field(McmcConfig(), discriminator="kind")
     rebuild_every: int = Field(
         25, ge=1, description="iterations between rebuilds of the hierarchy of up to 500,000 Gaussians"

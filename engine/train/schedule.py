@@ -36,6 +36,11 @@ class Schedule:
         every *= -(-self.config.checkpoint_every // every)
         return done % every == 0 or self.ends(done)
 
+    def judges_views(self, done: int) -> bool:
+        """Whether views that do not fit are looked for after ``done`` iterations, for the rest of the run."""
+        since = self.config.misfits_after * self.iterations
+        return self.measures(done) and since <= done < self.iterations
+
     def rebuilds(self, done: int, gaussians: int) -> bool:
         """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
         return self.measures(done) or done % rebuild_interval(self.config, gaussians) == 0

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Int64
 
 from engine.gaussians.model import FlatGaussians
 from engine.train.optimiser import Adam
@@ -23,6 +24,8 @@ class TrainState:
         running_mse: smoothed squared error of the training rays.
         best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
         best_iteration: when that was.
+        left_out: training views that are left out from here on.
+        taken_near: Gaussians taken away so far for being too near to a camera.
     """
 
     iteration: int
@@ -35,6 +38,8 @@ class TrainState:
     running_mse: float = 0.0
     best_psnr: float = -np.inf
     best_iteration: int = 0
+    left_out: Int64[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    taken_near: int = 0
 
     def raise_degree(self, degree: int) -> None:
         """Give the colours harmonics up to ``degree``, zero at first, if they have less."""

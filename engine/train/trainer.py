@@ -3,10 +3,13 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from engine.errors import Cancelled, TrainingFailure
-from engine.events import CheckpointWritten, Listener, TrainingProgress
+from engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
+from engine.scene.near import NearZones
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
@@ -15,11 +18,16 @@ from engine.train.checkpoint import save_checkpoint
 from engine.train.config import TrainConfig, most_gaussians
 from engine.train.densify import make_densifier
 from engine.train.densify.propagating import Propagating
+from engine.train.floors import ScaleFloor
 from engine.train.iteration import Differentiated, Machinery, iterate
+from engine.train.misfits import TrainingViews, ViewJudge
 from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
 from engine.train.shading import make_shading
 from engine.train.state import TrainState
+
+GONE_LOGIT = np.float32(-12.0)
+"""Opacity of what is taken away until its place is used for something else: no ray takes note of it."""
 
 
 class Trainer:
@@ -34,6 +42,8 @@ class Trainer:
         listener: hears the progress.
         threads: for everything; 0 means all cores.
         should_stop: asked wherever a run may stop, see :class:`engine.train.schedule.Schedule`.
+        scale_floor: what no scale falls below.
+        near_zones: where no Gaussian stays, whatever the strategy does.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: likewise.
         onlooker: shown the iterations done and the tracer as it is then, after each; it may trace without
@@ -43,6 +53,7 @@ class Trainer:
         state: where the training stands.
         schedule: when what happens.
         shading: the shading model.
+        views: how well the exported Gaussians show the training views, once they are there.
 
     Raises:
         ConfigError: the settings do not suit the photographs.
@@ -59,18 +70,23 @@ class Trainer:
         listener: Listener,
         threads: int = 0,
         should_stop: Callable[[], bool] = lambda: False,
+        scale_floor: ScaleFloor | None = None,
+        near_zones: NearZones | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
         onlooker: Callable[[int, Tracer], None] | None = None,
     ) -> None:
         self.state = state
         self._onlooker = onlooker
+        self._scale_floor = scale_floor
+        self._near_zones = near_zones
         self._config = config
         self._folder = folder
         self._fingerprint = fingerprint
         self._tell = listener
         self._should_stop = should_stop
         self._extent = dataset.extent
+        self._threads = threads
         self._batches = BatchSource(dataset, config)
         pixels = self._batches.sampler.pixel_count
         self.schedule = Schedule.of(config, pixels)
@@ -90,6 +106,11 @@ class Trainer:
             tracer = make_tracer(config.trace, threads=threads, box_padding=config.box_padding)
         self._machinery = Machinery(tracer, self.shading, densifier)
         self._judge = Judge(dataset, config, folder, listener)
+        self._names = [view.name for view in dataset.views]
+        self._view_judge = ViewJudge(dataset, config)
+        self.views: TrainingViews | None = None
+        if len(state.left_out):
+            self._batches.leave_out(state.left_out)
 
     def run(self) -> FlatGaussians:
         """Train to the end and return the Gaussians to export: the last ones, or the best if those collapsed.
@@ -108,23 +129,39 @@ class Trainer:
         while True:
             if schedule.rebuilds(state.iteration, len(state.gaussians)):
                 state.raise_degree(schedule.sh_degree(state.iteration))
+                if self._scale_floor is not None:
+                    self._scale_floor.hold(state.gaussians)
                 self._build()
                 self._pause(watch, resumed=0 < state.iteration == began_at)
             elif stale:
                 self._build()
             if schedule.ends(state.iteration):
-                return self._judge.choose(state, machinery.tracer, machinery.shading)
+                return self._conclude()
             batch = batches.draw(state.rng)
-            if not self._draws_or_stops(state.iteration + 1):
+            if self._threads != 1 and not self._draws_or_stops(state.iteration + 1):
                 batches.begin(state.rng)
             progress = schedule.progress(state.iteration)
             found = iterate(state, batch, machinery, self._config, progress=progress, extent=self._extent)
-            stale = schedule.may_densify(state.iteration) and self._densify()
+            stale = schedule.may_densify(state.iteration) and self._change()
             if schedule.tells(state.iteration):
                 self._report(found, watch, state.iteration - began_at)
             if self._onlooker is not None and not stale:
                 with watch.held():
                     self._onlooker(state.iteration, machinery.tracer)
+
+    def _conclude(self) -> FlatGaussians:
+        """The Gaussians to export, seen once more from all views."""
+        state, machinery = self.state, self._machinery
+        chosen = self._judge.choose(state, machinery.tracer, machinery.shading)
+        if self._near_zones is not None and (near := self._near_zones.holds(chosen.means_world)).any():
+            state.taken_near += int((near & (chosen.opacity_logits > GONE_LOGIT)).sum())
+            chosen = chosen.select(np.flatnonzero(~near))
+        if chosen is not state.gaussians:
+            machinery.tracer.build(chosen, machinery.shading.features(chosen))
+        self.views = self._view_judge.conclude(machinery.tracer, machinery.shading, state.left_out)
+        if (complaint := self.views.complaint()) is not None:
+            self._tell(Warned(complaint))
+        return chosen
 
     def _draws_or_stops(self, done: int) -> bool:
         """Whether, that far, anything but a batch draws from the generator or keeps its state."""
@@ -152,11 +189,29 @@ class Trainer:
                 state.seconds = seconds
                 if measuring:
                     self._judge.inspect(state, self._machinery.tracer, self._machinery.shading)
+                    self._leave_out()
                 self._save()
         if stopping:
             raise Cancelled(
                 f"Stopped after iteration {state.iteration} of {schedule.iterations}; "
                 "the same command with --resume goes on."
+            )
+
+    def _leave_out(self) -> None:
+        """Find views that do not fit, and train without them from here on."""
+        state, done = self.state, self.state.iteration
+        if not (self._config.leave_out_misfits and self.schedule.judges_views(done)):
+            return
+        found = self._view_judge.misfits(self._machinery.tracer, self._machinery.shading, state.left_out)
+        if len(found):
+            state.left_out = np.sort(np.concatenate([state.left_out, found]))
+            self._batches.leave_out(state.left_out)
+            names = ", ".join(self._names[i] for i in found.tolist())
+            self._tell(
+                Warned(
+                    f"From iteration {done} on these photographs are left out of the training, "
+                    f"since they do not fit the others: {names}."
+                )
             )
 
     def _save(self) -> None:
@@ -165,6 +220,23 @@ class Trainer:
         state.shading = self._machinery.shading.state()
         path = save_checkpoint(state, self._folder, self._fingerprint)
         self._tell(CheckpointWritten(state.iteration, str(path)))
+
+    def _change(self) -> bool:
+        """Change the set of Gaussians where that is due; whether it was."""
+        cleared = self._clear_near()  # first, so that the strategy can use those elsewhere
+        return self._densify() or cleared
+
+    def _clear_near(self) -> bool:
+        """Make what is too near to a camera invisible, and so dead to the strategy; whether any was."""
+        state, zones = self.state, self._near_zones
+        if zones is None or state.iteration % self._config.densify.interval:
+            return False
+        near = np.flatnonzero(zones.holds(state.gaussians.means_world))
+        near = near[state.gaussians.opacity_logits[near] > GONE_LOGIT]
+        state.gaussians.opacity_logits[near] = GONE_LOGIT
+        state.adam.reset(near)
+        state.taken_near += len(near)
+        return len(near) > 0
 
     def _densify(self) -> bool:
         """Let the strategy change the set of Gaussians if it is time; whether it was."""

@@ -1,4 +1,4 @@
-"""Opens an octagon mesh of octasplat in Blender, looking as octasplat renders it.
+"""Opens an octagon mesh of octasplat, a mesh PLY or a GLB, in Blender, looking as octasplat renders it.
 
 From a shell, with Blender 4.2 or later, to make a .blend that opens with a click::
 
@@ -9,8 +9,10 @@ In Blender: Scripting > Open > this file, write the path of a mesh behind ``MESH
 
 What it sets, and why:
 
-* Colours are composited as display values, so the mesh emits the raw numbers of the file and the view
-  transform is Raw. Any other view transform blends linear light, which is another picture.
+* Colours are composited as display values, so the mesh emits them as if they were light (those of a GLB,
+  which are linear, go through sRGB's curve first), and the view transform is Raw. With ``--view standard`` it
+  is Standard, for scenes with other things in them, and the compositor turns the picture into light after it
+  was blended (Convert Colorspace, from sRGB to Linear Rec.709): the same picture.
 * The fall-off of a Gaussian comes from the texture coordinates: opacity * exp(-Q/2 |2 uv - 1|^2).
 * Each ray may pass 256 transparent octagons, and is not ended early by chance (Cycles does so by default).
 * The object is turned upright: the scene's y points down, Blender's z points up. Export with
@@ -20,6 +22,7 @@ What it sets, and why:
 import argparse
 import json
 import math
+import struct
 import sys
 from pathlib import Path
 
@@ -72,31 +75,71 @@ def check(path):
     return float(stated[0]) if stated else DEFAULT_Q
 
 
+def check_glb(path):
+    """The quantile Q of a GLB of octagons; ends with a sentence if the file is something else."""
+    if not path.is_file():
+        raise SystemExit(f"{path}: there is no such file.")
+    with path.open("rb") as handle:
+        start = handle.read(20)
+        if len(start) < 20 or start[:4] != b"glTF":
+            raise SystemExit(f"{path}: is not a GLB file; name the mesh.glb of a run.")
+        try:
+            document = json.loads(handle.read(struct.unpack_from("<I", start, 12)[0]))
+            q = float(document["asset"]["extras"]["octasplat_q"])
+        except (ValueError, KeyError, TypeError):
+            raise SystemExit(f"{path}: holds no octagons; import it by File > Import > glTF.") from None
+    if "KHR_materials_unlit" not in document.get("extensionsUsed", []):
+        raise SystemExit(f"{path}: is to be lit, as any glTF; import it by File > Import > glTF.")
+    return q
+
+
 def clear_scene():
     """An empty file without the cube."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
 def import_octagons(path):
-    """Import the mesh with its material, upright; returns the object."""
+    """Import the mesh with its material, upright; returns its objects, one of a PLY."""
+    if path.suffix.lower() == ".glb":
+        return import_glb(path)
     q = check(path)
     before = set(bpy.data.objects)
     bpy.ops.wm.ply_import(
         filepath=str(path), import_colors="LINEAR", import_attributes=True, forward_axis="Y", up_axis="Z"
     )
     (octagons,) = set(bpy.data.objects) - before
-    octagons.data.materials.clear()
-    octagons.data.materials.append(octagon_material(q, octagons.data.color_attributes[0].name))
-    octagons["octasplat_q"] = q
+    set_material(octagons, octagon_material(q, octagons.data.color_attributes[0].name), q)
     upright = bpy.data.objects.new("octasplat_upright", None)
     bpy.context.scene.collection.objects.link(upright)
     octagons.parent = upright
     octagons.matrix_parent_inverse = BLENDER_FROM_WORLD  # a matrix, not angles: exact, and undone exactly
-    return octagons
+    return [octagons]
 
 
-def octagon_material(q, colours):
-    """Emission of the raw colours, mixed with transparency by the Gaussian's alpha."""
+def import_glb(path):
+    """The chunks of a GLB, which come upright."""
+    q = check_glb(path)
+    before = set(bpy.data.objects)
+    bpy.ops.import_scene.gltf(filepath=str(path))
+    chunks = [made for made in bpy.data.objects if made not in before and made.type == "MESH"]
+    material = octagon_material(q, chunks[0].data.color_attributes[0].name, linear=True)
+    for chunk in chunks:
+        set_material(chunk, material, q)
+    return chunks
+
+
+def set_material(octagons, material, q):
+    """Give an object its material, and say what it is."""
+    octagons.data.materials.clear()
+    octagons.data.materials.append(material)
+    octagons["octasplat_q"] = q
+
+
+def octagon_material(q, colours, linear=False):
+    """Emission of display colours, mixed with transparency by the Gaussian's alpha.
+
+    With ``linear`` the colour attribute is linear and goes through sRGB's curve.
+    """
     material = bpy.data.materials.new("octagons")
     if not material.node_tree:
         material.use_nodes = True
@@ -120,13 +163,24 @@ def octagon_material(q, colours):
     def vectors(operation, *inputs):
         return node("ShaderNodeVectorMath", tuple(enumerate(inputs)), operation=operation)
 
+    def display(value):
+        """12.92 v where v is at most 0.0031308, else 1.055 v^(1 / 2.4) - 0.055."""
+        low = maths("MULTIPLY", value, 12.92)
+        high = maths("MULTIPLY_ADD", maths("POWER", value, 1.0 / 2.4), 1.055, -0.055)
+        bright = maths("GREATER_THAN", value, 0.0031308)
+        return maths("ADD", low, maths("MULTIPLY", bright, maths("SUBTRACT", high, low)))
+
     uv = node("ShaderNodeUVMap", uv_map="UVMap").outputs["UV"]
     offset = vectors("SUBTRACT", uv, (0.5, 0.5, 0.0)).outputs["Vector"]
     square = vectors("DOT_PRODUCT", offset, offset).outputs["Value"]
     fall_off = maths("EXPONENT", maths("MULTIPLY", square, -2.0 * q))
     colour = node("ShaderNodeAttribute", attribute_type="GEOMETRY", attribute_name=colours)
     alpha = maths("MULTIPLY", fall_off, colour.outputs["Alpha"])
-    glow = node("ShaderNodeEmission", [("Color", colour.outputs["Color"]), ("Strength", 1.0)])
+    shown = colour.outputs["Color"]
+    if linear:
+        parts = node("ShaderNodeSeparateColor", [(0, shown)]).outputs
+        shown = node("ShaderNodeCombineColor", [(k, display(parts[k])) for k in range(3)]).outputs[0]
+    glow = node("ShaderNodeEmission", [("Color", shown), ("Strength", 1.0)])
     clear = node("ShaderNodeBsdfTransparent")
     mix = node(
         "ShaderNodeMixShader",
@@ -137,8 +191,8 @@ def octagon_material(q, colours):
     return material
 
 
-def set_up_scene(samples):
-    """Cycles for transparency, raw colours, black behind the scene."""
+def set_up_scene(samples, view="raw"):
+    """Cycles for transparency, display values as they are (``view``: raw or standard), black behind."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
@@ -154,8 +208,10 @@ def set_up_scene(samples):
     scene.render.image_settings.file_format = "PNG"
     scene.render.image_settings.color_mode = "RGB"
     scene.display_settings.display_device = "sRGB"
-    scene.view_settings.view_transform = "Raw"
+    scene.view_settings.view_transform = "Raw" if view == "raw" else "Standard"
     scene.view_settings.look = "None"
+    if view == "standard":
+        light_after_blending(scene)
     world = bpy.data.worlds.new("black")
     if not world.node_tree:
         world.use_nodes = True
@@ -167,9 +223,61 @@ def set_up_scene(samples):
                 area.spaces[0].shading.type = "MATERIAL"
 
 
+def light_after_blending(scene):
+    """Let the compositor turn rendered display values into light, which the Standard view turns back."""
+    if hasattr(scene, "compositing_node_group"):  # Blender 5
+        tree = bpy.data.node_groups.new("octasplat", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        scene.compositing_node_group = tree
+        output = tree.nodes.new("NodeGroupOutput")
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+        tree.nodes.clear()
+        output = tree.nodes.new("CompositorNodeComposite")
+    scene.render.use_compositing = True
+    rendered = tree.nodes.new("CompositorNodeRLayers")
+    convert = tree.nodes.new("CompositorNodeConvertColorSpace")
+    convert.from_color_space, convert.to_color_space = "sRGB", "Linear Rec.709"
+    tree.links.new(rendered.outputs["Image"], convert.inputs[0])
+    tree.links.new(convert.outputs[0], output.inputs[0])
+
+
+def path_of_views(content):
+    """The places of a run's photographs (its ``views.json``) as a camera path, without distortion."""
+    width, height = (content["views"][0][name] for name in ("width_px", "height_px"))
+    frames = []
+    for view in content["views"]:
+        camera = content["cameras"][view["camera"]]
+        single = camera["model"].startswith(("SIMPLE_", "RADIAL"))
+        fx, fy, cx, cy = [camera["params"][0], *camera["params"][:3]] if single else camera["params"][:4]
+        across, down = width / camera["width_px"], height / camera["height_px"]
+        from_world = Matrix.Translation(view["translation_cam_from_world"])
+        from_world @= Matrix(view["rotation_cam_from_world"]).to_4x4()
+        frames.append(
+            {
+                "camera_to_world": [list(row) for row in from_world.inverted()],
+                "fx": fx * across, "fy": fy * down, "cx": cx * across, "cy": cy * down,
+            }
+        )  # fmt: skip
+    return {
+        "width": width,
+        "height": height,
+        "frames": frames,
+        "names": [v["name"] for v in content["views"]],
+    }
+
+
 def add_cameras(path):
-    """One camera that takes the poses of a camera path (as ``octasplat render --path``) frame by frame."""
+    """One camera that takes the poses of a camera path (as ``octasplat render --path``) frame by frame.
+
+    The ``views.json`` of a run will do, too: its photographs' places, each a marker with its name.
+    """
     content = json.loads(path.read_text(encoding="utf-8"))
+    if "views" in content:
+        content = path_of_views(content)
+    for number, name in enumerate(content.get("names", ()), 1):
+        bpy.context.scene.timeline_markers.new(name, frame=number)
     width, height = content["width"], content["height"]
     scene, camera = bpy.context.scene, new_camera()
     scene.render.resolution_x, scene.render.resolution_y = width, height
@@ -206,15 +314,18 @@ def add_cameras(path):
 
 def add_default_camera(octagons):
     """A camera in front of the middle half of the vertices, which distant background does not move."""
-    count = len(octagons.data.vertices)
-    flat = [0.0] * (3 * count)
-    octagons.data.vertices.foreach_get("co", flat)
+    places = []
+    for item in octagons:
+        flat = [0.0] * (3 * len(item.data.vertices))
+        item.data.vertices.foreach_get("co", flat)
+        places += flat
     ranges = []
     for axis in range(3):
-        values = sorted(flat[axis::3])
+        values = sorted(places[axis::3])
+        count = len(values)
         ranges.append((values[count // 4], values[count // 2], values[(3 * count) // 4]))
     bpy.context.view_layer.update()
-    centre = octagons.matrix_world @ Vector([middle for _, middle, _ in ranges])
+    centre = octagons[0].matrix_world @ Vector([middle for _, middle, _ in ranges])
     size = max(max(high - low for low, _, high in ranges), 1e-6)
     camera = new_camera()
     camera.location = centre + Vector((0.0, -4.0, 1.0)) * size
@@ -237,18 +348,21 @@ def new_camera():
 def main(arguments):
     """Make the .blend, and the images if asked for."""
     parser = argparse.ArgumentParser(prog="import_octasplat.py", description="Octagon meshes into Blender.")
-    parser.add_argument("mesh", type=Path, help="the mesh.ply of a run, or an export named *.mesh.ply")
+    parser.add_argument("mesh", type=Path, help="mesh.ply or mesh.glb of a run, or an export of either")
     parser.add_argument("blend", type=Path, help="the .blend to write")
     parser.add_argument(
         "--cameras", type=Path, help="a camera path in JSON, as octasplat render --path takes"
     )
     parser.add_argument("--samples", type=int, default=16, help="Cycles samples per pixel (default: 16)")
+    parser.add_argument(
+        "--view", choices=("raw", "standard"), default="raw", help="the view transform (default: raw)"
+    )
     parser.add_argument("--render", type=Path, help="also render the first frame to this PNG")
     given = parser.parse_args(arguments)
-    check(given.mesh)
+    (check_glb if given.mesh.suffix.lower() == ".glb" else check)(given.mesh)
     clear_scene()
     octagons = import_octagons(given.mesh)
-    set_up_scene(given.samples)
+    set_up_scene(given.samples, given.view)
     if given.cameras:
         add_cameras(given.cameras)
     else:

@@ -22,7 +22,7 @@ from engine.render.paths import look_at
 from engine.render.renderer import render_rays
 from engine.render.video import VideoWriter
 from engine.surface.mesh import TriangleMesh
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import Tracer
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import binary_fill_holes, distance_transform_edt
 
 from engine.edit.deform import deform_to, deformation_corners
-from engine.edit.kernels_proxy import winding_numbers
+from engine.edit.kernels_mean_value import winding_numbers
 from engine.gaussians.model import FlatGaussians
 from engine.surface.compare import distances_to_surface, sample_surface
 from engine.surface.mesh import TriangleMesh

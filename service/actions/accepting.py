@@ -102,8 +102,8 @@ async def retry_job(
         owner = (await owned_job(connection, who, job_id)).owner
 
         async def make() -> uuid.UUID:
-            await check_new_job(connection, owner, service.settings.quota)
             job = await owned_job(connection, who, job_id, lock=True)
+            await check_new_job(connection, owner, service.settings.quota)
             options, estimate = await _revised(connection, service, who, job, asked)
             await rows.retry_job(
                 connection,
@@ -122,8 +122,8 @@ async def retry_job(
 
 async def _make_job(connection: Connection, service: Service, who: Principal, asked: _Asked) -> uuid.UUID:
     new, kind = asked.new, asked.kind
-    await check_new_job(connection, who.owner, service.settings.quota)
     inputs = await _inputs(connection, who, asked)
+    await check_new_job(connection, who.owner, service.settings.quota)
     workers = await workers_of(connection, new.queue, service.settings.stale_seconds)
     check_writable(kind, inputs.options, new.queue, workers)
     sizes = await photograph_sizes(connection, inputs.dataset_id) if inputs.dataset_id is not None else []

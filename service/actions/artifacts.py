@@ -1,12 +1,12 @@
 """Results of jobs, and pictures of scenes in the making."""
 
-import asyncio
 import uuid
 
 from service.actions.access import owned_job, read_job, sought
 from service.auth import Principal
 from service.problems import not_found
 from service.state import Service
+from service.threads import Threads, in_thread
 from workers.queue import jobs as rows
 from workers.records.rows import Artifact
 from workers.store.protocol import Blob
@@ -49,4 +49,4 @@ async def get_preview(service: Service, who: Principal, job_id: uuid.UUID) -> Bl
     job = await read_job(service, who, job_id)
     if job.preview is None:
         raise not_found("picture yet")
-    return await asyncio.to_thread(service.storage.stat, job.preview["sha256"])
+    return await in_thread(Threads.DOWNLOADS, service.storage.stat, job.preview["sha256"])

@@ -3,8 +3,12 @@
 import asyncio
 import uuid
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
+
+import psycopg
+from psycopg_pool import PoolTimeout
 
 from service.actions.access import owned_dataset
 from service.actions.parts import Part, cut
@@ -15,6 +19,7 @@ from service.intake.dataset import DatasetSummary, check_dataset
 from service.intake.inputs import check_inputs
 from service.schemas.datasets import DatasetChange, NewDataset
 from service.state import Service
+from service.threads import Threads, in_thread
 from workers.records import datasets as rows
 from workers.records.quotas import check_new_dataset
 from workers.records.rows import Dataset, DatasetFile
@@ -102,27 +107,45 @@ async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
     """Check a dataset; one that is sound never changes again.
 
     Raises:
-        Problem: 404.
+        Problem: 404; 429 with too many that wait to be checked.
         Conflict: it is being checked.
         IntakeRefused: it is not sound.
     """
     async with service.pool.connection() as connection:
-        await owned_dataset(connection, who, dataset_id)
+        owner = (await owned_dataset(connection, who, dataset_id)).owner
+    async with service.checks.passed(owner):
+        return await _check(service, dataset_id)
+
+
+async def _check(service: Service, dataset_id: uuid.UUID) -> Dataset:
+    async with service.pool.connection() as connection:
         before = await rows.begin_check(connection, dataset_id)
         if before.state == "committed":
             return before
         files = await rows.files_of(connection, dataset_id)
     summary: DatasetSummary | dict[str, Any] | None = None
+    renewing = asyncio.create_task(_renew_check(service, dataset_id))
     try:
         known = [_for_intake(f) for f in files]
         if before.holds == "files":
             summary = check_inputs(known)
         else:
-            summary = await asyncio.to_thread(check_dataset, service.storage, known)
+            limits = service.settings.dataset_limits()
+            summary = await in_thread(Threads.CHECKS, check_dataset, service.storage, known, limits)
     finally:
+        renewing.cancel()
         # Whatever happens, the dataset must not stay closed.
         dataset = await asyncio.shield(_end_check(service, dataset_id, summary))
     return dataset
+
+
+async def _renew_check(service: Service, dataset_id: uuid.UUID) -> None:
+    """Say now and then that the check is under way; without that others take it for lost."""
+    while True:
+        await asyncio.sleep(rows.CHECK_LOST_SECONDS / 6)
+        with suppress(psycopg.Error, PoolTimeout):
+            async with service.pool.connection() as connection:
+                await rows.renew_check(connection, dataset_id)
 
 
 async def _end_check(

@@ -10,6 +10,8 @@ from service.limits import ceilings_by_path
 from service.problems import not_found
 from service.schemas.system import FormatView, InfoView, KindView, QueueList, QueueView, WorkerView
 from service.state import Service
+from service.threads import Threads, in_thread
+from workers.isolation.abilities import abilities
 from workers.queue.jobs import queue_depths, running_by_queue
 from workers.queue.numbers import read_numbers
 from workers.records.migrate import missing_steps
@@ -17,6 +19,9 @@ from workers.records.rows import WorkerRow
 from workers.records.workers import live_workers
 from workers.store.errors import StorageError
 from workers.work.kinds import JobKind, job_kinds, kind_named
+
+STORAGE_SECONDS = 3.0
+"""A store that takes longer to answer is not ready."""
 
 
 def list_kinds(service: Service) -> list[KindView]:
@@ -49,6 +54,7 @@ def describe(service: Service, who: Principal) -> InfoView:
         needs_token=service.has_tokens or not service.settings.is_private,
         owner=who.owner,
         scopes=sorted(who.scopes),
+        isolation=abilities(),
     )
 
 
@@ -88,7 +94,7 @@ async def check_readiness(service: Service) -> dict[str, str]:
     """Whether requests can be served, part by part: ``ok``, or what ails it."""
     return {
         "database": await _check_database(service),
-        "storage": await asyncio.to_thread(_check_storage, service),
+        "storage": await _check_storage(service),
         "service": "draining" if service.draining else "ok",
     }
 
@@ -97,7 +103,7 @@ async def render_metrics(service: Service) -> bytes:
     """How the service fares, in the format of Prometheus."""
     async with service.pool.connection() as connection:
         numbers = await read_numbers(connection, service.settings.stale_seconds)
-    free_bytes = await asyncio.to_thread(_free_bytes, service)
+    free_bytes = await in_thread(Threads.LOOKS, _free_bytes, service)
     return service.metrics.render(numbers, streams=service.hub.streams, free_bytes=free_bytes)
 
 
@@ -117,8 +123,20 @@ async def _check_database(service: Service) -> str:
     return "ok" if not missing_steps(applied) else "outdated"
 
 
-def _check_storage(service: Service) -> str:
+async def _check_storage(service: Service) -> str:
+    """Looked at once for all who ask meanwhile; a store that hangs takes no more than one thread."""
+    if service.storage_look is None or service.storage_look.done():
+        service.storage_look = asyncio.ensure_future(in_thread(Threads.LOOKS, _look_at_storage, service))
     try:
+        async with asyncio.timeout(STORAGE_SECONDS):
+            return await asyncio.shield(service.storage_look)
+    except TimeoutError:
+        return "unreachable"
+
+
+def _look_at_storage(service: Service) -> str:
+    try:
+        service.storage.check()
         free = service.storage.free_bytes()
     except StorageError:
         return "unreachable"

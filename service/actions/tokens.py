@@ -2,11 +2,13 @@
 
 import uuid
 
-from service.problems import not_found
-from service.schemas.tokens import MadeToken, NewToken, TokenView
+from service.auth import Principal
+from service.problems import Problem, not_found
+from service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenView
 from service.state import Service
 from workers.records import tokens as rows
 from workers.records.rows import Token
+from workers.records.sessions import add_link
 
 
 async def list_tokens(service: Service) -> list[Token]:
@@ -19,7 +21,14 @@ async def make_token(service: Service, new: NewToken) -> MadeToken:
     """Make a token. From the first one on, nobody gets in without."""
     secret = rows.new_secret()
     async with service.pool.connection() as connection:
-        token = await rows.add_token(connection, secret, owner=new.owner, name=new.name, scopes=new.scopes)
+        token = await rows.add_token(
+            connection,
+            secret,
+            owner=new.owner,
+            name=new.name,
+            scopes=new.scopes,
+            hours=new.hours or service.settings.token_hours or None,
+        )
     service.forget_tokens()
     return MadeToken(**TokenView.of(token).model_dump(), token=secret)
 
@@ -34,3 +43,16 @@ async def revoke_token(service: Service, token_id: uuid.UUID) -> None:
         if not await rows.revoke_token(connection, token_id):
             raise not_found("token")
     service.forget_tokens()
+
+
+async def make_link(service: Service, who: Principal) -> SignInLink:
+    """Make a link that signs in once.
+
+    Raises:
+        Problem: 409 where nobody needs to sign in.
+    """
+    if who.token_id is None:
+        raise Problem(409, "no-token", "There are no tokens, so nobody has to sign in.")
+    async with service.pool.connection() as connection:
+        secret = await add_link(connection, who.token_id)
+    return SignInLink(path=f"/sign-in/once?key={secret}")

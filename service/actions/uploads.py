@@ -164,7 +164,7 @@ async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, u
         return receive_archive(
             service.storage,
             upload.body,
-            service.settings.work_folder / "archives",
+            service.spool,
             sha256=upload.sha256,
             size_bytes=upload.size_bytes,
             limits=service.settings.upload_limits(),
@@ -204,7 +204,7 @@ async def _enter(
     """Enter what is stored into the dataset, or none of it."""
     service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received))
     async with service.pool.connection() as connection, connection.transaction():
-        await note.confirm(connection)
+        await note.confirm(connection, {file.blob.sha256 for file in received})
         files = [
             await rows.put_file(connection, dataset.id, f.path, f.blob.sha256, f.blob.size_bytes, f.facts)
             for f in received

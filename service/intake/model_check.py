@@ -7,7 +7,7 @@ import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -17,6 +17,7 @@ from service.intake.faults import Fault
 from service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
 from workers.store.protocol import Storage
 from workers.store.trees import TreeFile, fetch_tree
+from workers.work.memory import total_bytes
 
 MIN_VIEWS = 3
 """Fewer photographs do not make a scene; as in the engine."""
@@ -30,14 +31,17 @@ class ModelLimits:
     """What parsing a model may take.
 
     Attributes:
-        memory_bytes: address space of the child; some 0.6 GB of it are the libraries.
+        memory_bytes: address space of the child; some 0.6 GB of it are the libraries. By default a quarter of
+            the machine's memory, but 2 GiB at least and 6 GiB at most.
         seconds: time.
         max_model_bytes: length of the model's files together.
+        hidden: folders that the child cannot open.
     """
 
-    memory_bytes: int = 6 << 30
+    memory_bytes: int = field(default_factory=lambda: min(6 << 30, max(2 << 30, total_bytes() // 4)))
     seconds: int = 120
     max_model_bytes: int = 4 << 30
+    hidden: tuple[Path, ...] = ()
 
 
 def check_model(
@@ -74,6 +78,7 @@ def check_model(
             min_views=MIN_VIEWS,
             memory_bytes=limits.memory_bytes,
             cpu_seconds=limits.seconds,
+            hidden=limits.hidden,
         )
         return _ask(request, limits)
 

@@ -2,7 +2,8 @@
 
     python -P -m service.intake.model_child < request.json > answer.json
 
-It limits its own memory, time and output before it imports anything that parses. Only this module's ``main``
+It limits its own memory, time and output, and gives up the network, other programs and writing, before it
+imports anything that parses. Only this module's ``main``
 imports pycolmap. The parent is :mod:`service.intake.model_check`; what it sends and receives is defined here.
 """
 
@@ -18,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from service.intake.faults import Fault
+from workers.isolation.confining import confine
+from workers.isolation.kernel import PR_SET_PDEATHSIG, prctl
 from workers.store.names import NameRefused, check_name, shown_name
 
 if TYPE_CHECKING:
@@ -27,7 +30,6 @@ MAX_ANSWER_BYTES = 4 << 20
 MAX_FAULTS = 100
 _MAX_COORDINATE = 1e12
 _UNIT_TOLERANCE = 1e-3
-_PARENT_DIED = 1  # PR_SET_PDEATHSIG
 
 
 class ModelRequest(BaseModel):
@@ -40,6 +42,7 @@ class ModelRequest(BaseModel):
         min_views: fewer posed photographs do not make a scene.
         memory_bytes: address space.
         cpu_seconds: processor time.
+        hidden: folders that are nothing to it.
     """
 
     root: Path
@@ -48,6 +51,7 @@ class ModelRequest(BaseModel):
     min_views: int
     memory_bytes: int
     cpu_seconds: int
+    hidden: tuple[Path, ...] = ()
 
 
 class ModelAnswer(BaseModel):
@@ -249,10 +253,8 @@ def _relative(sentence: str, root: Path) -> str:
 
 def _limit(request: ModelRequest) -> None:
     """Give up what a parser does not need, for good."""
-    if sys.platform == "linux":
-        import ctypes
-
-        ctypes.CDLL(None).prctl(_PARENT_DIED, signal.SIGKILL)
+    with contextlib.suppress(OSError):
+        prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     for kind, value in (
         (resource.RLIMIT_AS, request.memory_bytes),
         (resource.RLIMIT_CPU, request.cpu_seconds),
@@ -261,6 +263,7 @@ def _limit(request: ModelRequest) -> None:
     ):
         with contextlib.suppress(ValueError):  # already lower
             resource.setrlimit(kind, (value, value))
+    confine(hidden=request.hidden, read=(request.root,), may_start_processes=False, elsewhere_reads_only=True)
 
 
 if __name__ == "__main__":

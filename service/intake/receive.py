@@ -7,13 +7,14 @@ import re
 import tempfile
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import BinaryIO
 
 from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
 from service.intake.dataset import DatasetLimits, check_file_content
 from service.intake.faults import Fault, IntakeRefused
 from service.intake.images import ImageHeader, ImageLimits
+from service.intake.spool import Spool
+from service.threads import Threads, in_thread
 from workers.store.counting import CountingWriter
 from workers.store.os_errors import told
 from workers.store.protocol import Blob, BlobWriter, Storage
@@ -131,13 +132,13 @@ async def receive(stream: AsyncIterator[bytes], writer: BlobWriter, *, idle_seco
                 raise IntakeRefused(Fault("upload-stalled", detail)) from None
             pending += piece
             if len(pending) >= PIECE_BYTES:
-                await asyncio.to_thread(writer.write, bytes(pending))
+                await in_thread(Threads.UPLOADS, writer.write, bytes(pending))
                 pending.clear()
         if pending:
-            await asyncio.to_thread(writer.write, bytes(pending))
-        return await asyncio.to_thread(writer.commit)
+            await in_thread(Threads.UPLOADS, writer.write, bytes(pending))
+        return await in_thread(Threads.UPLOADS, writer.commit)
     except BaseException:
-        await asyncio.shield(asyncio.to_thread(writer.abort))
+        await asyncio.shield(in_thread(Threads.UPLOADS, writer.abort))
         raise
 
 
@@ -169,16 +170,18 @@ async def receive_file(
         StorageError: as by :func:`receive`.
     """
     most = limits.max_file_bytes if max_bytes is None else min(limits.max_file_bytes, max_bytes)
-    writer = await asyncio.to_thread(storage.begin, sha256=sha256, size_bytes=size_bytes, max_bytes=most)
+    writer = await in_thread(
+        Threads.UPLOADS, storage.begin, sha256=sha256, size_bytes=size_bytes, max_bytes=most
+    )
     blob = await receive(stream, writer, idle_seconds=limits.idle_seconds)
-    header = await asyncio.to_thread(check, storage, path, blob.sha256, limits.dataset.image)
+    header = await in_thread(Threads.UPLOADS, check, storage, path, blob.sha256, limits.dataset.image)
     return ReceivedFile(path, blob, header_facts(header))
 
 
 async def receive_archive(
     storage: Storage,
     stream: AsyncIterator[bytes],
-    spool: Path,
+    spool: Spool,
     *,
     sha256: str | None = None,
     size_bytes: int | None = None,
@@ -190,7 +193,7 @@ async def receive_archive(
     Args:
         storage: where to.
         stream: the body.
-        spool: folder for the archive while it is read; the file there has no name and ends with the process.
+        spool: for the archive while it is read; the file there has no name and ends with the process.
         sha256: digest that was announced.
         size_bytes: length that was announced.
         limits: what is taken.
@@ -201,13 +204,12 @@ async def receive_archive(
         StorageError: as by :func:`receive`.
     """
     most = limits.max_archive_bytes if max_bytes is None else min(limits.max_archive_bytes, max_bytes)
-    with told(spool):
-        spool.mkdir(parents=True, exist_ok=True, mode=0o700)
-        file = tempfile.TemporaryFile(dir=spool)  # noqa: SIM115 - closed below
-    with file:
-        writer = _SpoolWriter(file, spool, storage, sha256, size_bytes, most)
+    with told(spool.folder):
+        spool.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        file = tempfile.TemporaryFile(dir=spool.folder)  # noqa: SIM115 - closed below
+    with file, _SpoolWriter(file, spool, storage, sha256, size_bytes, most) as writer:
         blob = await receive(stream, writer, idle_seconds=limits.idle_seconds)
-        files, left_out = await asyncio.to_thread(_unpack, storage, file, limits, max_bytes)
+        files, left_out = await in_thread(Threads.UNPACKING, _unpack, storage, file, limits, max_bytes)
     return ReceivedArchive(files, left_out, blob.size_bytes)
 
 
@@ -245,34 +247,44 @@ def _unpack(
 
 
 class _SpoolWriter(CountingWriter):
-    """Writes an archive into a nameless file of this machine."""
+    """Writes an archive into a nameless file of this machine; its room is taken until the context ends."""
 
     def __init__(
         self,
         file: BinaryIO,
-        folder: Path,
+        spool: Spool,
         storage: Storage,
         sha256: str | None,
         size_bytes: int | None,
         max_bytes: int | None,
     ) -> None:
         self._file = file
-        self._folder = folder
+        self._spool = spool
         self._storage = storage
-        self._until_check = 0
+        self._taken_bytes = self._put_bytes = 0
         super().__init__(sha256, size_bytes, max_bytes)
         storage.ensure_room(size_bytes or 0)
+        self._take(size_bytes or 0)
+
+    def __exit__(self, *exception: object) -> None:
+        super().__exit__(*exception)
+        self._spool.give_back(self._taken_bytes)
+        self._taken_bytes = 0
 
     def _put(self, data: bytes | memoryview) -> None:
-        self._until_check -= len(data)
-        if self._until_check < 0:
+        self._put_bytes += len(data)
+        if self._put_bytes > self._taken_bytes:
             self._storage.ensure_room(len(data))
-            self._until_check = _CHECK_EVERY_BYTES
-        with told(self._folder):
+            self._take(max(len(data), _CHECK_EVERY_BYTES))
+        with told(self._spool.folder):
             self._file.write(data)
 
+    def _take(self, size_bytes: int) -> None:
+        self._spool.take(size_bytes)
+        self._taken_bytes += size_bytes
+
     def _publish(self, blob: Blob) -> None:
-        with told(self._folder):
+        with told(self._spool.folder):
             self._file.flush()
 
     def _discard(self) -> None:

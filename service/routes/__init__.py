@@ -6,18 +6,18 @@ from service.problems import MEDIA_TYPE, ProblemDocument
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """How errors of these statuses are described in OpenAPI; 400, 401 and 503 are everywhere."""
+    """How errors of these statuses are described in OpenAPI; 400, 401, 429 and 503 are everywhere."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}}
     names = {
         400: "Malformed", 401: "No valid token", 403: "The token's scope does not suffice",
         404: "There is no such thing, or it is not yours", 408: "The upload stalled",
         409: "Its state does not allow that", 410: "The content is gone", 412: "It has changed",
         413: "Too long", 416: "No such range", 421: "A foreign host name", 422: "Refused; see errors",
-        503: "Try again later", 507: "No room",
+        429: "Too many requests, or wrong tokens", 503: "Try again later", 507: "No room",
     }  # fmt: skip
     return {
         status: {"description": names[status], "content": content, "model": None}
-        for status in sorted({400, 401, 403, 421, 422, 503, *statuses})
+        for status in sorted({400, 401, 403, 421, 422, 429, 503, *statuses})
     }
 
 

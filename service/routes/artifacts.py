@@ -1,6 +1,5 @@
 """Results of jobs, and pictures of scenes in the making."""
 
-import asyncio
 import uuid
 from typing import Annotated
 
@@ -12,6 +11,7 @@ from service.downloads import send_blob
 from service.routes import problems
 from service.schemas.artifacts import ArtifactList, ArtifactView
 from service.state import ServiceDep
+from service.threads import Threads, in_thread
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
 
@@ -32,7 +32,8 @@ async def get_artifact_content(
 ) -> Response:  # fmt: skip
     """A result; `Range` and `If-Range` let a download go on."""
     row = await actions.get_artifact(service, who, job_id, name)
-    return await asyncio.to_thread(
+    return await in_thread(
+        Threads.DOWNLOADS,
         lambda: send_blob(
             service,
             request,
@@ -41,7 +42,7 @@ async def get_artifact_content(
             media_type=row.media_type,
             name=row.name,
             inline=inline,
-        )
+        ),
     )
 
 
@@ -53,7 +54,8 @@ async def get_artifact_content(
 async def get_preview(job_id: uuid.UUID, who: Reader, service: ServiceDep, request: Request) -> Response:
     """The newest picture of the scene in the making."""
     blob = await actions.get_preview(service, who, job_id)
-    response = await asyncio.to_thread(
+    response = await in_thread(
+        Threads.DOWNLOADS,
         lambda: send_blob(
             service,
             request,
@@ -61,7 +63,7 @@ async def get_preview(job_id: uuid.UUID, who: Reader, service: ServiceDep, reque
             size_bytes=blob.size_bytes,
             media_type="image/png",
             name="preview.png",
-        )
+        ),
     )
     response.headers["Cache-Control"] = "no-cache"
     return response

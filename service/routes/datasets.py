@@ -1,6 +1,5 @@
 """Datasets: made, filled file by file or by an archive, checked, read, deleted."""
 
-import asyncio
 import uuid
 from collections.abc import AsyncIterator
 from typing import Annotated
@@ -27,6 +26,7 @@ from service.schemas.datasets import (
     NewDataset,
 )
 from service.state import ServiceDep
+from service.threads import Threads, in_thread
 from workers.work.media_types import media_type
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
@@ -118,7 +118,8 @@ async def get_file(
 ) -> Response:
     """The content of a file."""
     row = await uploads.get_file(service, who, dataset_id, path)
-    return await asyncio.to_thread(
+    return await in_thread(
+        Threads.DOWNLOADS,
         lambda: send_blob(
             service,
             request,
@@ -126,7 +127,7 @@ async def get_file(
             size_bytes=row.size_bytes,
             media_type=media_type(row.path),
             name=row.path,
-        )
+        ),
     )
 
 

@@ -6,10 +6,10 @@ from fastapi import APIRouter, Response
 
 from service.actions import system as actions
 from service.actions import tokens
-from service.auth import Admin, Reader
+from service.auth import Admin, Reader, Writer
 from service.routes import problems
 from service.schemas.system import Health, InfoView, KindList, KindView, QueueList
-from service.schemas.tokens import MadeToken, NewToken, TokenList, TokenView
+from service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenList, TokenView
 from service.state import ServiceDep
 
 router = APIRouter(prefix="/v1", tags=["service"])
@@ -47,15 +47,23 @@ async def get_tokens(_who: Admin, service: ServiceDep) -> TokenList:
 
 
 @router.post("/tokens", status_code=201, responses=problems())
-async def make_token(new: NewToken, _who: Admin, service: ServiceDep) -> MadeToken:
+async def make_token(new: NewToken, _who: Admin, service: ServiceDep, response: Response) -> MadeToken:
     """Make a token. From the first one on, nobody gets in without."""
-    return await tokens.make_token(service, new)
+    made = await tokens.make_token(service, new)
+    response.headers["Location"] = f"/v1/tokens/{made.id}"
+    return made
 
 
 @router.delete("/tokens/{token_id}", status_code=204, responses=problems(404))
 async def delete_token(token_id: uuid.UUID, _who: Admin, service: ServiceDep) -> None:
-    """Shut a token out."""
+    """Shut a token out, with the sessions of browsers that were begun with it."""
     await tokens.revoke_token(service, token_id)
+
+
+@router.post("/sign-in-links", status_code=201, responses=problems(409))
+async def make_link(who: Writer, service: ServiceDep) -> SignInLink:
+    """Make a link that signs a browser in with your token, once, within five minutes."""
+    return await tokens.make_link(service, who)
 
 
 @health_router.get("/healthz")

@@ -41,6 +41,10 @@ class InfoView(BaseModel):
     needs_token: bool
     owner: str
     scopes: list[str]
+    isolation: dict[str, str | None] = Field(
+        description="What keeps programs that read what others sent from the rest of this machine, by "
+        "subject; null where its kernel takes no part. Workers say the same of theirs in their facts."
+    )
 
 
 class QueueView(BaseModel):

@@ -16,6 +16,9 @@ class NewToken(Strict):
     name: str = Field(max_length=100)
     owner: str = Field(pattern=r"^[A-Za-z0-9._@-]{1,100}$", description="Whose things it shows.")
     scopes: list[Literal["read", "write", "admin"]] = Field(min_length=1)
+    hours: float | None = Field(
+        None, gt=0, le=1_000_000, description="For how long it is valid; by default as the service is set."
+    )
 
 
 class TokenView(BaseModel):
@@ -45,3 +48,9 @@ class TokenList(BaseModel):
     """All tokens."""
 
     tokens: list[TokenView]
+
+
+class SignInLink(BaseModel):
+    """A link for a browser; it is worth a token until it is opened."""
+
+    path: str = Field(description="Below the address of the service.")

@@ -14,7 +14,7 @@ from workers.work.kinds import JobKind
 Control = Literal["choice", "yes_no", "whole", "number", "text", "list", "files"]
 PRESETS = ("fast", "standard", "paper")
 
-_FIRST = ("preset", "poses", "max_side", "exports", "files")
+_FIRST = ("preset", "poses", "max_side", "minutes", "exports", "files")
 _FIRST_OF_TRAINING = ("train.iterations", "train.max_gaussians", "train.sh_degree")
 _WORTH_OFFERING = {
     "glb": "mesh.glb",
@@ -29,6 +29,7 @@ _WORTH_OFFERING = {
 """A file name by format."""
 _LABELS = {
     "max_side": "Longest side, px",
+    "minutes": "Minutes of training",
     "max_gaussians": "Most Gaussians",
     "test_every": "Hold out every n-th view",
     "exports": "Files to write",
@@ -61,6 +62,7 @@ _HELPS = {
     "preset": "fast is a first look, standard is better, paper has the published settings and is slow.",
     "poses": "Where the camera poses come from.",
     "max_side": "Photographs are shrunk to this; empty keeps their size.",
+    "minutes": "Decides iterations and Gaussians by the machine's pace; empty leaves them to the preset.",
     "train.iterations": "More takes longer and gets sharper; 0 asks the photographs' pixels.",
     "train.max_gaussians": "More shows finer detail and makes larger files; 0 asks the photographs' pixels.",
     "train.sh_degree": "How much colours may change with the direction of view: 0 not at all.",

@@ -1,6 +1,5 @@
 """The pages: jobs, one job with its result, a new job; and the parts of them that renew themselves."""
 
-import asyncio
 import json
 import uuid
 from pathlib import PurePosixPath
@@ -22,6 +21,7 @@ from service.paging import read_id_cursor, write_cursor
 from service.queue_facts import unwritable_formats
 from service.schemas.jobs import JobChange, RetryRequest
 from service.state import Service, ServiceDep
+from service.threads import Threads, in_thread
 from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
 from service.web.forms import WITHOUT_FORM, options_form
 from service.web.light import light_form
@@ -85,10 +85,11 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     photographs = await photographs_of(service, who, job_id)
     unwritable = unwritable_formats(await living_workers(service))
     by_name = {row.name: row for row in artifacts}
-    metrics, config = await asyncio.to_thread(
-        lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)]
+    metrics, config = await in_thread(
+        Threads.DOWNLOADS,
+        lambda: [read_json(service.storage, by_name.get(name)) for name in (METRICS, CONFIG)],
     )
-    held_out = await asyncio.to_thread(read_names, service.storage, by_name.get(HELD_OUT))
+    held_out = await in_thread(Threads.DOWNLOADS, read_names, service.storage, by_name.get(HELD_OUT))
     figures = measured(metrics, artifacts, photographs)
     preview = detail.line.job.preview or {}
     shown = f"images/{preview.get('view')}"
@@ -131,7 +132,8 @@ async def show_job_status(request: Request, job_id: uuid.UUID, who: Reader, serv
 async def show_report(request: Request, job_id: uuid.UUID, who: Reader, service: ServiceDep) -> Response:
     """The report of a job as a page."""
     row = await get_artifact(service, who, job_id, REPORT, what="report")
-    response = await asyncio.to_thread(
+    response = await in_thread(
+        Threads.DOWNLOADS,
         lambda: send_blob(
             service, request, sha256=row.sha256, size_bytes=row.size_bytes, media_type="text/html",
             name=REPORT, inline=True,
@@ -147,7 +149,7 @@ async def get_cameras(job_id: uuid.UUID, who: Reader, service: ServiceDep) -> JS
     artifacts = await list_artifacts(service, who, job_id)
     files = await photographs_of(service, who, job_id)
     held_out = next((row for row in artifacts if row.name == HELD_OUT), None)
-    content = await asyncio.to_thread(_cameras, service, artifacts, files, held_out)
+    content = await in_thread(Threads.DOWNLOADS, _cameras, service, artifacts, files, held_out)
     headers = {"Cache-Control": "private, max-age=300"}
     return JSONResponse(content, headers=headers)
 

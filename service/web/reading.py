@@ -1,6 +1,5 @@
 """What the pages show of jobs, gathered from the tables and the store."""
 
-import asyncio
 import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +13,11 @@ from service.actions.parts import Part
 from service.auth import Principal
 from service.schemas.jobs import JobView
 from service.state import Service
+from service.threads import Threads, in_thread
 from service.web.results import METRICS, mean_psnr, read_json
 from service.web.templating import short_id
 from workers.queue import jobs as rows
-from workers.records.database import Connection
+from workers.records.database import Connection, naming
 from workers.records.datasets import files_of, get_dataset
 from workers.records.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
 
@@ -109,11 +109,14 @@ async def job_detail(service: Service, who: Principal, job_id: uuid.UUID) -> Job
         dataset = await get_dataset(connection, job.dataset_id) if job.dataset_id else None
         async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
             await cursor.execute(
-                """
-                SELECT * FROM job_events
+                naming(
+                    """
+                SELECT {} FROM job_events
                 WHERE job_id = %s AND kind NOT IN ('progress', 'preview', 'checkpoint')
                 ORDER BY id DESC LIMIT %s
                 """,
+                    JobEvent,
+                ),
                 [job_id, _MAX_EVENTS],
             )
             events = (await cursor.fetchall())[::-1]
@@ -149,8 +152,9 @@ async def _lines(service: Service, connection: Connection, jobs: Sequence[Job]) 
     counts = await _gaussian_counts(connection, ids)
     metrics = await _artifacts(connection, ids, METRICS)
     renders = await _artifacts(connection, ids, "renders/%.png")
-    contents = await asyncio.to_thread(
-        lambda: {job_id: read_json(service.storage, row) for job_id, row in metrics.items()}
+    contents = await in_thread(
+        Threads.DOWNLOADS,
+        lambda: {job_id: read_json(service.storage, row) for job_id, row in metrics.items()},
     )
     lines = []
     for job in jobs:

@@ -217,6 +217,7 @@ _NAMED = {
     "views.json": (_RECORDS, "octasplat render and surface, which need no photographs then"),
     "events.jsonl": (_RECORDS, "a text editor: what happened when, a line each"),
     "training.json": (_RECORDS, "a text editor"),
+    "plan.json": (_RECORDS, "a text editor: what the time for the training was used for"),
 }
 _SUFFIXES = {
     ".glb": (

@@ -1,19 +1,27 @@
-"""Signing in with a token, for browsers: it is kept in a cookie that scripts cannot read."""
+"""Signing in with a token or a link, for browsers: the cookie holds a session, which scripts cannot read."""
 
 import urllib.parse
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service.auth import COOKIE
-from service.state import ServiceDep
+from service.auth import (
+    COOKIE,
+    SECURE_COOKIE,
+    Principal,
+    principal_of_session,
+    session_secret,
+    token_of,
+)
+from service.state import Service, ServiceDep
 from service.web.routing import PageRoute, go_to, local_address
 from service.web.templating import page
-from workers.records.tokens import find_token
+from workers.records.rows import Token
+from workers.records.sessions import begin_session, end_session, use_link
+from workers.records.tokens import get_token
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
-_DAYS = 30
 _MAX_FORM_BYTES = 4096
 
 
@@ -27,30 +35,67 @@ async def show_sign_in(
 
 @router.post("/sign-in")
 async def sign_in(request: Request, service: ServiceDep) -> Response:
-    """Keep a valid token."""
+    """Begin a session with a valid token."""
     body = (await request.body())[:_MAX_FORM_BYTES].decode(errors="replace")
     form = urllib.parse.parse_qs(body)
     secret = form.get("token", [""])[0].strip()
     following = local_address(form.get("next", ["/"])[0])
-    async with service.pool.connection() as connection:
-        token = await find_token(connection, secret) if secret else None
+    token = await token_of(request, service, secret) if secret else None
     if token is None:
         return page(request, "sign_in.html", status=403, next=following, refused=True)
     response = go_to(request, following)
-    response.set_cookie(
-        COOKIE,
-        secret,
-        max_age=_DAYS * 86_400,
-        httponly=True,
-        samesite="strict",
-        secure=request.url.scheme == "https",
-    )
+    await _begin(request, response, service, token)
+    return response
+
+
+@router.get("/sign-in/once")
+async def sign_in_once(
+    request: Request, service: ServiceDep, key: Annotated[str, Query(max_length=100)] = ""
+) -> Response:
+    """Begin a session with a link that was made for it; it is used up, whoever opened it."""
+    request.state.is_change = True
+    async with service.pool.connection() as connection:
+        token_id = await use_link(connection, key)
+        token = None if token_id is None else await get_token(connection, token_id)
+    if token is None:
+        return page(
+            request,
+            "error.html",
+            status=403,
+            title="Used already",
+            detail="This link was opened before or is too old; octasplat open makes another.",
+        )
+    # A page, as browsers do not send the new cookie to where another program's link is forwarded to.
+    response: Response = page(request, "signed_in.html")
+    await _begin(request, response, service, token)
     return response
 
 
 @router.post("/sign-out")
-async def sign_out(request: Request) -> Response:
-    """Forget the token; it stays valid."""
+async def sign_out(request: Request, service: ServiceDep) -> Response:
+    """End the session; the token stays valid."""
+    secret = session_secret(request)
+    if secret is not None:
+        request.state.who = await principal_of_session(service, secret)
+        async with service.pool.connection() as connection:
+            await end_session(connection, secret)
     response = go_to(request, "/sign-in")
     response.delete_cookie(COOKIE, httponly=True, samesite="strict")
+    response.delete_cookie(SECURE_COOKIE, httponly=True, samesite="strict", secure=True)
     return response
+
+
+async def _begin(request: Request, response: Response, service: Service, token: Token) -> None:
+    hours = service.settings.session_hours
+    async with service.pool.connection() as connection:
+        session_id, secret = await begin_session(connection, token, hours)
+    request.state.who = Principal(token.owner, frozenset(token.scopes), token.id, session_id)
+    is_secure = request.url.scheme == "https"
+    response.set_cookie(
+        SECURE_COOKIE if is_secure else COOKIE,
+        secret,
+        max_age=int(3600 * hours),
+        httponly=True,
+        samesite="strict",
+        secure=is_secure,
+    )

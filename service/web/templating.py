@@ -10,7 +10,7 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 
 import engine
-from service.auth import COOKIE, Principal
+from service.auth import Principal, session_secret
 from service.web import wording
 
 PAGE_HEADERS = {
@@ -50,7 +50,7 @@ def page(
         .get_template(template)
         .render(
             who=who,
-            signed_in=COOKIE in request.cookies,
+            signed_in=session_secret(request) is not None,
             path=request.url.path,
             version=engine.__version__,
             **values,

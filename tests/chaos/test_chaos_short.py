@@ -1,6 +1,7 @@
 """Each blow of benchmarks/chaos.py once, while 24 short jobs are in flight: none is lost or done twice."""
 
 import random
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,11 +28,20 @@ def test_nothing_is_lost_whatever_is_killed(machine: Machine, tmp_path: Path) ->
     scene = make_scene(tmp_path / "scene")
     expected = undisturbed_reconstruction(scene, tmp_path / "undisturbed")
     run = Run(machine, scene, random.Random(5), expected)
+    gate = tmp_path / "gate"
+    prepare(run, chains=0, reconstructions=0, steps=0, seconds=0)
+    run.submit_chain(31, 0.02, gate=str(gate))
+    (held,) = run.accepted
+    checkpoint: dict[str, Any] | None = None
+    while checkpoint is None or checkpoint["step"] < 30:
+        time.sleep(0.1)
+        checkpoint = run.patiently(lambda api: api.get(f"/v1/jobs/{held}"))["checkpoint"]
     prepare(run, chains=24, reconstructions=2, steps=35, seconds=0.08)
     for blow in BLOWS:
         run.strike(blow)
+    gate.touch()
     assert run.in_flight_before[0] >= IN_FLIGHT
-    run.settle(240)
+    run.settle(600)
     assert run.faults() == [], machine.log.read_text()[-8000:]
     report = run.report()
     assert report["attempts"] > report["jobs"] and report["resumed_from_a_checkpoint"] > 0

@@ -1,13 +1,17 @@
 """``octasplat demo``, made tiny."""
 
 import signal
+import subprocess
+import sys
 import time
 import webbrowser
+from pathlib import Path
 
 import pytest
 
 import workers.cli.demonstration
 
+ROOT = Path(__file__).resolve().parents[2]
 SIZE = ("--views", 4, "--width", 32, "--height", 24)
 
 
@@ -27,14 +31,37 @@ def test_scene_only(octasplat, tmp_path):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_no_half_of_a_scene(start_octasplat, tmp_path, number, code):
     process = start_octasplat("demo", "-o", tmp_path / "still", "--scene-only", "--views", 500)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240
     while not any(path.name.endswith(".partial") for path in tmp_path.iterdir()):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.05)
     process.send_signal(number)
-    _, stderr = process.communicate(timeout=60)
+    _, stderr = process.communicate(timeout=240)
     assert process.returncode == code, stderr
     assert len(stderr.splitlines()) <= 1, stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+STOPPED_AT_ONCE = """
+import os, pathlib, signal, sys
+from workers.cli.demonstration import make_scene
+
+made = pathlib.Path.mkdir
+
+def mkdir(path, *given, **named):
+    made(path, *given, **named)
+    if path.name.endswith(".partial"):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+pathlib.Path.mkdir = mkdir
+make_scene(pathlib.Path(sys.argv[1]), {"views": 4}, quiet=True)
+"""
+
+
+def test_a_signal_at_the_very_beginning_leaves_nothing(tmp_path):
+    """As it happens on a loaded machine: right after the folder was made."""
+    command = [sys.executable, "-c", STOPPED_AT_ONCE, str(tmp_path / "still")]
+    assert subprocess.run(command, cwd=ROOT, check=False, timeout=120).returncode == 143
     assert list(tmp_path.iterdir()) == []
 
 

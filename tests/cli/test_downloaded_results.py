@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from engine.config import resolve_config
+from engine.events import Event, Warned
 from engine.render.images import read_image
 from workers.work.kinds import kind_named
 from workers.work.programs import reconstruct
@@ -25,6 +26,7 @@ class Results:
 
     folder: Path
     photographs: Path
+    warnings: tuple[str, ...]
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +36,33 @@ def results(scene, tmp_path_factory) -> Results:
     shutil.copytree(scene, root / "dataset")
     config = resolve_config("fast", settings={"test_every": 4, "max_side": 48}, assignments=SETTINGS)
     options = kind_named("reconstruct").options.model_validate(config.model_dump(mode="json"))
-    (root / "attempt").mkdir()
+    left = root / "attempt" / "run" / "config.json"  # by an attempt of another version
+    left.parent.mkdir(parents=True)
+    left.write_text(json.dumps({"scene": "elsewhere", "reconstruction": {"a_later_setting": 1}}))
+    heard: list[Event] = []
     reconstruct(
-        Task(root / "attempt", options.model_dump(mode="json"), root / "dataset", "still life", threads=1)
+        Task(
+            root / "attempt",
+            options.model_dump(mode="json"),
+            root / "dataset",
+            "still life",
+            threads=1,
+            listener=heard.append,
+        )
     )
+    warnings = tuple(event.message for event in heard if isinstance(event, Warned))
     downloaded = tmp_path_factory.mktemp("downloaded") / "results"
     shutil.copytree(root / "attempt" / "results", downloaded)
     shutil.rmtree(root)
-    return Results(downloaded, scene)
+    return Results(downloaded, scene, warnings)
+
+
+def test_what_another_version_left_is_begun_anew(results):
+    (told,) = [warning for warning in results.warnings if "begins anew" in warning]
+    assert (
+        "config.json" in told
+        and json.loads((results.folder / "metrics.json").read_text())["iterations"] == 60
+    )
 
 
 def test_its_views_are_rendered_without_photographs(results, octasplat, tmp_path):

@@ -102,6 +102,7 @@ def test_a_job_relights_with_files_of_its_own(shiny_run, scene_with_truth, tmp_p
     size = Sizes(64, 48, 8)
     assert {demand.of: demand.amount for demand in kind.demands(options, [size])} == {
         "render_pixels": 2 * 8 * 64 * 48, "render_paths": 2 * 8 * 64 * 48,
+        "workspace_bytes": round(0.4 * 2 * 8 * 64 * 48),
     }  # fmt: skip
     relight(Task(tmp_path / "attempt", options.model_dump(mode="json"), threads=1))
     views = tmp_path / "attempt" / "results" / "views"

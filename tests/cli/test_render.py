@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from engine.colour import linear_to_srgb
-from engine.files.gaussian_ply import read_gaussian_ply, read_near_world, write_gaussian_ply
+from engine.files.gaussian_ply import (
+    read_gaussian_ply,
+    read_near_world,
+    read_pixel_rad,
+    write_gaussian_ply,
+)
 from engine.render.images import read_channels, read_image
 
 SIZE = ("--width", 32, "--height", 24)
@@ -31,6 +36,15 @@ def test_views_and_their_size(run, octasplat, tmp_path, which, count):
     files = list(tmp_path.glob("*.png"))
     assert len(files) == count
     assert read_image(files[0]).shape == (24, 32, 3)
+
+
+def test_small_pictures_are_what_making_large_ones_smaller_gives(run, octasplat, tmp_path):
+    for name, size in (("large", ()), ("small", ("--max-side", 16))):
+        assert octasplat("render", run.output, "-o", tmp_path / name, *size).exit_code == 0
+    for path in (tmp_path / "small").iterdir():
+        large, small = read_image(tmp_path / "large" / path.name), read_image(path)
+        wanted = large.reshape(12, large.shape[0] // 12, 16, large.shape[1] // 16, 3).mean(axis=(1, 3))
+        assert np.abs(small - wanted).mean() < 1 / 255
 
 
 def test_views_of_a_run_whose_photographs_moved(run, octasplat, tmp_path):
@@ -77,6 +91,7 @@ def test_a_run_and_its_file_give_one_picture(run, octasplat, tmp_path):
     gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
     near = read_near_world(run.output / "scene.ply")
     assert near > 0
+    assert read_pixel_rad(run.output / "scene.ply") > 0
     # Right before the largest thing: what is nearer than the training saw is not to be seen in either.
     nearest = int(np.argmax(gaussians.opacities * gaussians.scales.prod(axis=1)))
     pose = np.eye(4)

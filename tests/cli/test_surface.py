@@ -36,6 +36,20 @@ def test_everything_at_once(run, octasplat, tmp_path):
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.mtl", "a.obj", "a.png"]
 
 
+def test_several_levels_of_detail_are_those_that_come_one_by_one(run, octasplat, tmp_path):
+    options = (*SMALL, "--texture", 64, "--threads", 1)
+    result = octasplat(
+        "surface", run.output, "-o", tmp_path / "a.glb", *options, "--max-triangles", "0.3k,100"
+    )
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a_0.3k.glb", "a_100.glb"]
+    counts = [len(trimesh.load(tmp_path / name, force="mesh").faces) for name in ("a_0.3k.glb", "a_100.glb")]
+    assert 100 < counts[0] <= 300 and 50 < counts[1] <= 100
+    assert result.output.count("Rendered") == 1 and result.output.count("Wrote") == 2
+    octasplat("surface", run.output, "-o", tmp_path / "b.glb", *options, "--max-triangles", 100)
+    assert (tmp_path / "b.glb").read_bytes() == (tmp_path / "a_100.glb").read_bytes()
+
+
 def test_unbounded_and_quiet(run, octasplat, tmp_path):
     result = octasplat("surface", run.output, "-o", tmp_path / "a.ply", *SMALL, "--unbounded", "--quiet")
     assert result.exit_code == 0, result.output
@@ -77,11 +91,21 @@ def test_refusals_are_one_sentence(run, octasplat, tmp_path, monkeypatch, option
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("bad", [("--bounds", "1,2,3"), ("--fill-holes", "some"), ("--fill-holes", "-1")])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        ("--bounds", "1,2,3"),
+        ("--fill-holes", "some"),
+        ("--fill-holes", "-1"),
+        ("--max-triangles", "5q"),
+        ("--max-triangles", "3"),
+        ("--max-triangles", "5k,5000"),
+    ],
+)
 def test_options_that_make_no_sense(run, octasplat, tmp_path, bad):
     result = octasplat("surface", run.output, "-o", tmp_path / "a.glb", *bad)
     assert result.exit_code == 2
-    assert bad[1] in result.output
+    assert bad[1].split(",")[-1] in result.output
 
 
 def test_ctrl_c_leaves_nothing(run, start_octasplat, tmp_path):

@@ -168,11 +168,15 @@ def test_transform_crop_merge_clean(octasplat, scene: Path, tmp_path: Path) -> N
         (("transform", "scene.ply", "-o", "out.ply"), 2, "Say what to do"),
         (("transform", "scene.ply", "-o", "out.ply", "--scale", "0"), 1, "flattens space"),
         (("crop", "scene.ply", "-o", "out.ply"), 2, "Say what to keep"),
-        (("crop", "scene.ply", "-o", "out.ply", "--sphere", "99", "0", "0", "1"), 1, "its centres lie in"),
+        (
+            ("crop", "scene.ply", "-o", "out.ply", "--sphere", "99", "0", "0", "1"),
+            1,
+            "octasplat info tells where",
+        ),
         (("crop", "scene.ply", "-o", "out.ply", "--box", *"110", *"001"), 1, "smallest"),
         (("merge", "scene.ply", "-o", "out.ply"), 2, "at least two"),
         (("clean", "scene.ply"), 2, "--dry-run"),
-        (("clean", "scene.ply", "-o", "out.ply", "--min-scale", "9"), 1, "nothing of it would be left"),
+        (("clean", "scene.ply", "-o", "out.ply", "--min-scale", "9"), 1, "octasplat info tells its sizes"),
     ],
 )
 def test_mistakes(octasplat, scene: Path, monkeypatch, arguments, code: int, message: str) -> None:

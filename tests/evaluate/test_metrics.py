@@ -7,6 +7,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from engine.colour import to_bytes
 from engine.evaluate import metrics
+from engine.psnr import colour_corrected, psnr
 
 
 def pair(height, width, seed=0):
@@ -40,13 +41,13 @@ def ssim_by_convolution(render, reference):
 
 def test_psnr_of_a_constant_error_is_its_closed_form():
     reference = np.full((4, 5, 3), 0.25, np.float32)
-    assert metrics.psnr(reference + np.float32(0.125), reference) == pytest.approx(20 * np.log10(8))
+    assert psnr(reference + np.float32(0.125), reference) == pytest.approx(20 * np.log10(8))
 
 
 def test_psnr_agrees_with_scikit_image():
     render, reference = pair(30, 41)
     expected = peak_signal_noise_ratio(reference.astype(float), render.astype(float), data_range=1)
-    assert metrics.psnr(render, reference) == pytest.approx(expected, abs=1e-9)
+    assert psnr(render, reference) == pytest.approx(expected, abs=1e-9)
 
 
 def test_colour_correction_undoes_gain_and_offset_where_pixels_count():
@@ -56,14 +57,14 @@ def test_colour_correction_undoes_gain_and_offset_where_pixels_count():
     weight = np.ones((30, 41), np.float32)
     weight[:, :10] = 0
     render[:, :10] = 0.9
-    corrected = metrics.colour_corrected(render, reference, weight)
+    corrected = colour_corrected(render, reference, weight)
     np.testing.assert_allclose(corrected[:, 10:], reference[:, 10:], atol=1e-6)
-    assert metrics.psnr(corrected, reference, weight) > 100
+    assert psnr(corrected, reference, weight) > 100
 
 
 def test_colour_correction_agrees_with_numpys_least_squares():
     render, reference = pair(30, 41)
-    corrected = metrics.colour_corrected(render, reference, np.ones((30, 41), np.float32))
+    corrected = colour_corrected(render, reference, np.ones((30, 41), np.float32))
     for channel in range(3):
         x, y = render[..., channel].ravel().astype(float), reference[..., channel].ravel()
         expected = np.clip(np.polyval(np.polyfit(x, y, 1), x), 0, 1)
@@ -72,8 +73,8 @@ def test_colour_correction_agrees_with_numpys_least_squares():
 
 def test_colour_correction_of_one_tone_or_of_nothing():
     grey, target = np.full((4, 5, 3), 0.5, np.float32), np.full((4, 5, 3), 0.25, np.float32)
-    np.testing.assert_allclose(metrics.colour_corrected(grey, target, np.ones((4, 5), np.float32)), target)
-    assert (metrics.colour_corrected(grey, target, np.zeros((4, 5), np.float32)) == grey).all()
+    np.testing.assert_allclose(colour_corrected(grey, target, np.ones((4, 5), np.float32)), target)
+    assert (colour_corrected(grey, target, np.zeros((4, 5), np.float32)) == grey).all()
 
 
 @pytest.mark.parametrize("size", [(40, 51), (11, 11), (7, 30)])
@@ -130,7 +131,7 @@ def test_flip_of_black_against_white_is_near_one():
 
 def test_identical_images_are_perfect():
     _, picture = pair(176, 176)
-    assert metrics.psnr(picture, picture) == np.inf
+    assert psnr(picture, picture) == np.inf
     assert metrics.ssim_both(picture, picture) == pytest.approx((1.0, 1.0))
     assert metrics.ms_ssim(picture, picture) == pytest.approx(1.0)
     assert metrics.flip(picture, picture).mean == pytest.approx(0.0, abs=1e-6)
@@ -141,13 +142,9 @@ def test_masked_psnr_is_that_of_the_valid_pixels():
     weight = np.zeros((20, 30), np.float32)
     weight[4:15, 6:20] = 1
     crop = np.s_[4:15, 6:20]
-    assert metrics.psnr(render, reference, weight) == pytest.approx(
-        metrics.psnr(render[crop], reference[crop])
-    )
-    assert metrics.psnr(render, reference, np.ones_like(weight)) == pytest.approx(
-        metrics.psnr(render, reference)
-    )
-    assert np.isnan(metrics.psnr(render, reference, np.zeros_like(weight)))
+    assert psnr(render, reference, weight) == pytest.approx(psnr(render[crop], reference[crop]))
+    assert psnr(render, reference, np.ones_like(weight)) == pytest.approx(psnr(render, reference))
+    assert np.isnan(psnr(render, reference, np.zeros_like(weight)))
 
 
 def test_errors_under_the_mask_cost_nothing_once_filled():

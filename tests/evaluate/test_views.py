@@ -6,6 +6,7 @@ import pytest
 from engine.errors import DatasetError
 from engine.evaluate import metrics
 from engine.evaluate.views import RenderedView, bootstrap_interval, measure_view, summarise
+from engine.psnr import colour_corrected, psnr
 
 
 def view(name="a.jpg", error=0.1, size=(30, 40), seed=0, **changes):
@@ -20,9 +21,9 @@ def test_metrics_are_those_of_the_images_rounded_to_8_bits():
     one = view(error=0.1003)
     row, flip_map = measure_view(one)
     render, reference = (metrics.rounded_to_8_bits(image) for image in (one.render, one.reference))
-    assert row.psnr == metrics.psnr(render, reference)
-    corrected = metrics.colour_corrected(render, reference, one.weight)
-    assert row.psnr_colour_corrected == metrics.psnr(corrected, reference)
+    assert row.psnr == psnr(render, reference)
+    corrected = colour_corrected(render, reference, one.weight)
+    assert row.psnr_colour_corrected == psnr(corrected, reference)
     assert row.ssim == metrics.ssim(render, reference)
     assert row.ssim_valid == metrics.ssim_valid(render, reference)
     assert row.ms_ssim is None

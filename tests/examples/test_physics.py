@@ -13,7 +13,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.paths import look_at
 from engine.surface.mesh import TriangleMesh
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "physics"
 

@@ -9,10 +9,11 @@ import pytest
 
 from engine.colour import srgb_to_linear
 from engine.errors import SceneFileError
-from engine.files import export_scene, importer_for, read_scene
+from engine.files import ExportOptions, export_scene, importer_for, read_scene
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.harmonics import sh_basis
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.octagon import octagon_corners_world, octagon_radii
 
 Make = Callable[..., FlatGaussians]
 KHR = "KHR_gaussian_splatting"
@@ -175,7 +176,10 @@ def test_linear_colours_are_converted_and_told(make_scene: Make, tmp_path: Path)
 
 def test_what_is_no_splat_is_refused(make_scene: Make, tmp_path: Path) -> None:
     scene = make_scene(30)
-    export_scene(scene, tmp_path / "mesh.glb")
+    export_scene(scene, tmp_path / "octagons.glb")
+    document, binary = parts(tmp_path / "octagons.glb")
+    document["asset"]["extras"] = {}
+    join(tmp_path / "mesh.glb", document, binary)
     assert importer_for(tmp_path / "mesh.glb").name == "khr-glb"
     with pytest.raises(SceneFileError, match=r"mesh\.glb: holds no splats .*octasplat edit"):
         read_scene(tmp_path / "mesh.glb")
@@ -229,3 +233,29 @@ def test_primitives_without_a_channel_get_zeros(make_scene: Make, tmp_path: Path
     document["asset"]["extras"] = {"octasplat_channels": {"label": "many"}}
     with pytest.raises(SceneFileError, match="its glTF is damaged"):
         read_scene(join(tmp_path / "c.glb", document, binary))
+
+
+def test_octagons_are_a_scene_with_one_colour_each(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(300)
+    label = np.arange(300, dtype=np.float32)[:, None]
+    export_scene(scene.with_channels({"label": label}), tmp_path / "mesh.glb", ExportOptions(chunks=4))
+    back, report = read_scene(tmp_path / "mesh.glb")
+    kept = scene.select(octagon_radii(scene.opacities) > 0)
+    assert 0 < len(back) == len(kept) < 300 and report.flattened == 0
+    assert "one colour" in report.notes[0] and f"{300 - len(kept)} fainter" in report.notes[1]
+    np.testing.assert_array_equal(back.channels["label"], label[octagon_radii(scene.opacities) > 0])
+    np.testing.assert_allclose(back.means_world, kept.means_world, atol=2e-6)
+    np.testing.assert_allclose(back.scales, kept.scales, rtol=1e-3)
+    np.testing.assert_allclose(back.opacities, kept.opacities, rtol=1e-5)
+    np.testing.assert_allclose(back.base_rgb_srgb, kept.base_rgb_srgb.clip(0, 1), atol=1e-5)
+    radii = octagon_radii(kept.opacities)
+    corners = octagon_corners_world(kept, radii)
+    np.testing.assert_allclose(octagon_corners_world(back, radii), corners, atol=1e-4 * kept.scales.max())
+
+
+def test_octagons_that_were_edited_are_refused_as_a_scene(make_scene: Make, tmp_path: Path) -> None:
+    export_scene(make_scene(40), tmp_path / "mesh.glb", ExportOptions(chunks=1))
+    document, binary = parts(tmp_path / "mesh.glb")
+    document["nodes"][1]["scale"] = [1.0, 1.1, 1.0]
+    with pytest.raises(SceneFileError, match=r"b\.glb: .*octasplat edit --mesh"):
+        read_scene(join(tmp_path / "b.glb", document, binary))

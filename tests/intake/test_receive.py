@@ -23,6 +23,7 @@ from service.intake.receive import (
     receive_archive,
     receive_file,
 )
+from service.intake.spool import Spool
 from workers.store import DigestMismatch, StorageFull, TooLarge
 from workers.store.local import LocalStorage
 
@@ -127,7 +128,9 @@ def scene_archive() -> bytes:
 
 def test_an_archive_is_taken_in(local_storage: LocalStorage, tmp_path: Path) -> None:
     data = scene_archive()
-    found = asyncio.run(receive_archive(local_storage, body(data), tmp_path / "spool", sha256=sha(data)))
+    found = asyncio.run(
+        receive_archive(local_storage, body(data), Spool(tmp_path / "spool"), sha256=sha(data))
+    )
     assert {file.path for file in found.files} == {*photographs(), *Model().files()}
     assert found.left_out == ("fox/notes.txt",) and found.size_bytes == len(data)
     facts = {file.path: file.facts for file in found.files}
@@ -139,17 +142,19 @@ def test_refused_archives(local_storage: LocalStorage, tmp_path: Path) -> None:
     bad_image = build(Member("images/a.png", b"not an image"))
     for data, code in ((b"PK\3\4 nonsense", "archive-damaged"), (bad_image, "image-kind")):
         with pytest.raises(IntakeRefused) as caught:
-            asyncio.run(receive_archive(local_storage, body(data), tmp_path / "spool"))
+            asyncio.run(receive_archive(local_storage, body(data), Spool(tmp_path / "spool")))
         assert caught.value.code == code
     data = scene_archive()
     with pytest.raises(DigestMismatch):
-        asyncio.run(receive_archive(local_storage, body(data), tmp_path / "spool", sha256="0" * 64))
+        asyncio.run(receive_archive(local_storage, body(data), Spool(tmp_path / "spool"), sha256="0" * 64))
     with pytest.raises(TooLarge):
         limits = UploadLimits(max_archive_bytes=100)
-        asyncio.run(receive_archive(local_storage, body(data), tmp_path / "spool", limits=limits))
+        asyncio.run(receive_archive(local_storage, body(data), Spool(tmp_path / "spool"), limits=limits))
     blank = build(Member("images/a.bmp", bytes(900_000)))
     with pytest.raises(IntakeRefused, match="quota"):
-        asyncio.run(receive_archive(local_storage, body(blank), tmp_path / "spool", max_bytes=len(blank)))
+        asyncio.run(
+            receive_archive(local_storage, body(blank), Spool(tmp_path / "spool"), max_bytes=len(blank))
+        )
     assert list((tmp_path / "spool").iterdir()) == []
 
 
@@ -159,7 +164,7 @@ def test_no_room(tmp_path: Path) -> None:
         with pytest.raises(StorageFull, match="kept free"):
             asyncio.run(receive_file(storage, "images/a.png", body(photograph())))
         with pytest.raises(StorageFull, match="kept free"):
-            asyncio.run(receive_archive(storage, body(scene_archive()), tmp_path / "spool"))
+            asyncio.run(receive_archive(storage, body(scene_archive()), Spool(tmp_path / "spool")))
     finally:
         storage.close()
 
@@ -167,6 +172,7 @@ def test_no_room(tmp_path: Path) -> None:
 MEMORY = """
 import asyncio, resource, sys
 from pathlib import Path
+from service.intake.spool import Spool
 from service.intake.receive import receive
 from workers.store.local import LocalStorage
 

@@ -26,7 +26,7 @@ from engine.light.staging import stage_meshes
 from engine.render.cameras import RenderCamera
 from engine.render.images import write_exr
 from engine.render.renderer import render_rays
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceSettings
 
 PLAIN = Integrator(samples=1, max_depth=6, roulette_depth=64, anti_aliasing=False)

@@ -13,10 +13,13 @@ import psycopg
 import pytest
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
+from workers.postgres import embedded
 from workers.postgres.binaries import PostgresBinaries, find_binaries
-from workers.postgres.embedded import EmbeddedPostgres
+from workers.postgres.embedded import EmbeddedPostgres, sync_file_system
 from workers.postgres.server_user import server_user
 from workers.records.errors import DatabaseError
+from workers.serve.machine import Plan, connections_needed
+from workers.settings import WorkerSettings
 
 
 @pytest.fixture
@@ -102,7 +105,7 @@ def test_two_starts_at_once_make_one_database(server: EmbeddedPostgres) -> None:
         )
         for _ in range(2)
     ]
-    answers = [process.communicate(timeout=60)[0] for process in both]
+    answers = [process.communicate(timeout=240)[0] for process in both]
     assert answers[0] == answers[1] and answers[0]
 
 
@@ -176,5 +179,51 @@ def test_binaries_out_of_the_servers_reach_are_copied(
     try:
         assert answer(server.start(), "SELECT 1") == "1"
         assert any(path.name.startswith("binaries-") for path in server.home.iterdir())
+    finally:
+        server.stop()
+
+
+def test_a_new_cluster_is_on_the_disk_before_it_takes_its_place(
+    server: EmbeddedPostgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = []
+
+    def sync(folder: Path) -> bool:
+        synced.append((folder.name, server.cluster.exists()))
+        return sync_file_system(folder)
+
+    monkeypatch.setattr(embedded, "sync_file_system", sync)
+    server.start()
+    (first, there), *_ = synced
+    assert first.endswith(".partial") and not there
+
+
+def test_the_log_does_not_grow_for_ever(server: EmbeddedPostgres, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(embedded, "LOG_BYTES", 20_000)
+    conninfo = server.start()
+    log = server.home / "log"
+    with psycopg.connect(conninfo, autocommit=True) as connection:
+        for number in range(400):
+            with pytest.raises(psycopg.errors.UndefinedTable):
+                connection.execute(f"SELECT 1 FROM missing_{number}".encode())
+    server.rotate_log()
+    assert log.stat().st_size < 20_000 and "missing_399" in (server.home / "log.1").read_text()
+    assert stat.S_IMODE((server.home / "log.1").stat().st_mode) == 0o600
+    assert answer(conninfo, "SELECT 1") == "1"
+    with psycopg.connect(conninfo) as connection, pytest.raises(psycopg.errors.UndefinedTable):
+        connection.execute("SELECT 1 FROM later")
+    assert log.read_bytes().lstrip(b"\0") == log.read_bytes() and "later" in log.read_text()
+
+
+def test_connections_grow_with_the_jobs_at_once(short_root: Path) -> None:
+    def plan(**queues: int) -> Plan:
+        return Plan(WorkerSettings(data=short_root / "many"), None, None, queues)
+
+    assert connections_needed(plan(cpu=1)) == 100
+    needed = connections_needed(plan(cpu=60))
+    assert needed > 12 + 6 + 4 * 60
+    server = EmbeddedPostgres(short_root / "many", needed)
+    try:
+        assert answer(server.start(), "SHOW max_connections") == str(needed)
     finally:
         server.stop()

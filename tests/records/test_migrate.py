@@ -1,5 +1,8 @@
 """Tables are brought up to date once, from nothing and from what earlier versions left."""
 
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +13,9 @@ from postgres_for_tests import copied_database
 
 from workers.postgres.embedded import EmbeddedPostgres
 from workers.records.errors import DatabaseError
-from workers.records.migrate import all_steps, migrate, missing_steps, queue_steps
+from workers.records.migrate import all_steps, migrate, missing_steps, queue_steps, wait_for_tables
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -66,12 +71,37 @@ def test_database_of_an_earlier_queue_ends_the_same(empty: str, conninfo: str) -
     assert fresh - upgraded == set()
 
 
-def test_newer_database_is_refused(empty: str) -> None:
+def test_newer_database_is_gone_on_with_if_it_says_so(empty: str) -> None:
     migrate(empty)
     with psycopg.connect(empty) as connection:
         connection.execute("INSERT INTO schema_steps VALUES ('octasplat', '9999_future.sql')")
-    with pytest.raises(DatabaseError, match=r"newer version.*9999_future"):
-        migrate(empty)
+    before = shape(empty)
+    assert migrate(empty) == ()
+    wait_for_tables(empty, seconds=0)
+    with psycopg.connect(empty) as connection:
+        (reach,) = connection.execute("SELECT oldest_reader FROM schema_reach").fetchall()
+        connection.execute("UPDATE schema_reach SET oldest_reader = '9999_future.sql'")
+    for use in (migrate, wait_for_tables):
+        with pytest.raises(DatabaseError, match=r"newer version.*9999_future"):
+            use(empty)
+    assert shape(empty) == before and reach[0] in {step.name for step in all_steps()}
+
+
+def test_workers_and_commands_that_read_leave_the_tables_alone(empty: str, tmp_path: Path) -> None:
+    before = shape(empty)
+    with pytest.raises(DatabaseError, match="octasplat migrate"):
+        wait_for_tables(empty, seconds=0)
+    environment = {**os.environ, "DATABASE_URL": empty, "OCTASPLAT_DATA": str(tmp_path)}
+
+    def octasplat(*arguments: str) -> "subprocess.CompletedProcess[str]":
+        command = [sys.executable, "-m", "workers", *arguments]
+        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+
+    listed = octasplat("token", "list")
+    assert listed.returncode == 1 and "octasplat migrate" in listed.stderr
+    assert shape(empty) == before
+    assert "0001_jobs.sql" in octasplat("migrate").stdout
+    assert octasplat("token", "list").returncode == 0
 
 
 def test_unreachable_database_is_one_sentence(tmp_path: Path) -> None:

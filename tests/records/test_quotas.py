@@ -2,11 +2,13 @@
 
 import asyncio
 import uuid
+from random import Random
 
 import psycopg
 import pytest
 from click.testing import CliRunner
 from psycopg.rows import dict_row
+from psycopg.types.json import Jsonb
 
 from workers.cli.commands.quota import quota as quota_command
 from workers.records.database import Connection, open_pool
@@ -140,5 +142,62 @@ def test_the_pool_is_enough(conninfo: str) -> None:
     async def check() -> None:
         async with open_pool(conninfo, max_size=2) as pool, pool.connection() as connection:
             await check_bytes(connection, "me", Quota(max_bytes=0))
+
+    asyncio.run(check())
+
+
+def test_what_is_counted_is_what_there_is(conninfo: str) -> None:
+    """Whatever comes, is replaced and goes, in any order, the count is that of all distinct contents."""
+    truth = """
+        SELECT coalesce(sum(size_bytes), 0)::bigint AS n FROM (
+            SELECT f.sha256, f.size_bytes FROM dataset_files f JOIN datasets d ON d.id = f.dataset_id
+            WHERE d.owner = 'me'
+            UNION SELECT a.sha256, a.size_bytes FROM artifacts a JOIN jobs j ON j.id = a.job_id
+            WHERE j.owner = 'me'
+            UNION SELECT file->>'sha256', (file->>'size_bytes')::bigint
+            FROM jobs j, jsonb_array_elements(j.checkpoint->'files') file WHERE j.owner = 'me'
+        ) AS contents
+        """
+    random = Random(7)
+
+    def content() -> tuple[str, int]:
+        number = random.randrange(12)
+        return f"{number:064x}", 10 * number + 1
+
+    async def check() -> None:
+        connection = await connect(conninfo)
+        datasets = [(await create_dataset(connection, "me", str(n))).id for n in range(3)]
+        jobs = [await new_job(connection, "me", "succeeded") for _ in range(3)]
+        seen = set()
+        for _ in range(150):
+            sha256, size_bytes = content()
+            match random.randrange(6):
+                case 0 | 1:
+                    path = f"images/{random.randrange(4)}.jpg"
+                    await put_file(connection, random.choice(datasets), path, sha256, size_bytes)
+                case 2:
+                    await connection.execute(
+                        "INSERT INTO artifacts VALUES (%s, %s, %s, %s, '') ON CONFLICT DO NOTHING",
+                        [random.choice(jobs), str(random.randrange(3)), sha256, size_bytes],
+                    )
+                case 3:
+                    files = [{"path": str(n), "sha256": s, "size_bytes": b} for n, (s, b) in
+                             enumerate(content() for _ in range(3))]  # fmt: skip
+                    kept = Jsonb({"files": files}) if random.random() < 0.7 else None
+                    query = "UPDATE jobs SET checkpoint = %s WHERE id = %s"
+                    await connection.execute(query, [kept, random.choice(jobs)])
+                case 4:
+                    gone = datasets.pop(random.randrange(3))
+                    await connection.execute("DELETE FROM datasets WHERE id = %s", [gone])
+                    datasets.append((await create_dataset(connection, "me", "again")).id)
+                case 5:
+                    gone = jobs.pop(random.randrange(3))
+                    await connection.execute("DELETE FROM jobs WHERE id = %s", [gone])
+                    jobs.append(await new_job(connection, "me", "succeeded"))
+            row = await (await connection.execute(truth)).fetchone()
+            assert row is not None and (await usage_of(connection, "me")).bytes == row["n"]
+            seen.add(row["n"])
+        assert len(seen) > 30
+        await connection.close()
 
     asyncio.run(check())

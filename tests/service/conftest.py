@@ -3,8 +3,9 @@
 import sys
 from pathlib import Path
 
+from bucket_for_tests import s3_address, s3_bucket
 from postgres_for_tests import conninfo, postgres, short_root, template
 
 sys.path.append(str(Path(__file__).parents[1] / "work"))
 
-__all__ = ["conninfo", "postgres", "short_root", "template"]
+__all__ = ["conninfo", "postgres", "s3_address", "s3_bucket", "short_root", "template"]

@@ -1,26 +1,42 @@
 """Hooks of schemathesis: most requests name things that exist, or nothing but 404 would be met.
 
 ``OCTASPLAT_TEST_IDS`` names a file that maps each path parameter to ids. Those under ``used`` may be changed
-and deleted, so each serves one request; those under ``kept`` are for reading.
+and deleted, so each serves one request; those under ``kept`` are for reading. Requests that follow links name
+what came of those before them. ZIP files are scenes, sound ones and ones that lie.
 """
 
 import itertools
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
 import schemathesis
+from hypothesis import strategies as st
+from schemathesis.generation.meta import TestPhase
+
+sys.path.append(str(Path(__file__).parents[1] / "intake"))
+
+from model_builder import Model, photographs
+from zip_builder import Member, build
 
 _IDS = json.loads(Path(os.environ["OCTASPLAT_TEST_IDS"]).read_text())
 _USED = {name: itertools.cycle(ids) for name, ids in _IDS["used"].items()}
 _KEPT = {name: itertools.cycle(ids) for name, ids in _IDS["kept"].items()}
 _COUNT = itertools.count()
+_SCENE = {**photographs(), **Model().files()}
+_FIELDS = st.dictionaries(
+    st.sampled_from(("flags", "method", "crc", "packed", "size", "start", "disk", "version")),
+    st.integers(0, 0xFFFF),
+    max_size=2,
+)
 
 
 @schemathesis.hook
 def before_call(_context: schemathesis.HookContext, case: schemathesis.Case, **_kwargs: Any) -> None:
-    if next(_COUNT) % 8 == 0 or not case.path_parameters:
+    follows = case.meta is not None and case.meta.phase.name == TestPhase.STATEFUL
+    if follows or next(_COUNT) % 8 == 0 or not case.path_parameters:
         return
     pool = _KEPT if case.method.upper() in ("GET", "HEAD") else _USED
     for name in case.path_parameters:
@@ -28,4 +44,31 @@ def before_call(_context: schemathesis.HookContext, case: schemathesis.Case, **_
             case.path_parameters[name] = next(pool[name])
 
 
-schemathesis.serializer.alias("application/zip", "application/octet-stream")
+@st.composite
+def scenes(draw: st.DrawFn) -> bytes:
+    """A scene as a ZIP file: as it should be, with entries of other names and contents, lying, or damaged."""
+    contents = dict(_SCENE)
+    for name in draw(st.lists(st.sampled_from(sorted(contents)), max_size=2)):
+        contents[name] = draw(st.binary(max_size=64))
+    entries = [Member(name, content) for name, content in contents.items()]
+    for name in draw(st.lists(st.one_of(st.text(max_size=20), st.binary(max_size=20)), max_size=2)):
+        method, mode = draw(st.sampled_from((0, 8, 9, 99))), draw(st.sampled_from((0o100644, 0o120777, 0)))
+        content = draw(st.binary(max_size=64))
+        entries.append(
+            Member(name, content, method=method, mode=mode, local=draw(_FIELDS), central=draw(_FIELDS))
+        )
+    end = draw(
+        st.one_of(
+            st.none(), st.dictionaries(st.sampled_from(("entries", "size", "start")), st.integers(0, 9999))
+        )
+    )
+    archive = bytearray(build(*entries, suffix=draw(st.sampled_from((b"", b"", b"x"))), end=end))
+    for place, value in draw(
+        st.lists(st.tuples(st.integers(0, len(archive) - 1), st.integers(0, 255)), max_size=3)
+    ):
+        archive[place] = value
+    return bytes(archive)
+
+
+whole = st.just(build(*(Member(name, content) for name, content in _SCENE.items())))
+schemathesis.openapi.media_type("application/zip", st.one_of(whole, scenes(), st.binary(max_size=200)))

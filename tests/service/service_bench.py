@@ -28,6 +28,7 @@ async def running(
         "floor_bytes": 0,
         "database_url": SecretStr(conninfo),
         "kind_modules": ("toy_kind",),
+        "wrong_token_seconds": 0.0,
         **settings,
     }
     app = create_app(ServiceSettings(**given))

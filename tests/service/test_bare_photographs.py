@@ -1,6 +1,7 @@
 """Photographs without poses, over HTTP: structure from motion as the first stages of the job."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -25,12 +26,15 @@ Octasplat = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="module")
-def octasplat() -> Octasplat:
+def octasplat(machine: Machine) -> Octasplat:
     """Runs the command line as a program."""
+    environment = {**os.environ, "OCTASPLAT_DATA": str(machine.data)}
 
     def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
         command = [sys.executable, "-m", "workers", *map(str, arguments)]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+        return subprocess.run(
+            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False
+        )
 
     return run
 
@@ -60,7 +64,7 @@ def test_a_folder_of_photographs_is_enough(machine: Machine, octasplat: Octaspla
     assert "Poses found for 8 of 8 photographs" in done.stdout
     for line in ("Found features 8 photographs", "Matched 28 pairs", "Found the poses of 8 of 8 photographs"):
         assert line in done.stdout
-    with Api(machine.address) as api:
+    with Api(machine.address, machine.token) as api:
         (job,) = api.get("/v1/jobs")["jobs"]
         assert job["stages"] == ["features", "matches", "poses", "load", "train", "evaluate", "export"]
         assert job["options"]["poses"] == "auto" and job["state"] == "succeeded"
@@ -82,6 +86,6 @@ def test_photographs_that_do_not_fit_together_fail_with_the_reason(
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert "do not overlap enough" in done.stderr and "send a COLMAP model" in done.stderr
     assert not (tmp_path / "no").exists()
-    with Api(machine.address) as api:
+    with Api(machine.address, machine.token) as api:
         job = api.get("/v1/jobs")["jobs"][0]
         assert (job["state"], job["attempt"], job["error"]["type"]) == ("failed", 1, "dataset_error")

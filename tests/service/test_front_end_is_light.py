@@ -23,7 +23,7 @@ def test_no_heavy_module_is_imported() -> None:
         text=True,
         check=True,
         cwd=Path(__file__).parents[2],
-        timeout=60,
+        timeout=240,
     )
     assert json.loads(done.stdout) == []
 

@@ -1,6 +1,5 @@
 """Nothing that lies in the current folder or in PYTHONPATH is run, whatever it is called."""
 
-import json
 import os
 import subprocess
 import sys
@@ -57,10 +56,10 @@ def served(project: Path, short_root: Path, tmp_path: Path) -> Iterator[Api]:
         assert process.poll() is None and time.monotonic() < deadline, said
         assert not (tmp_path / "imported").exists(), (tmp_path / "imported").read_text()
         time.sleep(0.05)
-    with Api(json.loads((data / "serve.json").read_text())["url"]) as api:
+    with Api.local(data) as api:
         yield api
     process.terminate()
-    assert process.wait(60) == 0
+    assert process.wait(120) == 0
 
 
 def test_serve_runs_nothing_of_the_current_folder(served: Api, project: Path, tmp_path: Path) -> None:

@@ -163,3 +163,21 @@ def test_what_a_job_takes_is_estimated_before_and_when_it_is_made(talk: Callable
             assert answer.status_code == 422 and answer.json()["errors"][0]["pointer"] == f"#/{name}"
 
     talk(conversation)
+
+
+def test_what_is_sure_to_take_too_much_disk_is_refused(talk: Callable[..., None]) -> None:
+    """Within the ceiling of pixels, and still more than a job's folder may take."""
+
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = await photographed_dataset(service, 64, 48, 3)
+        job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "reconstruct"})).json()
+        attempt = await claimed(service, job)
+        await attempt.succeed([Result("scene.ply", "a" * 64, 1, "text/plain")])
+        pictures = {"frames": 1000, "width_px": 1024, "height_px": 1024}
+        body = {"kind": "render", "source_id": job["id"], "options": {**pictures, "format": "exr"}}
+        assert ceiling(await http.post("/v1/jobs", json=body)) == ("#/options/format", 4 << 30)
+        body["options"]["format"] = "png"
+        answer = await http.post("/v1/jobs", json=body)
+        assert answer.status_code == 202 and answer.json()["estimate"]["disk_bytes"] > 4e8, answer.text
+
+    talk(conversation, max_workspace_bytes=4 << 30)

@@ -3,6 +3,7 @@
 import asyncio
 import hashlib
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -149,23 +150,63 @@ def test_what_is_stored_under_a_note_stays_and_a_note_given_up_names_nothing(
             pool, storage = service.pool, service.storage
             old = store(service, b"stored before and named by nobody")
             await asyncio.sleep(0.2)
-            async with storing.storing(pool):
+            async with storing.storing(pool, storage):
                 young = store(service, b"about to be named")
                 removed = await collect_at_once(pool, storage, every_seconds=0.0)
                 assert removed is not None and held(service) == {young} and old not in held(service)
-            async with storing.storing(pool) as note:
+            async with storing.storing(pool, storage) as note:
                 store(service, b"about to be named")
                 async with pool.connection() as connection:
                     await connection.execute("UPDATE storing SET seen_at = now() - interval '1 hour'")
                 # A note that is being confirmed is not given up, however old.
                 async with pool.connection() as connection:
-                    await note.confirm(connection)
+                    await note.confirm(connection, [young])
                     await collect_at_once(pool, storage, every_seconds=0.0)
                     assert held(service) == {young}
                 await collect_at_once(pool, storage, every_seconds=0.0)
                 assert not held(service)
                 async with pool.connection() as connection:
                     with pytest.raises(StorageUnavailable, match="silent for too long"):
-                        await note.confirm(connection)
+                        await note.confirm(connection, [young])
+
+    asyncio.run(story())
+
+
+def test_what_is_stored_again_while_it_is_removed_is_not_lost(
+    conninfo: str, tmp_path: Path, sharp: None, s3_address: str, s3_bucket: str
+) -> None:
+    """A bucket removes what was looked at a moment before; whoever stores it in that moment hears of it."""
+    content = picture(2000, "a")
+
+    async def story() -> None:
+        address = f"s3://{s3_bucket}/x?endpoint_url={s3_address}"
+        async with running(conninfo, tmp_path, storage=address) as (http, service):
+            with service.storage.begin() as writer:
+                writer.write(content)
+                writer.commit()
+            await asyncio.sleep(1.1)  # the times of a bucket are whole seconds
+            loop, looked, go_on = asyncio.get_running_loop(), asyncio.Event(), threading.Event()
+            client = service.storage.client  # type: ignore[attr-defined]
+            delete = client.delete_object
+
+            def slowly(**given: object) -> object:
+                loop.call_soon_threadsafe(looked.set)
+                assert go_on.wait(PATIENCE_SECONDS)
+                return delete(**given)
+
+            client.delete_object = slowly
+            removing = asyncio.create_task(collect_at_once(service.pool, service.storage, every_seconds=0.0))
+            await looked.wait()
+            address = f"{await new_dataset(http)}/files/images/a.png"
+            put = asyncio.create_task(http.put(address, content=content))
+            await asyncio.sleep(0.3)
+            go_on.set()
+            assert (removed := await removing) is not None and removed.blobs == 1
+            answer = await put
+            while answer.status_code == 503:
+                assert "Retry-After" in answer.headers
+                answer = await http.put(address, content=content)
+            assert answer.status_code == 201, answer.text
+            assert (await http.get(address)).content == content
 
     asyncio.run(story())

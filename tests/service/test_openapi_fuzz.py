@@ -1,4 +1,10 @@
-"""Schemathesis asks at every address of the OpenAPI document, in ways that fit it and in ways that do not."""
+"""Schemathesis asks at every address of the OpenAPI document, in ways that fit it and in ways that do not.
+
+    OCTASPLAT_TEST_EXAMPLES=100 python -m pytest tests/service/test_openapi_fuzz.py -rP
+
+asks 100 times of each kind for each operation, and goes on from what comes back (a dataset that was made is
+filled, committed, and used for jobs).
+"""
 
 import json
 import os
@@ -18,9 +24,10 @@ pytestmark = pytest.mark.heavy
 
 ROOT = Path(__file__).parents[2]
 TOKEN = "octa_for-the-fuzzing"
-EXAMPLES = os.environ.get("OCTASPLAT_TEST_EXAMPLES", "6")
-"""Requests of each kind for each operation; more for longer."""
-COPIES = 300
+EXAMPLES = int(os.environ.get("OCTASPLAT_TEST_EXAMPLES", "6"))
+"""Requests of each kind for each operation; with many, links from one to the next are followed as well."""
+PHASES = "examples,coverage,fuzzing" + (",stateful" if EXAMPLES >= 50 else "")
+COPIES = 50 * EXAMPLES
 CHECKS = (
     "not_a_server_error", "status_code_conformance", "content_type_conformance",
     "response_headers_conformance", "response_schema_conformance", "unsupported_method", "ignored_auth",
@@ -45,6 +52,7 @@ def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
         "OCTASPLAT_FLOOR_BYTES": "0",
         "OCTASPLAT_PORT": "0",
         "OCTASPLAT_TOKEN": TOKEN,
+        "OCTASPLAT_WRONG_TOKEN_SECONDS": "0",
         "OCTASPLAT_KIND_MODULES": '["toy_kind"]',
         "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'work'}",
     }
@@ -59,7 +67,7 @@ def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
     assert address.startswith("http"), log.read_text()
     yield FrontEnd(process, address, log)
     process.terminate()
-    process.wait(20)
+    process.wait(120)
     process.stdout.close()
 
 
@@ -117,17 +125,18 @@ def test_no_request_breaks_the_service(front_end: FrontEnd, conninfo: str, tmp_p
         "PYTHONPATH": str(Path(__file__).parent),
     }
     command = [
-        str(Path(sys.executable).with_name("schemathesis")), "run", f"{front_end.address}/openapi.json",
-        "--header", f"Authorization: Bearer {TOKEN}", "--phases", "examples,coverage,fuzzing",
-        "--max-examples", EXAMPLES, "--seed", "20261121", "--no-shrink", "--checks", ",".join(CHECKS),
+        sys.executable, "-m", "schemathesis.cli", "run", f"{front_end.address}/openapi.json",
+        "--header", f"Authorization: Bearer {TOKEN}", "--phases", PHASES,
+        "--max-examples", str(EXAMPLES), "--seed", "20261121", "--no-shrink", "--checks", ",".join(CHECKS),
         "--request-timeout", "60", "--wait-for-schema", "60",
         "--suppress-health-check", "all", "--warnings", "off", "--workers", "2",
         "--continue-on-failure", "--no-color",
     ]  # fmt: skip
     for _attempt in range(3):
         done = subprocess.run(
-            command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False
-        )
+            command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False,
+            timeout=300 * EXAMPLES,
+        )  # fmt: skip
         if AST_IN_THREADS not in done.stdout:
             break
     assert done.returncode == 0, done.stdout[-20_000:] + done.stderr[-2000:]

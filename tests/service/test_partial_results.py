@@ -157,7 +157,7 @@ def test_a_file_that_fails_leaves_the_rest_and_a_retry_does_not_train_again(
         assert {"scene.ply", "metrics.json", "report.html", "mesh.glb", "mesh.ply"} <= set(first)
         assert "a.sog" not in first and any(name.startswith("renders/") for name in first)
         command = [sys.executable, "-m", "workers", "retry", job["id"], "--exports", "mesh.obj,mesh.glb"]
-        environment = {**os.environ, "OCTASPLAT_SERVER": api.address}
+        environment = {**os.environ, "OCTASPLAT_DATA": str(machine.data)}
         said = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
         assert said.returncode == 0, said.stderr
         done = watch_job(api, job["id"], lambda _event: None, lambda _state: None)

@@ -44,7 +44,7 @@ class Machine:
 
     @property
     def api(self) -> Api:
-        return Api(json.loads((self.data / "serve.json").read_text())["url"])
+        return Api.local(self.data)
 
     def children(self, word: str) -> list[psutil.Process]:
         """Processes below whose command holds ``word``."""
@@ -60,7 +60,7 @@ class Machine:
     def stop(self) -> int:
         if self.process.poll() is None:
             self.process.terminate()
-        return self.process.wait(60)
+        return self.process.wait(120)
 
 
 def start(data: Path) -> Machine:
@@ -80,9 +80,11 @@ def start(data: Path) -> Machine:
     with log.open("ab") as output:
         process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=output)
     machine = Machine(data, process)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240
     while not (data / "serve.json").exists():
-        assert process.poll() is None and time.monotonic() < deadline, log.read_text()
+        if process.poll() is not None or time.monotonic() > deadline:
+            machine.stop()
+            raise AssertionError(log.read_text())
         time.sleep(0.05)
     return machine
 
@@ -121,7 +123,7 @@ def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None
     """The log tells what was done, also by lost attempts, and nothing names a path of the machine."""
     environment = {
         **os.environ,
-        "OCTASPLAT_SERVER": json.loads((machine.data / "serve.json").read_text())["url"],
+        "OCTASPLAT_DATA": str(machine.data),
     }
 
     def command(*arguments: str) -> str:
@@ -152,7 +154,7 @@ def test_everything_is_killed_and_the_result_is_the_same(
         job = submit(api, Submission(scene, OPTIONS, "killed"))
         address = f"/v1/jobs/{job['id']}"
 
-        def until(ready: Any, seconds: float = 60.0) -> dict[str, Any]:
+        def until(ready: Any, seconds: float = 240.0) -> dict[str, Any]:
             deadline = time.monotonic() + seconds
             while not ready(now := api.get(address)):
                 assert time.monotonic() < deadline, now
@@ -239,8 +241,9 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
                 "lit",
                 "--wait",
             )
-            command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit", "--server", api.address)
-            lit = CliRunner().invoke(cli, [str(word) for word in command])
+            command = ("derive", "render", job["id"], *words, "-o", tmp_path / "lit")
+            environment = {"OCTASPLAT_DATA": str(machine.data)}
+            lit = CliRunner(env=environment).invoke(cli, [str(word) for word in command])
             assert lit.exit_code == 0 and "Rendered 1 image in" in lit.output, lit.output
             assert (tmp_path / "lit" / "views" / "view_000.png").is_file()
             with pytest.raises(ServiceError, match="no result nothing"):
@@ -262,6 +265,6 @@ def test_killed_database_comes_back(machine: Machine, scene: Path) -> None:
 
 def test_second_service_on_the_same_data_is_refused(machine: Machine) -> None:
     command = [sys.executable, "-m", "workers", "serve", "--data", str(machine.data), "--port", "0"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1 and "Another octasplat serve" in done.stderr
     assert "Traceback" not in done.stderr

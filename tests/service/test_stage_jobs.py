@@ -277,4 +277,4 @@ def test_a_killed_film_goes_on_at_another_worker_with_the_bytes_of_the_command(
     finally:
         for process in workers:
             process.kill()
-            process.wait(20)
+            process.wait(120)

@@ -344,7 +344,7 @@ def start_server(conninfo: str, tmp_path: Path, short_root: Path) -> Iterator[Ca
     yield start
     for process in processes:
         process.terminate()
-        process.wait(20)
+        process.wait(120)
 
 
 def answers(path: Path) -> bool:

@@ -20,7 +20,7 @@ from workers.records.database import open_pool
 from workers.upkeep.webhooks import addresses
 from workers.upkeep.webhooks.addresses import AddressRefused, check_url
 from workers.upkeep.webhooks.outbox import WAITS_SECONDS, take_due
-from workers.upkeep.webhooks.sending import guarded_client, send_due
+from workers.upkeep.webhooks.sending import OF_ONE_OWNER, Sender, guarded_client, send_due
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 HERE = ("127.0.0.1",)
@@ -419,5 +419,34 @@ def test_there_is_an_end_of_webhooks(talk: Callable[..., None]) -> None:
         body = {"url": "https://example.org/hook"}
         statuses = [(await http.post("/v1/webhooks", json=body)).status_code for _ in range(51)]
         assert statuses == [201] * 50 + [422]
+
+    talk(conversation)
+
+
+def test_slow_answers_to_one_owner_delay_nobody_else(talk: Callable[..., None]) -> None:
+    """One whose address takes connections and never answers, and one whose address answers."""
+
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        slow, quick = await with_token(service, "slow", "write"), await with_token(service, "quick", "write")
+        with receiving() as receiver, socket.create_server(("127.0.0.1", 0), backlog=100) as silent:
+            port = silent.getsockname()[1]
+            for headers, url, messages in ((slow, f"http://127.0.0.1:{port}/", 60), (quick, receiver.url, 2)):
+                answer = await http.post("/v1/webhooks", json={"url": url}, headers=headers)
+                for _ in range(messages):
+                    await http.post(f"/v1/webhooks/{answer.json()['id']}/test", headers=headers)
+            sender = Sender(service.pool, HERE)
+            try:
+                async with asyncio.timeout(60):
+                    assert await sender.begin() == OF_ONE_OWNER + 2
+                    while len(receiver.heard) < 2:
+                        await asyncio.sleep(0.02)
+                    assert await sender.begin() == 0  # the slow one has all that it may
+                    answer = await http.post("/v1/webhooks", json={"url": receiver.url}, headers=quick)
+                    await http.post(f"/v1/webhooks/{answer.json()['id']}/test", headers=quick)
+                    assert await sender.begin() == 1
+                    while len(receiver.heard) < 3:
+                        await asyncio.sleep(0.02)
+            finally:
+                await sender.close()
 
     talk(conversation)

@@ -16,7 +16,7 @@ from engine.shading.ambient import ambient_visibility, bounced_light
 from engine.shading.deferred import Deferred
 from engine.shading.material_settings import MaterialSettings
 from engine.shading.protocol import Sight
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceSettings
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
@@ -32,8 +32,8 @@ from flat_world import FlatWorld, small_config
 
 BARE = {
     "learn": True, "environment_height": 16, "ambient_rays": 4, "normal_weight": 0.0,
-    "depth_normal_weight": 0.0, "smooth_weight": 0.0, "smooth_normal_weight": 0.0, "harmonics_weight": 0.0,
-    "white_weight": 0.0, "even_weight": 0.0,
+    "depth_normal_weight": 0.0, "smooth_weight": 0.0, "smooth_gloss_weight": 0.0,
+    "smooth_normal_weight": 0.0, "harmonics_weight": 0.0, "white_weight": 0.0, "even_weight": 0.0,
 }  # fmt: skip
 
 

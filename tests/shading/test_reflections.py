@@ -15,7 +15,7 @@ from engine.shading.material_settings import MaterialSettings
 from engine.shading.protocol import Sight
 from engine.shading.reflections import Seen, facets_of, noise, pair_mean, pair_slope
 from engine.shading.split_sum import Surface
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 
 sys.path.append(str(Path(__file__).parent))
 

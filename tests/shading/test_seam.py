@@ -18,7 +18,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
 from engine.shading.exposure import Exposures
 from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceGradients, Tracer, TraceResult, TraceSettings
 from engine.train.batches import Batch, BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint

@@ -17,7 +17,7 @@ from engine.surface.cameras import cameras_around
 from engine.surface.extract import ExtractedSurface, extract_surface
 from engine.surface.mesh import TriangleMesh, edge_report
 from engine.surface.options import SurfaceOptions
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
 

@@ -24,7 +24,7 @@ from engine.surface.occlusion import Occluder
 from engine.surface.options import SurfaceOptions
 from engine.surface.region import choose_region
 from engine.surface.volume import fuse
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 
 MIN_VIEWS = 3
 """Only what so many cameras see can be asked for."""

@@ -17,7 +17,7 @@ from engine.surface.mesh import TriangleMesh
 from engine.surface.options import SurfaceOptions
 from engine.surface.tangents import vertex_tangents
 from engine.surface.texture import TextureLayout
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 
 SIDE = 256
 UP = (0.0, 0.0, 1.0)

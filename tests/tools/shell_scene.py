@@ -11,7 +11,7 @@ from engine.render.cameras import RenderCamera
 from engine.render.images import read_image
 from engine.render.path_file import CameraPath, write_camera_path
 from engine.render.renderer import background_colour, render_rays
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceSettings
 
 WIDTH_PX, HEIGHT_PX = 256, 192

@@ -52,6 +52,17 @@ def test_cycles_draws_what_we_draw(scene: FlatGaussians, blend: Path, tmp_path: 
     assert psnr_db(image, our_view(scene, shell_cameras()[frame])) >= 55.0
 
 
+@pytest.mark.parametrize(("name", "view"), [("a.glb", "standard"), ("a.mesh.ply", "standard")])
+def test_the_standard_view_shows_the_same(scene: FlatGaussians, tmp_path: Path, name: str, view: str) -> None:
+    """Of a GLB, too, whose colours and opacities Blender keeps in 8 bits."""
+    export_scene(scene, tmp_path / name, ExportOptions(chunks=2))
+    write_shell_cameras(tmp_path / "cameras.json")
+    given = (tmp_path / name, tmp_path / "a.blend", "--cameras", tmp_path / "cameras.json", "--view", view)
+    run_blender(IMPORT_SCRIPT, *given)
+    run_blender(SCRIPTS / "render_blend.py", tmp_path / "a.blend", tmp_path / "cycles.png", 1)
+    assert psnr_db(tmp_path / "cycles.png", our_view(scene, shell_cameras()[0])) >= 45.0
+
+
 def test_the_camera_comes_back_as_a_path(blend: Path, tmp_path: Path) -> None:
     run_blender(EXPORT_PATH_SCRIPT, tmp_path / "path.json", "--blend", blend)
     given, back = (

@@ -24,7 +24,7 @@ from engine.surface.extract import extract_surface
 from engine.surface.materials import material_features
 from engine.surface.mesh import TriangleMesh
 from engine.surface.options import SurfaceOptions
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceSettings
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]

@@ -20,7 +20,7 @@ from trace_scenes import (
 
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Gradients, Recording, Tracer, TraceSettings
 

@@ -20,9 +20,9 @@ from trace_scenes import (
 
 from engine.gaussians.model import concatenate
 from engine.rays import RayBatch
-from engine.trace.cpu import CpuTracer
 from engine.trace.cpu.packets import MAX_RAYS, find_packets
 from engine.trace.cpu.recording import CpuRecording
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceResult
 
 

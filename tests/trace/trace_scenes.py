@@ -7,7 +7,7 @@ import torch
 
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
 from engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
 

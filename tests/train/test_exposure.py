@@ -12,7 +12,7 @@ from engine.events import Event, HeldOutMeasured
 from engine.rays import RayBatch
 from engine.shading.exposure import Exposures
 from engine.shading.protocol import Sight
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceResult
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig

@@ -14,7 +14,7 @@ from engine.events import Event, HeldOutMeasured, TrainingProgress
 from engine.pipeline import reconstruct
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.shading.plain import PLAIN
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.train.batches import BatchSource
 from engine.train.config import LossWeights, TrainConfig, preset
 from engine.train.iteration import differentiate

@@ -68,7 +68,7 @@ def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> It
     yield start
     for process in processes:
         process.terminate()
-        process.wait(20)
+        process.wait(120)
 
 
 @pytest.fixture(scope="module")

@@ -84,7 +84,7 @@ def work(flow: Flow, database: str) -> Iterator[None]:
     )
     yield
     process.terminate()
-    process.wait(40)
+    process.wait(120)
 
 
 def test_a_folder_is_sent_and_goes_on_after_a_break(flow: Flow) -> None:

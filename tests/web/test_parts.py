@@ -146,7 +146,11 @@ def test_everybody_sees_their_own(talk: Callable[..., None], database: str) -> N
         async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
             for owner, scope in (("ann", "write"), ("bob", "write"), ("eve", "read")):
                 await add_token(connection, f"octa_{owner}", owner=owner, name=owner, scopes=[scope])
-        as_user = {name: {"Cookie": f"octasplat_token=octa_{name}"} for name in ("ann", "bob", "eve")}
+        as_user = {}
+        for name in ("ann", "bob", "eve"):
+            entered = await http.post("/sign-in", data={"token": f"octa_{name}"})
+            as_user[name] = {"Cookie": entered.headers["set-cookie"].partition(";")[0]}
+            http.cookies.clear()
         assert "of ann" in (await http.get("/", headers=as_user["ann"])).text
         for path in (
             f"/jobs/{job}",

@@ -24,7 +24,7 @@ from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.render.cameras import RenderCamera, focal_from_fov
 from engine.render.environment_map import read_environment, write_environment
 from engine.render.renderer import background_colour, render_rays
-from engine.trace.cpu import CpuTracer
+from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceSettings
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psycopg
 import pytest
-from worker_bench import Bench, child_pids, wait_for_end
+from worker_bench import PATIENCE_SECONDS, Bench, child_pids, wait_for_end
 
 STALE_SECONDS = 8.0
 LONG = {"STALE_SECONDS": "600"}
@@ -19,7 +19,7 @@ LONG = {"STALE_SECONDS": "600"}
 
 @pytest.fixture
 def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(conninfo, tmp_path / "bench")
+    bench = Bench(conninfo, tmp_path / "bench", stale_seconds=3.0)
     bench.folder.mkdir()
     yield bench
     bench.close()
@@ -61,7 +61,7 @@ def test_lost_database_stops_the_child_before_others_take_over(bench: Bench) -> 
     (child,) = child_pids(worker)
     with bench.cut_off():
         wait_for_end(child, STALE_SECONDS)
-        assert worker.wait(60) == 69  # to be started again
+        assert worker.wait(PATIENCE_SECONDS) == 69  # to be started again
     bench.worker(name="after", queues="cpu")
     bench.wait(job_id, lambda job: job.worker == "after" and job.attempt == 2)
     bench.open_gate()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from worker_bench import Bench
+from worker_bench import PATIENCE_SECONDS, Bench
 
 from workers.records.workers import live_workers
 
@@ -33,7 +33,7 @@ def test_a_job_ends_when_its_time_is_up_and_a_retry_has_time_anew(bench: Bench) 
     job_id = bench.submit(options={"steps": 100_000, "checkpoint_every": 10})
     bench.wait(job_id, lambda job: job.checkpoint is not None)
     first.terminate()
-    assert first.wait(60) == 0
+    assert first.wait(PATIENCE_SECONDS) == 0
     bench.worker(name="second", MAX_JOB_HOURS=hours)
     job = bench.over(job_id)
     assert job.state == "failed" and job.error is not None and job.error["type"] == "time_limit"

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from worker_bench import Bench
+from worker_bench import PATIENCE_SECONDS, Bench
 
 
 @pytest.fixture
@@ -39,11 +39,11 @@ def test_interrupted_job_is_taken_before_the_tiny_ones_behind_it(bench: Bench, k
     if kill:
         worker.kill()
         worker.wait()
-        bench.worker(queues="", name="care")  # finds out that the first is lost
+        bench.worker(queues="", name="care", STALE_SECONDS="3")  # finds out that the first is lost
         bench.wait(long_one, lambda job: job.state == "queued")
     else:
         worker.terminate()
-        assert worker.wait(60) == 0
+        assert worker.wait(PATIENCE_SECONDS) == 0
     bench.worker(name="second")
     job = bench.over(long_one)
     bench.over(tiny[1])

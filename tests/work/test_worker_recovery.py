@@ -10,10 +10,13 @@ from pathlib import Path
 import psutil
 import psycopg
 import pytest
-from worker_bench import ROOT, Bench, alive, child_pids, wait_for_end
+from worker_bench import PATIENCE_SECONDS, ROOT, Bench, alive, child_pids, wait_for_end
 
 TAKEN_OVER_SECONDS = 20.0
 """After 2.4 s a worker is missed; the rest is for a machine that is busy."""
+
+
+SOON = {"STALE_SECONDS": "3"}
 
 
 @pytest.fixture
@@ -41,11 +44,11 @@ def test_job_is_done_and_its_journal_tells_of_it(bench: Bench) -> None:
 
 
 def test_killed_worker_takes_its_child_along_and_another_goes_on(bench: Bench) -> None:
-    first = bench.worker(name="first")
+    first = bench.worker(name="first", **SOON)
     job_id = bench.submit(options=bench.held())
     bench.wait_at_gate(job_id)
     (child,) = child_pids(first)
-    bench.worker(name="second")
+    bench.worker(name="second", **SOON)
     bench.up("second")
     first.kill()
     job = bench.wait(job_id, lambda job: job.worker == "second", TAKEN_OVER_SECONDS)
@@ -71,12 +74,12 @@ def test_killed_child_is_started_again_from_the_checkpoint(bench: Bench) -> None
 
 
 def test_frozen_worker_is_fenced_when_it_comes_back(bench: Bench) -> None:
-    first = bench.worker(name="first")
+    first = bench.worker(name="first", **SOON)
     job_id = bench.submit(options=bench.held())
     bench.wait_at_gate(job_id)
     (child,) = child_pids(first)
     first.send_signal(signal.SIGSTOP)
-    bench.worker(name="second")
+    bench.worker(name="second", **SOON)
     bench.wait(job_id, lambda job: job.worker == "second" and job.attempt == 2)
     assert alive(child)  # the ghost's child goes on working
     first.send_signal(signal.SIGCONT)
@@ -102,10 +105,10 @@ def test_job_that_kills_its_program_fails_with_the_reason(bench: Bench) -> None:
 
 def test_job_that_kills_its_worker_fails_too(bench: Bench) -> None:
     """The rescue counts, as no worker lives to do so."""
-    bench.worker(queues="", name="care")
+    bench.worker(queues="", name="care", **SOON)
     job_id = bench.submit(options={"steps": 100_000, "seconds": 0.02, "checkpoint_every": 1_000_000})
     for _ in range(4):
-        worker = bench.worker(name="victim")
+        worker = bench.worker(name="victim", **SOON)
         bench.wait(job_id, lambda job: job.state == "running")
         worker.kill()
         worker.wait()
@@ -123,7 +126,7 @@ def test_terminated_worker_hands_back_at_once(bench: Bench) -> None:
     bench.up("second")
     first.terminate()
     bench.wait(job_id, lambda job: job.worker == "second")  # long before anybody could miss the first
-    assert first.wait(60) == 0
+    assert first.wait(PATIENCE_SECONDS) == 0
     bench.open_gate()
     job = bench.over(job_id)
     assert (job.state, job.attempt, job.rescues) == ("succeeded", 2, 0)

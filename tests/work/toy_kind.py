@@ -13,6 +13,9 @@ from workers.work.kinds import JobKind, register
 from workers.work.kinds.table import validated
 from workers.work.task import Task
 
+if Path(os.environ.get("XDG_CACHE_HOME", "/nowhere"), "broken").exists():
+    raise ImportError("a library is broken on this machine")
+
 
 class ToyOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -25,6 +28,9 @@ class ToyOptions(BaseModel):
     fault: bool = False
     silent_at: int | None = None
     hog_bytes: int = 0
+    fill_bytes: int = 0
+    """Written to its folder at the beginning of every attempt."""
+    result_bytes: int = 0
     log_lines: int = 0
     hold_at: int | None = None
     """Goes on beyond this step once the file ``gate`` is there."""
@@ -76,6 +82,9 @@ def run(task: Task) -> None:
         history.write(f"{step}\n")
     hog = bytearray(options.hog_bytes)
     hog[::4096] = b"x" * len(hog[::4096])
+    with (task.run / "filled").open("wb") as filled:
+        for _ in range(options.fill_bytes >> 16):
+            filled.write(os.urandom(1 << 16))
     print(f"the toy begins at {step}", flush=True)  # noqa: T201 - as a library might
     for number in range(options.log_lines):
         print(f"line {number} of a library that cannot stop talking")  # noqa: T201
@@ -100,6 +109,8 @@ def run(task: Task) -> None:
             raise Cancelled("stopped")
     task.listener(StageFinished("train", 1.0))
     (task.results / "sum.txt").write_text(str(sum(range(options.steps + 1))))
+    if options.result_bytes:
+        (task.results / "large.bin").write_bytes(os.urandom(options.result_bytes))
     (task.results / "history.txt").write_text((task.run / "events.jsonl").read_text())
 
 

@@ -12,6 +12,7 @@ import click
 
 import engine
 from engine.errors import OctasplatError
+from workers.cli.commands.backup import backup, restore
 from workers.cli.commands.clean import clean
 from workers.cli.commands.client import COMMANDS as CLIENT_COMMANDS
 from workers.cli.commands.crop import crop
@@ -25,6 +26,8 @@ from workers.cli.commands.import_ import import_
 from workers.cli.commands.info import info
 from workers.cli.commands.material import material
 from workers.cli.commands.merge import merge
+from workers.cli.commands.migrate import migrate
+from workers.cli.commands.open import open_page
 from workers.cli.commands.quota import quota
 from workers.cli.commands.reconstruct import reconstruct
 from workers.cli.commands.relight import relight
@@ -90,8 +93,8 @@ def cli() -> None:
 
 for _command in (
     reconstruct, evaluate, info, export, import_, render, relight, stage, surface,
-    material, edit, deform, transform, crop, merge, clean, demo,
-    serve, worker, token, fsck, quota, *CLIENT_COMMANDS,
+    material, edit, deform, transform, crop, merge, clean, demo, backup, restore,
+    serve, worker, open_page, token, fsck, quota, migrate, *CLIENT_COMMANDS,
 ):  # fmt: skip
     cli.add_command(_command)
 

@@ -1,6 +1,5 @@
 """Talking to a service with the progress shown: submit, wait, save the results."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import click
 
 from workers.cli.progress import show_progress
 from workers.client import submission
-from workers.client.api import TOKEN, Api
+from workers.client.api import Api
 from workers.client.submission import Derivation, JobFailed, Submission
 from workers.telling.wording import run_summary
 
@@ -73,11 +72,11 @@ def _tell_of(job: dict[str, Any], *, quiet: bool) -> None:
         click.echo(f"Note: {note}", err=True)
 
 
-def run_demo(address: str, output: Path = DEMO_OUTPUT) -> None:
+def run_demo(api: Api, output: Path = DEMO_OUTPUT) -> None:
     """The way of a user through the service, on a scene that octasplat makes itself.
 
     Args:
-        address: of the service.
+        api: the service.
         output: folder for the scene and the result.
     """
     from workers.cli.demonstration import make_scene
@@ -85,6 +84,5 @@ def run_demo(address: str, output: Path = DEMO_OUTPUT) -> None:
     scene = output / "scene"
     make_scene(scene, {}, quiet=False)
     options = {"preset": "fast", "train": {"iterations": 2000}}
-    with Api(address, os.environ.get(TOKEN)) as api:
-        submit_and_wait(api, Submission(scene, options=options, label="demo"), output / "result")
+    submit_and_wait(api, Submission(scene, options=options, label="demo"), output / "result")
     click.echo(f"Open {output / 'result' / 'report.html'} in a browser to see the result.")

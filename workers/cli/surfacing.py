@@ -1,8 +1,8 @@
 """What ``octasplat surface`` does once its options are understood."""
 
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from engine.run_folder import CONFIG, ENVIRONMENT, SCENE, is_run, run_viewpoints
 from engine.scene import load_scene
 from engine.shading.environment_frame import environment_frame
 from engine.surface.cameras import cameras_around, photograph_cameras
-from engine.surface.extract import ExtractedSurface, extract_surface
+from engine.surface.extract import ExtractedSurface, extract_levels
 from engine.surface.materials import material_features
 from engine.surface.options import SurfaceOptions
 from engine.trace.make import make_tracer
@@ -45,6 +45,8 @@ class Asked:
         scene: folder of photographs, see the command.
         materials: whether it is to be lit.
         up: the axis that then points up; None for that of the run.
+        levels: for several levels of detail in place of one, what each adds to the file's name and its number
+            of triangles.
     """
 
     source: Path
@@ -52,6 +54,16 @@ class Asked:
     scene: Path | None
     materials: bool = False
     up: str | None = None
+    levels: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """The file of each level."""
+        if not self.levels:
+            return (self.output,)
+        return tuple(
+            self.output.with_name(f"{self.output.stem}_{name}{self.output.suffix}") for name in self.levels
+        )
 
 
 def run_surface(
@@ -90,17 +102,24 @@ def run_surface(
     tracer = make_tracer(settings, threads=threads, build_quality=2)
     tracer.build(gaussians, features)
     with show_progress(quiet=quiet, should_stop=should_stop) as listener:
-        extracted = extract_surface(
-            tracer, cameras, options,
+        surfaces = extract_levels(
+            tracer, cameras, options, tuple(asked.levels.values()) or (options.max_triangles,),
             scratch=output.parent, light_frame=frame, listener=listener, should_stop=should_stop,
         )  # fmt: skip
-    files = write_surface(extracted.mesh, output)
+    for surface, place in zip(surfaces, asked.outputs, strict=True):
+        files = write_surface(surface.mesh, place)
+        if not quiet:
+            click.echo(_summary(surface))
+            _tell_written(files)
     if light is not None:
-        files = (*files, _copied(light, output.with_name(ENVIRONMENT)))
-    if not quiet:
-        click.echo(_summary(extracted))
-        for path in files:
-            click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")
+        copied = _copied(light, output.with_name(ENVIRONMENT))
+        if not quiet:
+            _tell_written((copied,))
+
+
+def _tell_written(files: tuple[Path, ...]) -> None:
+    for path in files:
+        click.echo(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB).")
 
 
 def _light_to_copy(source: Path, output: Path) -> Path | None:

@@ -11,7 +11,7 @@ from typing import Any, Self
 import httpx
 
 from engine.errors import OctasplatError
-from workers.settings import ADDRESS_FILE, default_data_folder
+from workers.settings import ADDRESS_FILE, TOKEN_FILE, default_data_folder
 
 DEFAULT_ADDRESS = "http://127.0.0.1:8642"
 SERVER, TOKEN, DATA = "OCTASPLAT_SERVER", "OCTASPLAT_TOKEN", "OCTASPLAT_DATA"
@@ -37,12 +37,36 @@ def find_address(environment: Mapping[str, str], data: Path | None = None) -> st
     """Where the service is: as the environment says, or where ``octasplat serve`` of this machine is."""
     if environment.get(SERVER):
         return environment[SERVER].rstrip("/")
-    folder = data or Path(environment.get(DATA) or default_data_folder())
+    return _local_address(data or _data_folder(environment)) or DEFAULT_ADDRESS
+
+
+def find_token(environment: Mapping[str, str], address: str, data: Path | None = None) -> str | None:
+    """What to show the service: the environment's token, or that of ``octasplat serve`` of this machine.
+
+    The latter is for that service alone; no other address is ever sent it.
+    """
+    if environment.get(TOKEN):
+        return environment[TOKEN]
+    folder = data or _data_folder(environment)
+    if _local_address(folder) != address.rstrip("/"):
+        return None
+    try:
+        return (folder / TOKEN_FILE).read_text(encoding="ascii").strip() or None
+    except (OSError, ValueError):  # somebody else's
+        return None
+
+
+def _data_folder(environment: Mapping[str, str]) -> Path:
+    return Path(environment.get(DATA) or default_data_folder())
+
+
+def _local_address(folder: Path) -> str | None:
+    """Where ``octasplat serve`` on that data folder is, if it runs."""
     try:
         content = json.loads((folder / ADDRESS_FILE).read_text(encoding="utf-8"))
         return str(content["url"]).rstrip("/")
     except (OSError, ValueError, KeyError, TypeError):
-        return DEFAULT_ADDRESS
+        return None
 
 
 class Api:
@@ -67,6 +91,12 @@ class Api:
             trust_env=not local,
             limits=httpx.Limits(max_connections=20),
         )
+
+    @classmethod
+    def local(cls, data: Path) -> Self:
+        """The service that ``octasplat serve`` runs on a data folder of one's own."""
+        address = _local_address(data) or DEFAULT_ADDRESS
+        return cls(address, find_token({}, address, data))
 
     def __enter__(self) -> Self:
         return self

@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 
 from engine.events import Listener
-from workers.client.api import Api, check_stream
+from workers.client.api import Api, Unreachable, check_stream
 from workers.telling.events import TOLD_KINDS, told_event
 
 TERMINAL = frozenset({"succeeded", "failed", "canceled"})
@@ -34,18 +34,20 @@ def watch_job(
         Unreachable: the service was away for two minutes.
     """
     last = "0"
-    heard = time.monotonic()
+    away: float | None = None
     while True:
         try:
             for kind, data, number in _events(api, job_id, last):
-                last = number
-                heard = time.monotonic()
+                last, away = number, None
                 _tell(kind, data, listener, on_state)
-        except httpx.TransportError as error:
-            if time.monotonic() - heard > _PATIENCE_SECONDS:
-                raise api.unreachable(error) from None
-        job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
-        heard = time.monotonic()
+            job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
+        except (httpx.TransportError, Unreachable) as error:
+            away = time.monotonic() if away is None else away
+            if time.monotonic() - away > _PATIENCE_SECONDS:
+                raise (error if isinstance(error, Unreachable) else api.unreachable(error)) from None
+            time.sleep(0.5)
+            continue
+        away = None
         if job["state"] in TERMINAL:
             return job
         time.sleep(0.5)

@@ -3,20 +3,21 @@
     postgres/cluster/    the data; never deleted, not even when they cannot be used
     postgres/run/        the socket
     postgres/password    of the only user, readable by its owner
-    postgres/log         what the server says
+    postgres/log         what the server says, and before that in log.1
 
 The server outlives a killed parent; the next start finds it running and takes it over.
 """
 
 import contextlib
+import ctypes
 import fcntl
 import hashlib
 import os
 import secrets
 import shutil
 import subprocess
+import sys
 import tempfile
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,12 +35,14 @@ NAME = "octasplat"
 PORT = 5432
 """Only names the socket; nothing listens on it."""
 START_SECONDS = 60
+LEAST_CONNECTIONS = 100
+LOG_BYTES = 16 << 20
+"""The log begins anew when it is longer; the one before stays beside it."""
 _MAX_SOCKET_BYTES = 103  # the shortest limit there is (macOS); Linux takes 107
 _SETTINGS = (
     "listen_addresses=",
     "unix_socket_permissions=0700",
     "shared_buffers=32MB",
-    "max_connections=100",
     "password_encryption=scram-sha-256",
     "timezone=UTC",
     "log_timezone=UTC",
@@ -52,9 +55,11 @@ class EmbeddedPostgres:
 
     Args:
         data: the data folder of the service.
+        connections: how many there may be at once; of a server that runs already they stay as they are.
     """
 
     data: Path
+    connections: int = LEAST_CONNECTIONS
 
     @property
     def home(self) -> Path:
@@ -197,12 +202,26 @@ class EmbeddedPostgres:
             given.unlink(missing_ok=True)
         if self.cluster.exists():
             self.cluster.rmdir()
+        # Before it takes its place, so that no power cut leaves half of one there; all at once, as a thousand
+        # flushes of single files take seconds on some disks.
+        if not sync_file_system(partial):
+            self._run(binaries, user, "initdb", "--sync-only", "-D", ".", cwd=partial)
         partial.rename(self.cluster)
-        # A thousand flushes take seconds on some disks; only a power cut within these would tell.
-        threading.Thread(target=self._sync, args=(binaries, user), daemon=True).start()
+        sync_file_system(self.home)
 
-    def _sync(self, binaries: PostgresBinaries, user: ServerUser) -> None:
-        self._run(binaries, user, "initdb", "--sync-only", "-D", ".", check=False)
+    def rotate_log(self) -> None:
+        """Begin the log anew if it is long."""
+        log = self.home / "log"
+        with contextlib.suppress(OSError):
+            if log.stat().st_size <= LOG_BYTES:
+                return
+            partial = self.home / "log.1.partial"
+            with log.open("rb") as source, partial.open("wb") as target:
+                source.seek(-LOG_BYTES, os.SEEK_END)
+                shutil.copyfileobj(source, target)
+            partial.chmod(0o600)
+            partial.replace(self.home / "log.1")
+            os.truncate(log, 0)  # the server appends to it
 
     def _remove_stale_locks(self) -> None:
         """Remove lock files of a server that is gone where Postgres would give up.
@@ -218,7 +237,12 @@ class EmbeddedPostgres:
                 path.unlink(missing_ok=True)
 
     def _start(self, binaries: PostgresBinaries, user: ServerUser) -> None:
-        options = [f"unix_socket_directories={self._socket_folder()}", *_SETTINGS]
+        self.rotate_log()
+        options = [
+            f"unix_socket_directories={self._socket_folder()}",
+            f"max_connections={self.connections}",
+            *_SETTINGS,
+        ]
         quoted = " ".join(f"-c '{option}'" for option in options)
         try:
             self._run(
@@ -288,6 +312,19 @@ class EmbeddedPostgres:
         with (self.home / "lock").open("w") as handle:
             fcntl.flock(handle, fcntl.LOCK_EX)
             yield
+
+
+def sync_file_system(folder: Path) -> bool:
+    """Flush the disk that a folder is on; False where the system has no way to."""
+    if not sys.platform.startswith("linux"):
+        return False
+    fd = os.open(folder, os.O_RDONLY)
+    try:
+        return bool(ctypes.CDLL(None, use_errno=True).syncfs(fd) == 0)
+    except AttributeError:
+        return False
+    finally:
+        os.close(fd)
 
 
 def is_postgres(pid_file: Path) -> bool:

@@ -17,6 +17,7 @@ from workers.queue.port import Slips
 from workers.queue.storing import Note
 from workers.records.database import Connection, Pool
 from workers.records.journal import add_event, add_log_lines, trim_log
+from workers.records.quotas import NO_QUOTA, Quota, check_bytes
 from workers.records.rows import Job
 
 MAX_RESCUES = 3
@@ -48,11 +49,13 @@ class Attempt:
         pool: connections.
         job: the row as it was when the attempt began; ``job.attempt`` is the number that fences.
         shown: a JSON value as its texts may be shown to users; everything that is written goes through it.
+        quota: what an owner may store who has no limits of their own.
     """
 
     pool: Pool
     job: Job
     shown: Callable[[Any], Any] = lambda value: value
+    quota: Quota = NO_QUOTA
 
     async def beat(self) -> str:
         """Say that the worker lives; returns the state, ``running`` or ``canceling``."""
@@ -110,16 +113,18 @@ class Attempt:
 
         Raises:
             StorageUnavailable: ``note``, under which it was stored, was given up.
+            QuotaExceeded: the job's owner may not store as much.
         """
         async with self._fenced() as (connection, job):
             if note is not None:
-                await note.confirm(connection)
+                await note.confirm(connection, {file["sha256"] for file in manifest["files"]})
             await connection.execute(
                 """
                 UPDATE jobs SET checkpoint = %s, rescues = CASE WHEN %s THEN 0 ELSE rescues END WHERE id = %s
                 """,
                 [Jsonb(dict(manifest)), advances, job.id],
             )
+            await check_bytes(connection, job.owner, self.quota)
             event = {key: manifest[key] for key in ("stage", "step") if key in manifest}
             await add_event(connection, job.id, job.attempt, "checkpoint", event)
 
@@ -127,7 +132,7 @@ class Attempt:
         """Record the newest preview picture: ``sha256``, ``step`` and ``view``; ``note`` as above."""
         async with self._fenced() as (connection, job):
             if note is not None:
-                await note.confirm(connection)
+                await note.confirm(connection, [preview["sha256"]])
             await connection.execute(
                 "UPDATE jobs SET preview = %s WHERE id = %s", [Jsonb(dict(preview)), job.id]
             )
@@ -139,12 +144,16 @@ class Attempt:
         Args:
             results: all of them.
             psnr: mean over the held-out views, dB, if they were measured.
+
+        Raises:
+            QuotaExceeded: the job's owner may not store as much.
         """
         async with self._fenced() as (connection, job):
             if psnr is not None:
                 await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [psnr, job.id])
             await _show(connection, job, results)
             await end_job(connection, job, "succeeded", None)
+            await check_bytes(connection, job.owner, self.quota)
 
     async def fail(
         self, error: Mapping[str, Any], results: Sequence[Result] = (), note: Note | None = None
@@ -153,10 +162,12 @@ class Attempt:
 
         Raises:
             StorageUnavailable: ``note``, under which they were stored, was given up.
+            QuotaExceeded: the job's owner may not store as much.
         """
         async with self._fenced() as (connection, job):
             if results:
                 await _show(connection, job, results, note)
+                await check_bytes(connection, job.owner, self.quota)
             await end_job(connection, job, "failed", self.shown(dict(error)))
 
     async def cancel(self) -> None:
@@ -181,15 +192,32 @@ class Attempt:
         error: Mapping[str, Any],
         results: Sequence[Result] = (),
         note: Note | None = None,
+        *,
+        wait_seconds: float = 0.0,
+        forget_checkpoint: bool = False,
     ) -> None:
         """The attempt was lost without its worker's intent: another try, or the end if there were enough.
 
-        At the end ``results`` are those that there are, ``note`` as in :meth:`fail`.
+        Args:
+            slips: the queue.
+            error: what happened.
+            results: those that there are, for the end.
+            note: as in :meth:`fail`.
+            wait_seconds: for how long the job is not taken up again.
+            forget_checkpoint: at the end; then a retry begins anew.
+
+        Raises:
+            StorageUnavailable: as by :meth:`fail`.
+            QuotaExceeded: as by :meth:`fail`.
         """
         async with self._fenced() as (connection, job):
-            failed = await rescue(connection, slips, job, self.shown(dict(error)), keep_slip=True)
+            error = self.shown(dict(error))
+            failed = await rescue(connection, slips, job, error, keep_slip=True, wait_seconds=wait_seconds)
+            if failed and forget_checkpoint:
+                await connection.execute("UPDATE jobs SET checkpoint = NULL WHERE id = %s", [job.id])
             if failed and results:
                 await _show(connection, job, results, note)
+                await check_bytes(connection, job.owner, self.quota)
 
     @asynccontextmanager
     async def _fenced(self) -> AsyncIterator[tuple[Connection, Job]]:
@@ -219,6 +247,13 @@ async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attemp
             """,
             [worker, job_id],
         )
+        await connection.execute(
+            """
+            INSERT INTO owner_turns (owner, queue) VALUES (%s, %s)
+            ON CONFLICT (owner, queue) DO UPDATE SET turn_at = clock_timestamp()
+            """,
+            [job.owner, job.queue],
+        )
         await add_event(connection, job_id, job.attempt + 1, "state", {"state": "running", "worker": worker})
         await trim_log(connection, job_id, KEPT_LOG_LINES)
         await add_log_lines(connection, job_id, job.attempt + 1, [f"Attempt {job.attempt + 1} on {worker}"])
@@ -228,12 +263,19 @@ async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attemp
 
 
 async def rescue(
-    connection: Connection, slips: Slips, job: Job, error: Mapping[str, Any], *, keep_slip: bool = False
+    connection: Connection,
+    slips: Slips,
+    job: Job,
+    error: Mapping[str, Any],
+    *,
+    keep_slip: bool = False,
+    wait_seconds: float = 0.0,
 ) -> bool:
     """Give a job whose attempt was lost to another worker; the caller holds the job's lock.
 
     A job that was to be cancelled is cancelled. One that was lost too often without getting any further is
-    failed with ``error``. With ``keep_slip`` the slip is still being delivered and goes by itself.
+    failed with ``error``. With ``keep_slip`` the slip is still being delivered and goes by itself. Nobody
+    takes it up before ``wait_seconds`` are over.
 
     Returns:
         Whether it failed.
@@ -252,7 +294,7 @@ async def rescue(
         await add_event(connection, job.id, job.attempt, "rescued", data)
         lost = f"Lost, and queued again: {error['message']}"
         await add_log_lines(connection, job.id, job.attempt, [lost])
-        await queue_again(connection, slips, job, keep_slip=keep_slip)
+        await queue_again(connection, slips, job, keep_slip=keep_slip, wait_seconds=wait_seconds)
     return False
 
 
@@ -261,7 +303,7 @@ async def _show(
 ) -> None:
     """Put results into the place of earlier ones; the one place where they become visible."""
     if note is not None:
-        await note.confirm(connection)
+        await note.confirm(connection, {result.sha256 for result in results})
     async with connection.cursor() as cursor:
         await cursor.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
         await cursor.executemany(

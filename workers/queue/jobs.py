@@ -12,8 +12,8 @@ from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
 from workers.queue.port import QueueDepth, Slips
-from workers.records.database import Connection
-from workers.records.errors import Conflict
+from workers.records.database import Connection, naming
+from workers.records.errors import Conflict, Missing
 from workers.records.ids import new_id
 from workers.records.journal import add_event
 from workers.records.rows import Artifact, Job
@@ -66,12 +66,12 @@ async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
 
 async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job | None:
     """The job of that id, or None; with ``lock`` nobody else changes it until the transaction ends."""
-    query = "SELECT * FROM jobs WHERE id = %s FOR UPDATE" if lock else "SELECT * FROM jobs WHERE id = %s"
+    query = "SELECT {} FROM jobs WHERE id = %s FOR UPDATE" if lock else "SELECT {} FROM jobs WHERE id = %s"
     if lock:  # for all it knows the database would wait hours for a host that vanished
         limit = "SELECT set_config('idle_in_transaction_session_timeout', %s, true)"
         await connection.execute(limit, [f"{LOCK_SECONDS}s"])
     async with connection.cursor(row_factory=class_row(Job)) as cursor:
-        await cursor.execute(query, [job_id])
+        await cursor.execute(naming(query, Job), [job_id])
         return await cursor.fetchone()
 
 
@@ -100,8 +100,9 @@ async def list_jobs(
     """
     async with connection.cursor(row_factory=class_row(Job)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM jobs
+            naming(
+                """
+            SELECT {} FROM jobs
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
               AND (cardinality(%(states)s::text[]) = 0 OR state = ANY(%(states)s))
               AND (%(kind)s::text IS NULL OR kind = %(kind)s)
@@ -110,6 +111,8 @@ async def list_jobs(
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
+                Job,
+            ),
             {
                 "owner": owner,
                 "states": list(states),
@@ -124,15 +127,25 @@ async def list_jobs(
 
 
 async def queue_position(connection: Connection, job: Job) -> int | None:
-    """How many jobs go before a queued job in its queue; None for any other."""
+    """How many jobs go before a queued job in its queue, if owners take turns; None for any other."""
     if job.state != "queued":
         return None
     cursor = await connection.execute(
         """
-        SELECT count(*) AS ahead FROM jobs
-        WHERE state = 'queued' AND queue = %s AND (priority > %s OR priority = %s AND slip < %s)
+        WITH waiting AS (
+            SELECT owner, priority, slip FROM jobs WHERE state = 'queued' AND queue = %(queue)s
+        ), own AS (
+            SELECT count(*) AS n FROM waiting
+            WHERE owner = %(owner)s AND priority = %(priority)s AND slip < %(slip)s
+        )
+        SELECT (SELECT count(*) FROM waiting WHERE priority > %(priority)s) + own.n + (
+            SELECT coalesce(sum(least(n, own.n + 1)), 0) FROM (
+                SELECT count(*) AS n FROM waiting
+                WHERE owner <> %(owner)s AND priority = %(priority)s AND slip < %(slip)s GROUP BY owner
+            ) AS others
+        ) AS ahead FROM own
         """,
-        [job.queue, job.priority, job.priority, job.slip],
+        {"queue": job.queue, "owner": job.owner, "priority": job.priority, "slip": job.slip},
     )
     row = await cursor.fetchone()
     return int(row["ahead"]) if row else 0
@@ -143,7 +156,7 @@ async def cancel_job(connection: Connection, slips: Slips, job_id: uuid.UUID) ->
 
     Raises:
         Conflict: it succeeded or failed already.
-        KeyError: there is no such job.
+        Missing: there is no such job.
     """
     async with connection.transaction():
         job = await _existing(connection, job_id, lock=True)
@@ -183,7 +196,7 @@ async def retry_job(
 
     Raises:
         Conflict: it is neither failed nor cancelled.
-        KeyError: there is no such job.
+        Missing: there is no such job.
     """
     async with connection.transaction():
         job = await _existing(connection, job_id, lock=True)
@@ -213,7 +226,15 @@ async def retry_job(
         return await _existing(connection, job_id)
 
 
-async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_slip: bool = False) -> None:
+async def queue_again(
+    connection: Connection,
+    slips: Slips,
+    job: Job,
+    *,
+    keep_slip: bool = False,
+    wait_seconds: float = 0.0,
+    quiet: bool = False,
+) -> None:
     """Put a job back into its queue with a new slip; the caller holds the job's lock.
 
     A job that has a slip, as it was interrupted or not even begun, keeps its place: it goes before all that
@@ -224,10 +245,17 @@ async def queue_again(connection: Connection, slips: Slips, job: Job, *, keep_sl
         slips: the queue.
         job: which.
         keep_slip: the old slip is being delivered and goes by itself when that ends.
+        wait_seconds: for how long it is not taken up.
+        quiet: it never ceased to be queued, so that nobody needs to hear of it.
     """
     if job.slip is not None and not keep_slip:
         await slips.remove(connection, job.slip)
-    slip = await slips.put(connection, job.id, job.queue, job.priority, place_of=job.slip)
+    slip = await slips.put(
+        connection, job.id, job.queue, job.priority, place_of=job.slip, wait_seconds=wait_seconds
+    )
+    if quiet:
+        await connection.execute("UPDATE jobs SET slip = %s WHERE id = %s", [slip, job.id])
+        return
     await connection.execute(
         """
         UPDATE jobs SET state = 'queued', slip = %s, queued_at = now(), worker = NULL, seconds_left = NULL
@@ -256,7 +284,7 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
 
     Raises:
         Conflict: it is not over, or other jobs work on its results.
-        KeyError: there is no such job.
+        Missing: there is no such job.
     """
     async with connection.transaction():
         job = await _existing(connection, job_id, lock=True)
@@ -279,14 +307,18 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
 async def artifacts_of(connection: Connection, job_id: uuid.UUID) -> list[Artifact]:
     """The results of a job, by name."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
-        await cursor.execute("SELECT * FROM artifacts WHERE job_id = %s ORDER BY name", [job_id])
+        await cursor.execute(
+            naming("SELECT {} FROM artifacts WHERE job_id = %s ORDER BY name", Artifact), [job_id]
+        )
         return await cursor.fetchall()
 
 
 async def get_artifact(connection: Connection, job_id: uuid.UUID, name: str) -> Artifact | None:
     """One result of a job, or None."""
     async with connection.cursor(row_factory=class_row(Artifact)) as cursor:
-        await cursor.execute("SELECT * FROM artifacts WHERE job_id = %s AND name = %s", [job_id, name])
+        await cursor.execute(
+            naming("SELECT {} FROM artifacts WHERE job_id = %s AND name = %s", Artifact), [job_id, name]
+        )
         return await cursor.fetchone()
 
 
@@ -313,5 +345,5 @@ async def running_by_queue(connection: Connection) -> dict[str, int]:
 async def _existing(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job:
     job = await get_job(connection, job_id, lock=lock)
     if job is None:
-        raise KeyError(job_id)
+        raise Missing("job")
     return job

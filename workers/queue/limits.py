@@ -1,13 +1,15 @@
-"""Ends of jobs that no worker brings about: how long they have run, and queues that nobody takes."""
+"""Ends of jobs before their work: how long they have run, queues that nobody takes, hosts too small."""
 
 import uuid
+from collections.abc import Mapping
+from typing import Any
 
 from psycopg.rows import class_row
 
 from workers.queue.attempts import end_job
 from workers.queue.jobs import get_job
 from workers.queue.port import Slips
-from workers.records.database import Connection, Pool
+from workers.records.database import Connection, Pool, naming
 from workers.records.rows import TERMINAL, Job
 
 
@@ -42,16 +44,21 @@ async def end_abandoned(pool: Pool, slips: Slips, *, stale_seconds: float, hours
         return []
     async with pool.connection() as connection, connection.cursor(row_factory=class_row(Job)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM jobs WHERE state = 'queued' AND queued_at < now() - make_interval(secs => %(limit)s)
+            naming(
+                """
+            SELECT {} FROM jobs WHERE state = 'queued'
+              AND queued_at < now() - make_interval(secs => %(limit)s)
               AND NOT EXISTS (
                 SELECT 1 FROM workers WHERE jobs.queue = ANY(workers.queues)
-                  AND seen_at > now() - make_interval(secs => %(stale)s))
+                  AND seen_at > now() - make_interval(secs => %(stale)s)
+                  AND coalesce(facts->'kinds' ? jobs.kind, true))
               AND NOT EXISTS (
-                SELECT 1 FROM jobs others WHERE others.queue = jobs.queue
+                SELECT 1 FROM jobs others WHERE others.queue = jobs.queue AND others.kind = jobs.kind
                   AND others.heartbeat_at > now() - make_interval(secs => %(limit)s))
             ORDER BY id LIMIT 1000
             """,
+                Job,
+            ),
             {"limit": 3600 * hours, "stale": stale_seconds},
         )
         found = await cursor.fetchall()
@@ -64,9 +71,22 @@ async def end_abandoned(pool: Pool, slips: Slips, *, stale_seconds: float, hours
             if now.slip is not None:
                 await slips.remove(connection, now.slip)
             message = (
-                f"The job waited for {hours:g} hours in the queue {job.queue}, which no worker takes; start "
+                f"The job waited for {hours:g} hours in the queue {job.queue}, from which no worker takes "
+                f"jobs of the kind {job.kind}; start "
                 f"one with octasplat worker --queues {job.queue}, or ask for another queue."
             )
             await end_job(connection, now, "failed", {"type": "no_worker", "message": message})
             ended.append(job.id)
     return ended
+
+
+async def fail_unbegun(
+    connection: Connection, job_id: uuid.UUID, slip: int, error: Mapping[str, Any]
+) -> bool:
+    """Fail a job whose slip is being delivered, before any attempt; False if it has gone on without it."""
+    async with connection.transaction():
+        job = await get_job(connection, job_id, lock=True)
+        if job is None or job.state != "queued" or job.slip != slip:
+            return False
+        await end_job(connection, job, "failed", error)
+    return True

@@ -36,6 +36,7 @@ class Slips(Protocol):
         priority: int,
         *,
         place_of: int | None = None,
+        wait_seconds: float = 0.0,
     ) -> int:
         """Queue a slip for a job within the transaction of ``connection``.
 
@@ -46,6 +47,7 @@ class Slips(Protocol):
             priority: higher goes first; where it is the same, the smaller number does.
             place_of: an earlier slip of the job whose place in the queue the new one takes: before all that
                 were queued after it. None queues it last.
+            wait_seconds: with ``place_of``, for how long others go before it all the same.
 
         Returns:
             The slip's number, which no slip of this job had.
@@ -56,12 +58,20 @@ class Slips(Protocol):
         """Take a slip away, whether it waits or its worker was lost; harmless if it is gone."""
         ...
 
+    async def take(self, connection: Connection, slip: int) -> bool:
+        """Take away a slip that could be delivered now; False if it is with somebody, or is yet to wait."""
+        ...
+
     async def lost(self, connection: Connection) -> Sequence[uuid.UUID]:
         """Jobs that say they are queued although no slip of theirs waits or is with a live worker."""
         ...
 
     async def work(self, queue: str, concurrency: int, deliver: Deliver) -> None:
         """Deliver slips until :meth:`stop` is called or the database is lost; returns when all are done."""
+        ...
+
+    def pause(self) -> None:
+        """Deliver no more slips until :meth:`work` is called again."""
         ...
 
     def stop(self) -> None:

@@ -53,10 +53,11 @@ class ProcrastinateSlips:
         priority: int,
         *,
         place_of: int | None = None,
+        wait_seconds: float = 0.0,
     ) -> int:
         """Queue a slip; see the port."""
         if place_of is not None:
-            return await _put_back(connection, job_id, queue, priority, place_of)
+            return await _put_back(connection, job_id, queue, priority, place_of, wait_seconds)
         job = procrastinate.jobs.Job(
             queue=queue,
             priority=priority,
@@ -72,6 +73,20 @@ class ProcrastinateSlips:
     async def remove(self, connection: Connection, slip: int) -> None:
         """Take a slip away; see the port."""
         await connection.execute("DELETE FROM procrastinate_jobs WHERE id = %s", [slip])
+
+    async def take(self, connection: Connection, slip: int) -> bool:
+        """Take away a slip that waits; see the port."""
+        cursor = await connection.execute(
+            """
+            DELETE FROM procrastinate_jobs WHERE id = (
+                SELECT id FROM procrastinate_jobs
+                WHERE id = %s AND status = 'todo' AND (scheduled_at IS NULL OR scheduled_at <= now())
+                FOR UPDATE SKIP LOCKED
+            )
+            """,
+            [slip],
+        )
+        return cursor.rowcount > 0
 
     async def lost(self, connection: Connection) -> Sequence[uuid.UUID]:
         """Queued jobs without a living slip; see the port."""
@@ -124,20 +139,32 @@ class ProcrastinateSlips:
     def stop(self) -> None:
         """Deliver no more; see the port."""
         self._stopped = True
+        self.pause()
+
+    def pause(self) -> None:
+        """Deliver no more for now; see the port."""
         for worker in self._workers:
             worker.stop()  # type: ignore[no-untyped-call]
 
 
 async def _put_back(
-    connection: Connection, job_id: uuid.UUID, queue: str, priority: int, place_of: int
+    connection: Connection, job_id: uuid.UUID, queue: str, priority: int, place_of: int, wait_seconds: float
 ) -> int:
     """Queue a slip in the place of an earlier one; Procrastinate's own way numbers them all anew."""
     cursor = await connection.execute(
         """
-        INSERT INTO procrastinate_jobs (id, queue_name, task_name, priority, args)
-        VALUES (%s, %s, %s, %s, jsonb_build_object('job_id', %s::text)) RETURNING id
+        INSERT INTO procrastinate_jobs (id, queue_name, task_name, priority, args, scheduled_at)
+        VALUES (%(id)s, %(queue)s, %(task)s, %(priority)s, jsonb_build_object('job_id', %(job)s::text),
+            CASE WHEN %(wait)s > 0 THEN now() + make_interval(secs => %(wait)s) END) RETURNING id
         """,
-        [returned_number(place_of), queue, TASK, priority, str(job_id)],
+        {
+            "id": returned_number(place_of),
+            "queue": queue,
+            "task": TASK,
+            "priority": priority,
+            "job": str(job_id),
+            "wait": wait_seconds,
+        },
     )
     row = await cursor.fetchone()
     assert row is not None

@@ -7,7 +7,7 @@ from psycopg.rows import class_row
 from workers.queue.attempts import rescue
 from workers.queue.jobs import get_job, queue_again
 from workers.queue.port import Slips
-from workers.records.database import Pool
+from workers.records.database import Pool, naming
 from workers.records.rows import Job
 
 logger = logging.getLogger(__name__)
@@ -24,12 +24,15 @@ async def rescue_lost_jobs(pool: Pool, slips: Slips, stale_seconds: float) -> in
     async with pool.connection() as connection:
         async with connection.transaction(), connection.cursor(row_factory=class_row(Job)) as cursor:
             await cursor.execute(
-                """
-                SELECT * FROM jobs
+                naming(
+                    """
+                SELECT {} FROM jobs
                 WHERE state IN ('running', 'canceling')
                   AND heartbeat_at < now() - make_interval(secs => %s)
                 ORDER BY id FOR UPDATE SKIP LOCKED
                 """,
+                    Job,
+                ),
                 [stale_seconds],
             )
             lost = await cursor.fetchall()

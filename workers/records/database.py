@@ -1,10 +1,13 @@
 """Connections to the database."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from typing import Any
+from dataclasses import fields
+from functools import cache
+from typing import Any, LiteralString
 
 import psycopg
+from psycopg import sql
 from psycopg.rows import DictRow, dict_row
 from psycopg_pool import AsyncConnectionPool
 
@@ -12,6 +15,32 @@ from workers.records.errors import DatabaseError
 
 Connection = psycopg.AsyncConnection[DictRow]
 Pool = AsyncConnectionPool[Connection]
+
+STATEMENT_SECONDS = 60
+"""A statement that takes longer, as it waits for a lock or the database is overwhelmed, is given up."""
+IDLE_SECONDS = 30
+"""A transaction of which nothing is heard for so long is undone; its process is gone or frozen."""
+KEEPALIVES: Mapping[str, int] = {
+    "keepalives": 1,
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 25_000,
+}
+"""So that a host that vanished is noticed within half a minute; by itself TCP takes hours."""
+
+
+@cache
+def naming(query: LiteralString, row: type[Any]) -> sql.Composed:
+    """A query with the columns that a row has in the place of its braces.
+
+    They are named, as the next version's tables, with which this one goes on for a while, may have more.
+
+    Args:
+        query: with ``{}`` where the columns belong.
+        row: a dataclass whose fields are named as the columns.
+    """
+    return sql.SQL(query).format(sql.SQL(", ").join(sql.Identifier(field.name) for field in fields(row)))
 
 
 @asynccontextmanager
@@ -26,7 +55,7 @@ async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 
     Raises:
         DatabaseError: the database cannot be reached.
     """
-    options: dict[str, Any] = {"row_factory": dict_row, "connect_timeout": 10}
+    options: dict[str, Any] = {"row_factory": dict_row, "connect_timeout": 10, **KEEPALIVES}
     pool: Pool = AsyncConnectionPool(
         conninfo,
         min_size=1,
@@ -34,6 +63,7 @@ async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 
         timeout=wait_seconds,
         open=False,
         kwargs=options,
+        configure=_bound,
         check=AsyncConnectionPool.check_connection,
         reconnect_timeout=wait_seconds,
     )
@@ -49,3 +79,21 @@ async def open_pool(conninfo: str, *, max_size: int = 10, wait_seconds: float = 
         yield pool
     finally:
         await pool.close(timeout=5)
+
+
+async def _bound(connection: Connection) -> None:
+    """Bound what others may have to wait for this connection; not by options, as a pooler refuses them."""
+    settings = {
+        "statement_timeout": f"{STATEMENT_SECONDS}s",
+        "idle_in_transaction_session_timeout": f"{IDLE_SECONDS}s",
+        # The server's own view of a client that vanished.
+        "tcp_keepalives_idle": str(KEEPALIVES["keepalives_idle"]),
+        "tcp_keepalives_interval": str(KEEPALIVES["keepalives_interval"]),
+        "tcp_keepalives_count": str(KEEPALIVES["keepalives_count"]),
+    }
+    await connection.set_autocommit(True)
+    await connection.execute(
+        "SELECT set_config(name, value, false) FROM unnest(%s::text[], %s::text[]) AS given (name, value)",
+        [list(settings), list(settings.values())],
+    )
+    await connection.set_autocommit(False)

@@ -7,11 +7,14 @@ from typing import Any
 from psycopg.rows import class_row, dict_row
 from psycopg.types.json import Jsonb
 
-from workers.records.database import Connection
-from workers.records.errors import Conflict
+from workers.records.database import Connection, naming
+from workers.records.errors import Conflict, Missing
 from workers.records.ids import new_id
 from workers.records.rows import Dataset, DatasetFile, DatasetHolds
 from workers.records.sizes import Sizes
+
+CHECK_LOST_SECONDS = 60
+"""A validation of which nothing was heard for so long counts no more; its process is gone."""
 
 
 async def create_dataset(
@@ -30,9 +33,9 @@ async def create_dataset(
 
 async def get_dataset(connection: Connection, dataset_id: uuid.UUID, *, lock: bool = False) -> Dataset | None:
     """The dataset of that id, or None."""
-    query = "SELECT * FROM datasets WHERE id = %s"
+    query = "SELECT {} FROM datasets WHERE id = %s"
     async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
-        await cursor.execute(f"{query} FOR UPDATE" if lock else query, [dataset_id])
+        await cursor.execute(naming(f"{query} FOR UPDATE" if lock else query, Dataset), [dataset_id])
         return await cursor.fetchone()
 
 
@@ -42,12 +45,15 @@ async def list_datasets(
     """Datasets, the newest first; ``owner`` None takes everybody's."""
     async with connection.cursor(row_factory=class_row(Dataset)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM datasets
+            naming(
+                """
+            SELECT {} FROM datasets
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
+                Dataset,
+            ),
             {"owner": owner, "before": before, "limit": limit},
         )
         return await cursor.fetchall()
@@ -82,7 +88,7 @@ async def put_file(
 
     Raises:
         Conflict: the dataset takes no files any more.
-        KeyError: there is no such dataset.
+        Missing: there is no such dataset.
     """
     async with connection.transaction():
         await _open_dataset(connection, dataset_id)
@@ -106,7 +112,7 @@ async def remove_file(connection: Connection, dataset_id: uuid.UUID, path: str) 
 
     Raises:
         Conflict: the dataset does not change any more.
-        KeyError: there is no such dataset.
+        Missing: there is no such dataset.
     """
     async with connection.transaction():
         await _open_dataset(connection, dataset_id)
@@ -120,7 +126,8 @@ async def get_file(connection: Connection, dataset_id: uuid.UUID, path: str) -> 
     """One file of a dataset, or None."""
     async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
         await cursor.execute(
-            "SELECT * FROM dataset_files WHERE dataset_id = %s AND path = %s", [dataset_id, path]
+            naming("SELECT {} FROM dataset_files WHERE dataset_id = %s AND path = %s", DatasetFile),
+            [dataset_id, path],
         )
         return await cursor.fetchone()
 
@@ -131,10 +138,13 @@ async def files_of(
     """Files of a dataset by path; those after the path ``after``, at most ``limit``."""
     async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM dataset_files WHERE dataset_id = %s AND path COLLATE "C" > %s
+            naming(
+                """
+            SELECT {} FROM dataset_files WHERE dataset_id = %s AND path COLLATE "C" > %s
             ORDER BY path COLLATE "C" LIMIT %s
             """,
+                DatasetFile,
+            ),
             [dataset_id, after, limit],
         )
         return await cursor.fetchall()
@@ -160,12 +170,12 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
 
     Raises:
         Conflict: it is being validated already.
-        KeyError: there is no such dataset.
+        Missing: there is no such dataset.
     """
     async with connection.transaction():
         dataset = await get_dataset(connection, dataset_id, lock=True)
         if dataset is None:
-            raise KeyError(dataset_id)
+            raise Missing("dataset")
         if dataset.state == "checking" and not await _check_was_lost(connection, dataset_id):
             raise Conflict("The dataset is being checked already; ask again in a moment.")
         if dataset.state != "committed":
@@ -174,6 +184,13 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
                 [dataset_id],
             )
         return dataset
+
+
+async def renew_check(connection: Connection, dataset_id: uuid.UUID) -> None:
+    """Say that a dataset is still being validated."""
+    await connection.execute(
+        "UPDATE datasets SET used_at = now() WHERE id = %s AND state = 'checking'", [dataset_id]
+    )
 
 
 async def end_check(
@@ -185,7 +202,11 @@ async def end_check(
     photographs: int = 0,
     facts: Mapping[str, Any] | None = None,
 ) -> Dataset:
-    """Commit a dataset that was found sound, or open it again for better files."""
+    """Commit a dataset that was found sound, or open it again for better files.
+
+    Raises:
+        Missing: there is no such dataset any more.
+    """
     await connection.execute(
         """
         UPDATE datasets SET state = CASE WHEN %(sound)s THEN 'committed' ELSE 'open' END,
@@ -202,7 +223,8 @@ async def end_check(
         },
     )
     dataset = await get_dataset(connection, dataset_id)
-    assert dataset is not None
+    if dataset is None:
+        raise Missing("dataset")
     return dataset
 
 
@@ -220,7 +242,7 @@ async def change_dataset(
     )
     dataset = await get_dataset(connection, dataset_id)
     if dataset is None:
-        raise KeyError(dataset_id)
+        raise Missing("dataset")
     return dataset
 
 
@@ -228,12 +250,15 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
     """Forget a dataset that no job needs; its blobs stay until they are swept.
 
     Raises:
-        Conflict: jobs were made from it.
-        KeyError: there is no such dataset.
+        Conflict: jobs were made from it, or it is being validated.
+        Missing: there is no such dataset.
     """
     async with connection.transaction():
-        if await get_dataset(connection, dataset_id, lock=True) is None:
-            raise KeyError(dataset_id)
+        dataset = await get_dataset(connection, dataset_id, lock=True)
+        if dataset is None:
+            raise Missing("dataset")
+        if dataset.state == "checking" and not await _check_was_lost(connection, dataset_id):
+            raise Conflict("The dataset is being checked; delete it when that is done.")
         cursor = await connection.execute(
             "SELECT count(*) AS n FROM jobs WHERE %s IN (dataset_id, files_id)", [dataset_id]
         )
@@ -244,9 +269,10 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
 
 
 async def _check_was_lost(connection: Connection, dataset_id: uuid.UUID) -> bool:
-    """Whether a check began so long ago that whoever made it must have gone."""
+    """Whether whoever checks was not heard of for so long that it must have gone."""
     cursor = await connection.execute(
-        "SELECT used_at < now() - interval '15 minutes' AS lost FROM datasets WHERE id = %s", [dataset_id]
+        "SELECT used_at < now() - make_interval(secs => %s) AS lost FROM datasets WHERE id = %s",
+        [CHECK_LOST_SECONDS, dataset_id],
     )
     row = await cursor.fetchone()
     return bool(row and row["lost"])
@@ -255,7 +281,7 @@ async def _check_was_lost(connection: Connection, dataset_id: uuid.UUID) -> bool
 async def _open_dataset(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
     dataset = await get_dataset(connection, dataset_id, lock=True)
     if dataset is None:
-        raise KeyError(dataset_id)
+        raise Missing("dataset")
     if dataset.state != "open":
         raise Conflict(f"The dataset is {dataset.state}, so its files do not change; make a new dataset.")
     return dataset

@@ -9,3 +9,11 @@ class DatabaseError(OctasplatError):
 
 class Conflict(OctasplatError):
     """The job or dataset is in a state that does not allow what was asked."""
+
+
+class Missing(OctasplatError):
+    """What was asked for is not there, or not any more; ``what`` names its kind."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"There is no such {what}.")
+        self.what = what

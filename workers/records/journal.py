@@ -7,7 +7,7 @@ from typing import Any
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from workers.records.database import Connection
+from workers.records.database import Connection, naming
 from workers.records.rows import JobEvent, LogLine
 
 CHANNEL = "octasplat_events"
@@ -53,7 +53,7 @@ async def events_after(
     """Events of a job with an id above ``after``, in order."""
     async with connection.cursor(row_factory=class_row(JobEvent)) as cursor:
         await cursor.execute(
-            "SELECT * FROM job_events WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s",
+            naming("SELECT {} FROM job_events WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s", JobEvent),
             [job_id, after, limit],
         )
         return await cursor.fetchall()
@@ -65,7 +65,7 @@ async def log_after(
     """Log lines of a job with an id above ``after``, in order."""
     async with connection.cursor(row_factory=class_row(LogLine)) as cursor:
         await cursor.execute(
-            "SELECT * FROM job_logs WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s",
+            naming("SELECT {} FROM job_logs WHERE job_id = %s AND id > %s ORDER BY id LIMIT %s", LogLine),
             [job_id, after, limit],
         )
         return await cursor.fetchall()

@@ -1,6 +1,12 @@
-"""Brings a database to this version's tables: ours and the queue's, each step once, under one lock."""
+"""Brings a database to this version's tables: ours and the queue's, each step once, under one lock.
 
-from collections.abc import Iterator
+Steps add to what is there, so that processes of the version before go on beside this one's: they only begin,
+end and write what they know. What they can no longer read or write raises :data:`OLDEST_READER`.
+"""
+
+import logging
+import time
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -11,6 +17,9 @@ from workers.records.errors import DatabaseError
 
 OURS, QUEUE = "octasplat", "procrastinate"
 OLDEST_SERVER = 140000
+OLDEST_READER = "0007_files.sql"
+"""Processes that know this step of ours may go on with the tables of this version."""
+WAIT_SECONDS = 120.0
 _LOCK = 0x6F637461  # "octa"
 _VERSIONS = """
 CREATE TABLE IF NOT EXISTS schema_steps (
@@ -18,8 +27,14 @@ CREATE TABLE IF NOT EXISTS schema_steps (
     name text NOT NULL,
     applied_at timestamptz NOT NULL DEFAULT now(),
     PRIMARY KEY (component, name)
-)
+);
+CREATE TABLE IF NOT EXISTS schema_reach (
+    one boolean PRIMARY KEY DEFAULT true CHECK (one),
+    oldest_reader text NOT NULL
+);
 """
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -37,14 +52,18 @@ class Step:
     sql: str
 
 
-def migrate(conninfo: str) -> tuple[str, ...]:
+def migrate(conninfo: str, only: Collection[str] | None = None) -> tuple[str, ...]:
     """Apply every step that the database lacks; others who start meanwhile wait.
 
+    Args:
+        conninfo: how to connect.
+        only: of our own steps only those of these names.
+
     Returns:
-        Names of the steps applied.
+        Names of the steps applied; none where a newer version made the tables, which this one may use.
 
     Raises:
-        DatabaseError: the database cannot be reached, is too old, or is newer than this version.
+        DatabaseError: the database cannot be reached, is too old, or is too new for this version.
     """
     try:
         with psycopg.connect(conninfo, autocommit=True, connect_timeout=10) as connection:
@@ -52,15 +71,32 @@ def migrate(conninfo: str) -> tuple[str, ...]:
                 major = connection.info.server_version // 10000
                 raise DatabaseError(f"The database is Postgres {major}; Postgres 14 or newer is needed.")
             connection.execute("SELECT pg_advisory_lock(%s)", [_LOCK])
-            return tuple(_apply_missing(connection))
+            return tuple(_apply_missing(connection, only))
     except psycopg.OperationalError as error:
-        raise DatabaseError(
-            f"The database cannot be reached ({_one_line(error)}); check DATABASE_URL and that it runs."
-        ) from None
+        raise _unreachable(error) from None
     except psycopg.Error as error:
         raise DatabaseError(
             f"The database's tables cannot be brought up to date: {_one_line(error)}"
         ) from None
+
+
+def wait_for_tables(conninfo: str, seconds: float = WAIT_SECONDS) -> None:
+    """Wait until somebody has brought the tables to this version; changes nothing.
+
+    Raises:
+        DatabaseError: the database cannot be reached, is too new for this version, or nobody has.
+    """
+    deadline, told = time.monotonic() + seconds, False
+    while missing := _lacking(conninfo):
+        if time.monotonic() > deadline:
+            raise DatabaseError(
+                f"The database lacks tables of this version ({missing[0]}); start octasplat serve or the "
+                "front end of this version, or run octasplat migrate."
+            )
+        if not told:
+            logger.warning("the database lacks tables of this version (%s); waiting for them", missing[0])
+        told = True
+        time.sleep(1)
 
 
 def missing_steps(applied: set[tuple[str, str]]) -> list[str]:
@@ -84,26 +120,76 @@ def _steps(component: str, folder: Traversable) -> Iterator[Step]:
             yield Step(component, file.name, file.read_text(encoding="utf-8"))
 
 
-def _apply_missing(connection: psycopg.Connection) -> Iterator[str]:
+def _apply_missing(connection: psycopg.Connection, only: Collection[str] | None) -> Iterator[str]:
     connection.execute(_VERSIONS)
     rows = connection.execute("SELECT component, name FROM schema_steps").fetchall()
     applied = {(str(component), str(name)) for component, name in rows}
     steps = all_steps()
-    unknown = applied - {(step.component, step.name) for step in steps}
-    if unknown:
-        raise DatabaseError(
-            f"The database was made by a newer version of octasplat (it has the step {max(unknown)[1]}); "
-            "install that version. Nothing was changed."
-        )
+    if _is_newer(connection, applied):
+        return
     if not any(component == QUEUE for component, _ in applied):
         yield from _begin_queue(connection)
         steps = tuple(step for step in steps if step.component != QUEUE)
     for step in steps:
-        if (step.component, step.name) not in applied:
+        left_out = only is not None and step.component == OURS and step.name not in only
+        if (step.component, step.name) not in applied and not left_out:
             with connection.transaction():
                 connection.execute(step.sql)
                 _record(connection, step)
             yield step.name
+    connection.execute(
+        """
+        INSERT INTO schema_reach (oldest_reader) VALUES (%s)
+        ON CONFLICT (one) DO UPDATE SET oldest_reader = excluded.oldest_reader
+        """,
+        [OLDEST_READER],
+    )
+
+
+def _is_newer(connection: psycopg.Connection, applied: set[tuple[str, str]]) -> bool:
+    """Whether a newer version made the tables.
+
+    Raises:
+        DatabaseError: one whose tables this version may not use.
+    """
+    steps = all_steps()
+    unknown = applied - {(step.component, step.name) for step in steps}
+    if not unknown:
+        return False
+    reach = None
+    if connection.execute("SELECT to_regclass('schema_reach') IS NOT NULL").fetchone() == (True,):
+        reach = connection.execute("SELECT oldest_reader FROM schema_reach").fetchone()
+    if (
+        reach is None
+        or missing_steps(applied)
+        or max(s.name for s in steps if s.component == OURS) < reach[0]
+    ):
+        raise DatabaseError(
+            f"The database was made by a newer version of octasplat (it has the step {max(unknown)[1]}); "
+            "install that version. Nothing was changed."
+        )
+    logger.info("the tables are those of a newer version, beside which this one may go on")
+    return True
+
+
+def _lacking(conninfo: str) -> list[str]:
+    """Steps that a database lacks."""
+    try:
+        with psycopg.connect(conninfo, autocommit=True, connect_timeout=10) as connection:
+            if connection.execute("SELECT to_regclass('schema_steps') IS NULL").fetchone() == (True,):
+                return missing_steps(set())
+            rows = connection.execute("SELECT component, name FROM schema_steps").fetchall()
+            applied = {(str(component), str(name)) for component, name in rows}
+            _is_newer(connection, applied)
+            return missing_steps(applied)
+    except psycopg.OperationalError as error:
+        raise _unreachable(error) from None
+
+
+def _unreachable(error: psycopg.Error) -> DatabaseError:
+    return DatabaseError(
+        f"The database cannot be reached ({_one_line(error)}); check DATABASE_URL and that it runs."
+    )
 
 
 def _begin_queue(connection: psycopg.Connection) -> Iterator[str]:

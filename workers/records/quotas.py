@@ -1,11 +1,14 @@
 """What an owner may take: bytes, datasets, and jobs that are not over. All tokens of an owner share it.
 
 The checks take a lock of the owner that ends with the transaction, so that what is checked and what is then
-entered in the same transaction belong together, however many requests come at once.
+entered in the same transaction belong together, however many requests come at once. Whoever also locks a job
+or a dataset locks that first. The database counts bytes as they change (``migrations/0008_usage.sql``), so no
+check takes longer for who has more.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, LiteralString
 
 from psycopg.rows import class_row
 
@@ -28,7 +31,8 @@ class Quota:
     """Limits; None sets none.
 
     Attributes:
-        max_bytes: contents of datasets and results together; content that occurs twice counts once.
+        max_bytes: files of datasets, results, and checkpoints of jobs that have not succeeded; content that
+            occurs twice counts once.
         max_datasets: datasets.
         max_jobs: jobs that are queued or running.
     """
@@ -83,13 +87,7 @@ async def usage_of(connection: Connection, owner: str) -> Usage:
         await cursor.execute(
             """
             SELECT
-                (SELECT coalesce(sum(size_bytes), 0)::bigint FROM (
-                    SELECT f.sha256, f.size_bytes FROM dataset_files f JOIN datasets d ON d.id = f.dataset_id
-                    WHERE d.owner = %(owner)s
-                    UNION
-                    SELECT a.sha256, a.size_bytes FROM artifacts a JOIN jobs j ON j.id = a.job_id
-                    WHERE j.owner = %(owner)s
-                ) AS contents) AS bytes,
+                (SELECT coalesce(sum(bytes), 0)::bigint FROM owner_usage WHERE owner = %(owner)s) AS bytes,
                 (SELECT count(*) FROM datasets WHERE owner = %(owner)s) AS datasets,
                 (SELECT count(*) FROM jobs WHERE owner = %(owner)s
                  AND state IN ('queued', 'running', 'canceling')) AS jobs
@@ -106,7 +104,7 @@ async def bytes_left(connection: Connection, owner: str, default: Quota = NO_QUO
     quota = await quota_of(connection, owner, default)
     if quota.max_bytes is None:
         return None
-    return max(0, quota.max_bytes - (await usage_of(connection, owner)).bytes)
+    return max(0, quota.max_bytes - await _bytes_of(connection, owner))
 
 
 async def check_bytes(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> None:
@@ -118,7 +116,7 @@ async def check_bytes(connection: Connection, owner: str, default: Quota = NO_QU
     quota = await _locked_quota(connection, owner, default)
     if quota.max_bytes is None:
         return
-    used = (await usage_of(connection, owner)).bytes
+    used = await _bytes_of(connection, owner)
     if used > quota.max_bytes:
         raise QuotaExceeded(
             "bytes",
@@ -135,7 +133,8 @@ async def check_new_dataset(connection: Connection, owner: str, default: Quota =
     quota = await _locked_quota(connection, owner, default)
     if quota.max_datasets is None:
         return
-    if (await usage_of(connection, owner)).datasets >= quota.max_datasets:
+    query = "SELECT count(*) AS n FROM (SELECT 1 FROM datasets WHERE owner = %s LIMIT %s) AS found"
+    if await _number(connection, query, [owner, quota.max_datasets]) >= quota.max_datasets:
         raise QuotaExceeded(
             "datasets", f"You have all of your {quota.max_datasets} datasets; delete one first."
         )
@@ -150,7 +149,12 @@ async def check_new_job(connection: Connection, owner: str, default: Quota = NO_
     quota = await _locked_quota(connection, owner, default)
     if quota.max_jobs is None:
         return
-    if (await usage_of(connection, owner)).jobs >= quota.max_jobs:
+    query = """
+        SELECT count(*) AS n FROM (
+            SELECT 1 FROM jobs WHERE owner = %s AND state IN ('queued', 'running', 'canceling') LIMIT %s
+        ) AS found
+        """
+    if await _number(connection, query, [owner, quota.max_jobs]) >= quota.max_jobs:
         raise QuotaExceeded(
             "jobs",
             f"{quota.max_jobs} of your jobs are queued or running, which is as many as allowed; "
@@ -163,3 +167,14 @@ async def _locked_quota(connection: Connection, owner: str, default: Quota) -> Q
     if quota != NO_QUOTA:
         await connection.execute("SELECT pg_advisory_xact_lock(%s, hashtext(%s))", [_LOCK, owner])
     return quota
+
+
+async def _bytes_of(connection: Connection, owner: str) -> int:
+    query = "SELECT coalesce(sum(bytes), 0)::bigint AS n FROM owner_usage WHERE owner = %s"
+    return await _number(connection, query, [owner])
+
+
+async def _number(connection: Connection, query: LiteralString, values: Sequence[object]) -> int:
+    row = await (await connection.execute(query, values)).fetchone()
+    assert row is not None
+    return int(row["n"])

@@ -21,7 +21,9 @@ async def references(connection: Connection) -> AsyncIterator[Reference]:
             async for row in cursor:
                 yield Reference(f"job {row['job_id']} {row['name']}", row["sha256"], row["size_bytes"])
         async with connection.cursor("job_states") as cursor:
-            await cursor.execute("SELECT * FROM jobs WHERE checkpoint IS NOT NULL OR preview IS NOT NULL")
+            await cursor.execute(
+                "SELECT id, checkpoint, preview FROM jobs WHERE checkpoint IS NOT NULL OR preview IS NOT NULL"
+            )
             async for row in cursor:
                 for reference in _of_job(row):
                     yield reference

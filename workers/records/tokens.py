@@ -4,15 +4,20 @@ import hashlib
 import secrets
 import uuid
 from collections.abc import Sequence
+from typing import Literal
 
 from psycopg.rows import class_row
 
-from workers.records.database import Connection
+from workers.records.database import Connection, naming
 from workers.records.ids import new_id
 from workers.records.rows import Token
 
 PREFIX = "octa_"
 SCOPES = ("read", "write", "admin")
+LOCAL_OWNER = "local"
+"""Whose things they are that were made on one's own machine."""
+Origin = Literal["environment", "machine"]
+_LOCK = 0x6F637474  # "octt"
 
 
 def new_secret() -> str:
@@ -26,9 +31,25 @@ def hash_secret(secret: str) -> str:
 
 
 async def add_token(
-    connection: Connection, secret: str, *, owner: str, name: str, scopes: Sequence[str]
+    connection: Connection,
+    secret: str,
+    *,
+    owner: str,
+    name: str,
+    scopes: Sequence[str],
+    hours: float | None = None,
 ) -> Token:
     """Let ``secret`` in; one that is known already keeps its row and gets these rights.
+
+    One that was shut out stays so.
+
+    Args:
+        connection: to the database.
+        secret: what is sent.
+        owner: whose things it shows.
+        name: what to call it.
+        scopes: what it may do.
+        hours: for how long it is valid; None for ever.
 
     Raises:
         ValueError: an unknown scope.
@@ -38,28 +59,87 @@ async def add_token(
         raise ValueError(f"scopes are {', '.join(SCOPES)}, not {', '.join(sorted(unknown)) or 'none'}")
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
         await cursor.execute(
-            """
-            INSERT INTO tokens (id, owner, name, sha256, scopes) VALUES (%s, %s, %s, %s, %s)
+            naming(
+                """
+            INSERT INTO tokens (id, owner, name, sha256, scopes, expires_at)
+            VALUES (%s, %s, %s, %s, %s, now() + make_interval(secs => %s))
             ON CONFLICT (sha256) DO UPDATE
-            SET owner = excluded.owner, name = excluded.name, scopes = excluded.scopes, revoked_at = NULL
-            RETURNING *
+            SET owner = excluded.owner, name = excluded.name, scopes = excluded.scopes
+            RETURNING {}
             """,
-            [new_id(), owner, name, hash_secret(secret), list(scopes)],
+                Token,
+            ),
+            [
+                new_id(),
+                owner,
+                name,
+                hash_secret(secret),
+                list(scopes),
+                None if hours is None else 3600 * hours,
+            ],
         )
         token = await cursor.fetchone()
     assert token is not None
     return token
 
 
+async def add_environment_token(connection: Connection, secret: str) -> Token:
+    """Let the secret of the environment in, and shut out those that it was before.
+
+    Returns:
+        Its row; one that was shut out stays so, and then nothing is changed.
+    """
+    async with connection.transaction():
+        await connection.execute("SELECT pg_advisory_xact_lock(%s)", [_LOCK])
+        token = await add_token(connection, secret, owner="admin", name="OCTASPLAT_TOKEN", scopes=["admin"])
+        if token.revoked_at is None:
+            await set_origin(connection, token.id, "environment")
+            await connection.execute(
+                """
+                UPDATE tokens SET revoked_at = now() FROM token_origins
+                WHERE token_id = id AND origin = 'environment' AND id <> %s AND revoked_at IS NULL
+                """,
+                [token.id],
+            )
+    return token
+
+
+async def set_origin(connection: Connection, token_id: uuid.UUID, origin: Origin) -> None:
+    """Say that a token was made by a program rather than by somebody."""
+    await connection.execute(
+        "INSERT INTO token_origins (token_id, origin) VALUES (%s, %s) ON CONFLICT DO NOTHING",
+        [token_id, origin],
+    )
+
+
 async def find_token(connection: Connection, secret: str) -> Token | None:
     """The valid token of that secret, or None."""
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM tokens WHERE sha256 = %s AND revoked_at IS NULL
+            naming(
+                """
+            SELECT {} FROM tokens WHERE sha256 = %s AND revoked_at IS NULL
               AND (expires_at IS NULL OR expires_at > now())
             """,
+                Token,
+            ),
             [hash_secret(secret)],
+        )
+        return await cursor.fetchone()
+
+
+async def get_token(connection: Connection, token_id: uuid.UUID) -> Token | None:
+    """The valid token of that id, or None."""
+    async with connection.cursor(row_factory=class_row(Token)) as cursor:
+        await cursor.execute(
+            naming(
+                """
+            SELECT {} FROM tokens WHERE id = %s AND revoked_at IS NULL
+              AND (expires_at IS NULL OR expires_at > now())
+            """,
+                Token,
+            ),
+            [token_id],
         )
         return await cursor.fetchone()
 
@@ -67,24 +147,25 @@ async def find_token(connection: Connection, secret: str) -> Token | None:
 async def list_tokens(connection: Connection) -> list[Token]:
     """All tokens, the newest first."""
     async with connection.cursor(row_factory=class_row(Token)) as cursor:
-        await cursor.execute("SELECT * FROM tokens ORDER BY id DESC")
+        await cursor.execute(naming("SELECT {} FROM tokens ORDER BY id DESC", Token))
         return await cursor.fetchall()
 
 
-async def any_token(connection: Connection) -> bool:
-    """Whether there is a valid token at all."""
+async def any_token(connection: Connection, *, valid: bool = True) -> bool:
+    """Whether there is a valid token at all, or with ``valid`` False whether there ever was any."""
     cursor = await connection.execute(
         """
-        SELECT EXISTS (SELECT 1 FROM tokens WHERE revoked_at IS NULL
-                       AND (expires_at IS NULL OR expires_at > now())) AS any
-        """
+        SELECT EXISTS (SELECT 1 FROM tokens WHERE NOT %s OR (revoked_at IS NULL
+                       AND (expires_at IS NULL OR expires_at > now()))) AS any
+        """,
+        [valid],
     )
     row = await cursor.fetchone()
     return bool(row and row["any"])
 
 
 async def revoke_token(connection: Connection, token_id: uuid.UUID) -> bool:
-    """Shut a token out; False if there is none that is valid."""
+    """Shut a token out, with the sessions that were begun with it; False if there is none that is valid."""
     cursor = await connection.execute(
         "UPDATE tokens SET revoked_at = now() WHERE id = %s AND revoked_at IS NULL", [token_id]
     )

@@ -7,7 +7,7 @@ from typing import Any
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from workers.records.database import Connection
+from workers.records.database import Connection, naming
 from workers.records.rows import WorkerRow
 
 
@@ -46,7 +46,10 @@ async def live_workers(connection: Connection, stale_seconds: float) -> list[Wor
     """Workers that were seen within ``stale_seconds``, by name."""
     async with connection.cursor(row_factory=class_row(WorkerRow)) as cursor:
         await cursor.execute(
-            "SELECT * FROM workers WHERE seen_at > now() - make_interval(secs => %s) ORDER BY name",
+            naming(
+                "SELECT {} FROM workers WHERE seen_at > now() - make_interval(secs => %s) ORDER BY name",
+                WorkerRow,
+            ),
             [stale_seconds],
         )
         return await cursor.fetchall()

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from engine.config import read_config
 from engine.errors import ConfigError, OutputError
 from engine.events import Listener
-from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
+from engine.files.gaussian_ply import read_gaussian_ply, read_near_world, read_pixel_rad
 from engine.gaussians.model import FlatGaussians
 from engine.light.companions import companions
 from engine.light.stage import Stage
@@ -40,7 +40,7 @@ ANY_SIDE_PX = 1 << 30
 
 @dataclass(frozen=True)
 class Source:
-    """A scene to render; what only a run knows is None for a bare file of Gaussians."""
+    """A scene to render; what only a run knows is None, or 0, for a bare file of Gaussians."""
 
     gaussians: FlatGaussians
     settings: TraceSettings
@@ -48,6 +48,7 @@ class Source:
     background: str = "black"
     viewpoints: SplitViewpoints | None = None
     max_side: int | None = None
+    trained_rad: float = 0.0
 
     @property
     def extent_world(self) -> float:
@@ -142,10 +143,11 @@ def render_files(
             return preview_stage(set_up(), shots[0], output, listener)
         kept = series.kept(identity_of(*what, of_views, place.photographs))
         return series.render(set_up().paint, kept, listener)
-    kept = series.kept(identity_of(*what, of_views))
+    kept = series.kept(identity_of(*what, of_views, source.trained_rad))
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
-    return series.render(scene_paint(tracer, background, transparent=transparent), kept, listener)
+    paint = scene_paint(tracer, background, transparent=transparent, trained_rad=source.trained_rad)
+    return series.render(paint, kept, listener)
 
 
 def _as_asked(stage: Stage, options: dict[str, Any]) -> Stage:
@@ -246,13 +248,15 @@ def _read_run(options: dict[str, Any]) -> Source:
         config.evaluate_background,
         viewpoints,
         config.max_side,
+        read_pixel_rad(run / SCENE),
     )
 
 
 def _read_file(options: dict[str, Any], say: Callable[[str], None]) -> Source:
     path: Path = options["source"]
     gaussians = open_scene(path, say)
-    return Source(gaussians, TraceSettings(), read_near_world(path))
+    near_world, trained_rad = read_near_world(path), read_pixel_rad(path)
+    return Source(gaussians, TraceSettings(), near_world, trained_rad=trained_rad)
 
 
 def stage_place(

@@ -17,6 +17,8 @@ FIRST_WAIT_SECONDS = 0.5
 LONGEST_WAIT_SECONDS = 30.0
 STEADY_SECONDS = 60.0
 """A process that lived so long before it ended is started again at once."""
+NOT_STARTED = 127
+"""Exit code of what could not even be started, as shells have it."""
 
 
 class KeptChild:
@@ -80,14 +82,18 @@ class KeptChild:
 
     async def _run_once(self) -> int:
         self.starts += 1
-        self._process = await asyncio.create_subprocess_exec(
-            *self._command,
-            env=self._environment,
-            cwd="/",  # nothing that lies where the user stands is to be found by chance
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE if self._on_line is not None else None,
-            start_new_session=True,
-        )
+        try:
+            self._process = await asyncio.create_subprocess_exec(
+                *self._command,
+                env=self._environment,
+                cwd="/",  # nothing that lies where the user stands is to be found by chance
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.PIPE if self._on_line is not None else None,
+                start_new_session=True,
+            )
+        except OSError as error:
+            logger.error("%s cannot be started: %s", self.name, error)
+            return NOT_STARTED
         if self._stopping.is_set():
             self._process.terminate()
         if self._on_line is not None and self._process.stdout is not None:

@@ -14,15 +14,19 @@ from engine.errors import OctasplatError, OutputError
 from engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
 from engine.isolated_python import python_command
 from engine.writing import write_json
-from workers.postgres.embedded import EmbeddedPostgres
+from workers.isolation.abilities import tell_what_lacks
+from workers.isolation.hiding import hide_memory
+from workers.postgres.embedded import LEAST_CONNECTIONS, EmbeddedPostgres
 from workers.records.migrate import migrate
 from workers.serve.children import KeptChild
-from workers.settings import ADDRESS_FILE, PREFIX, WorkerSettings
+from workers.serve.own_token import keep_own_token
+from workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings, worker_connections
 
 logger = logging.getLogger(__name__)
 
 READY_SECONDS = 180.0
 LOOK_SECONDS = 1.0
+SPARE_CONNECTIONS = 40
 
 
 @dataclass(frozen=True)
@@ -55,19 +59,33 @@ async def serve(plan: Plan, on_ready: Callable[[str], Awaitable[None] | None]) -
     Raises:
         OctasplatError: something cannot be started.
     """
+    hide_memory()
+    tell_what_lacks()
     settings = plan.settings
-    with _alone(settings.data) as address_file:
-        database = EmbeddedPostgres(settings.data.absolute()) if settings.database_url is None else None
+    with hold_data(settings.data) as address_file:
+        database = (
+            EmbeddedPostgres(settings.data.absolute(), connections_needed(plan))
+            if settings.database_url is None
+            else None
+        )
         try:
             conninfo = (
                 await asyncio.to_thread(database.start) if database is not None else settings.conninfo()
             )
             await asyncio.to_thread(migrate, conninfo)
+            await keep_own_token(conninfo, settings.data / TOKEN_FILE)
             return await _run(plan, database, conninfo, address_file, on_ready)
         finally:
             address_file.unlink(missing_ok=True)
             if database is not None:
                 await asyncio.to_thread(database.stop)
+
+
+def connections_needed(plan: Plan) -> int:
+    """What the processes of this machine may use, and some for commands and workers elsewhere."""
+    front = plan.settings.pool_size + 1
+    workers = [worker_connections({}), *([worker_connections(plan.queues)] if plan.queues else [])]
+    return max(LEAST_CONNECTIONS, front + sum(workers) + SPARE_CONNECTIONS)
 
 
 async def _run(
@@ -172,6 +190,7 @@ async def _keep_database(database: EmbeddedPostgres | None) -> None:
     """Start the private database again whenever it ends."""
     while database is not None:
         await asyncio.sleep(LOOK_SECONDS)
+        await asyncio.to_thread(database.rotate_log)
         if await asyncio.to_thread(database.is_alive):
             continue
         logger.warning("the database ended; starting it again")
@@ -179,10 +198,12 @@ async def _keep_database(database: EmbeddedPostgres | None) -> None:
             await asyncio.to_thread(database.start)
         except OctasplatError as error:
             logger.error("%s", error)
+        except Exception:
+            logger.exception("the database could not be started and is tried again")
 
 
 @contextlib.contextmanager
-def _alone(data: Path) -> Iterator[Path]:
+def hold_data(data: Path) -> Iterator[Path]:
     """Hold the data folder; yields the path of the file that says where the service is.
 
     Raises:

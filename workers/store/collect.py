@@ -1,7 +1,7 @@
-"""Removing contents that nothing names. Whoever calls this knows all that is named."""
+"""Contents that nothing names, found and removed. Whoever calls this knows all that is named."""
 
 import math
-from collections.abc import Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 
 from workers.store.protocol import Storage, StoredBlob
@@ -14,16 +14,28 @@ class Collected:
     blobs: int = 0
     size_bytes: int = 0
 
+    def __add__(self, other: "Collected") -> "Collected":
+        return Collected(self.blobs + other.blobs, self.size_bytes + other.size_bytes)
 
-def collect_unused(
+
+@dataclass(frozen=True)
+class Unused:
+    """Content that may be removed unless it is written once more: from ``before_unix`` on it stays, s."""
+
+    sha256: str
+    size_bytes: int
+    before_unix: float
+
+
+def unused(
     storage: Storage,
     named: Set[str],
     replaced: Set[str],
     *,
     unused_before_unix: float,
     replaced_before_unix: float,
-) -> Collected:
-    """Remove contents that are not named and were not written lately.
+) -> list[Unused]:
+    """Contents that are not named and were not written lately.
 
     Content is stored first and named afterwards, and storing it once more makes it young, so what is old and
     not named is not about to be named either.
@@ -36,18 +48,15 @@ def collect_unused(
         replaced_before_unix: the same for what is in ``replaced``, s.
 
     Raises:
-        StorageError: the store cannot be listed or changed.
+        StorageError: the store cannot be listed.
     """
-    count = size_bytes = 0
+    found = []
     for entry in storage.blobs():
         sha256 = entry.blob.sha256
         limit = max(unused_before_unix, replaced_before_unix) if sha256 in replaced else unused_before_unix
-        if sha256 in named or entry.modified_unix >= limit:
-            continue
-        if storage.delete_older(sha256, limit):
-            count += 1
-            size_bytes += entry.blob.size_bytes
-    return Collected(count, size_bytes)
+        if sha256 not in named and entry.modified_unix < limit:
+            found.append(Unused(sha256, entry.blob.size_bytes, limit))
+    return found
 
 
 def unnamed(storage: Storage, named: Set[str]) -> list[StoredBlob]:
@@ -59,25 +68,29 @@ def unnamed(storage: Storage, named: Set[str]) -> list[StoredBlob]:
     return [entry for entry in storage.blobs() if entry.blob.sha256 not in named]
 
 
-def remove_unchanged(
-    storage: Storage, found: Sequence[StoredBlob], named: Set[str], *, before_unix: float
-) -> Collected:
-    """Remove contents that are still not named and were not stored once more since they were listed.
+def unchanged(found: Sequence[StoredBlob], named: Set[str], *, before_unix: float) -> list[Unused]:
+    """Of contents that were listed those that are still not named, as long as they are as they were listed.
 
     Args:
-        storage: the store.
         found: what :func:`unnamed` listed before ``named`` was gathered.
         named: digests that must stay.
         before_unix: only what was written before this time goes, s.
+    """
+    return [
+        Unused(entry.blob.sha256, entry.blob.size_bytes, math.nextafter(entry.modified_unix, math.inf))
+        for entry in found
+        if entry.blob.sha256 not in named and entry.modified_unix < before_unix
+    ]
+
+
+def remove(storage: Storage, contents: Iterable[Unused]) -> Collected:
+    """Remove contents that were not written once more.
 
     Raises:
         StorageError: the store cannot be changed.
     """
-    count = size_bytes = 0
-    for entry in found:
-        if entry.blob.sha256 in named or entry.modified_unix >= before_unix:
-            continue
-        if storage.delete_older(entry.blob.sha256, math.nextafter(entry.modified_unix, math.inf)):
-            count += 1
-            size_bytes += entry.blob.size_bytes
-    return Collected(count, size_bytes)
+    removed = Collected()
+    for content in contents:
+        if storage.delete_older(content.sha256, content.before_unix):
+            removed += Collected(1, content.size_bytes)
+    return removed

@@ -23,7 +23,7 @@ from typing import BinaryIO
 
 from workers.store.copying import copy_verified
 from workers.store.counting import CountingWriter
-from workers.store.errors import BlobMissing, StorageFull
+from workers.store.errors import BlobMissing, StorageFull, StorageUnavailable
 from workers.store.os_errors import MAKE_ROOM, told
 from workers.store.protocol import (
     MAX_DOCUMENT_BYTES,
@@ -237,6 +237,17 @@ class LocalStorage:
                 f"The disk of the store has {max(0, free)} bytes left to use ({self.floor_bytes} more are "
                 f"kept free) but {size_bytes} are needed; {MAKE_ROOM}."
             )
+
+    def check(self) -> None:
+        """Whether the folder is still there and can be written; see the protocol."""
+        with told(self.root):
+            # A disk that was unmounted leaves another folder in its place, or none.
+            if not os.path.samestat(self.root.stat(), os.fstat(self._root_fd)):
+                raise StorageUnavailable(
+                    f"{self.root} is not the folder that the store was opened in; mount it again."
+                )
+            if not os.access("staging", os.W_OK | os.X_OK, dir_fd=self._root_fd):
+                raise StorageUnavailable(f"{self.root} cannot be written; check its disk and its access.")
 
     def sweep(self, older_than_seconds: float) -> int:
         """Remove old files from staging; see the protocol."""

@@ -190,6 +190,14 @@ class Storage(Protocol):
         """Room above the floor, negative below it; None where the store has no known end."""
         ...
 
+    def check(self) -> None:
+        """Whether the store can be used now.
+
+        Raises:
+            StorageUnavailable: it is not there, does not answer, or refuses the service.
+        """
+        ...
+
     def sweep(self, older_than_seconds: float) -> int:
         """Remove what uploads that were killed left behind; returns how many there were."""
         ...

@@ -204,6 +204,16 @@ class S3Storage:
     def free_bytes(self) -> None:
         """None; see the protocol."""
 
+    def check(self) -> None:
+        """Whether the bucket answers; see the protocol."""
+        with self._told("the bucket itself"):
+            try:
+                self.client.list_objects_v2(Bucket=self.bucket, Prefix=self.prefix, MaxKeys=1)
+            except ClientError as error:
+                if _code(error) in _ABSENT | {"NoSuchBucket"}:
+                    raise StorageUnavailable(f"There is no bucket {self.bucket}; check its name.") from error
+                raise
+
     def sweep(self, older_than_seconds: float) -> int:
         """Remove old staged objects and abort old uploads; see the protocol."""
         removed = 0

@@ -88,7 +88,20 @@ def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
     return [
         *([f"Poses found for {found['placed']} of {found['photographs']} photographs"] if found else []),
         mean_metrics(metrics),
+        *_training_views(metrics.get("training_views") or {}),
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
         f"trained in {duration(metrics['seconds'])}",
         *(f"{label + ':':8}{output / name}" for label, name in files if (output / name).exists()),
+    ]
+
+
+def _training_views(known: dict[str, Any]) -> list[str]:
+    """How well the views that were trained on are shown, in a line."""
+    if known.get("psnr") is None:
+        return []
+    count, left = len(known["views"]), len(known["left_out"])
+    without = f", {left} left out" if left else ""
+    return [
+        f"Mean over {count} training views: PSNR {known['psnr']:.2f} dB, "
+        f"{known['worst_psnr']:.2f} dB the worst ({known['worst']}){without}"
     ]

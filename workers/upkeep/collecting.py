@@ -9,13 +9,13 @@ import logging
 import re
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
-from workers.queue.storing import give_up_silent, oldest_note
+from workers.queue.storing import give_up_silent, oldest_note, removing
 from workers.records.database import Connection, Pool
 from workers.records.references import references
-from workers.store.collect import Collected, collect_unused, remove_unchanged, unnamed
+from workers.store.collect import Collected, Unused, remove, unchanged, unnamed, unused
 from workers.store.protocol import Storage
 from workers.store.trees import read_manifest
 
@@ -28,6 +28,10 @@ AT_ONCE_SECONDS = 3.0
 CLOCK_SECONDS = 60.0
 """By how much the clocks of the store and the database may differ."""
 _SETTLED_SECONDS = 2.0
+COLLECT_SECONDS = 3600
+"""After so long others may collect although somebody still does."""
+AT_ONCE = 50
+"""Contents that are removed while nobody names anything."""
 INSTALLATION = "installation"
 _RESULTS = re.compile(r"results/([0-9a-f-]{36})/\d+")
 
@@ -103,6 +107,8 @@ async def _turn(pool: Pool, storage: Storage, every_seconds: float) -> AsyncIter
             logger.warning("the store is another database's, so nothing in it is collected")
             yield False
             return
+        # Nobody waits for this row; who finds it locked leaves the collecting to others.
+        await connection.execute(f"SET LOCAL idle_in_transaction_session_timeout = '{COLLECT_SECONDS}s'")
         yield True
         await connection.execute("UPDATE installation SET collected_at = clock_timestamp()")
 
@@ -128,14 +134,16 @@ async def _collect(pool: Pool, storage: Storage, unused_seconds: float, replaced
             )
             replaced = {row["sha256"] for row in await cursor.fetchall()}
         named |= await _published(connection, storage, entered)
-        removed = await asyncio.to_thread(
-            collect_unused,
+        await connection.commit()  # what follows may take long
+        found = await asyncio.to_thread(
+            unused,
             storage,
             named,
             replaced,
             unused_before_unix=min(now - unused_seconds, began_unix),
             replaced_before_unix=min(now - replaced_seconds, began_unix),
         )
+        removed = await _remove(connection, storage, found)
         await connection.execute("DELETE FROM replaced_contents WHERE sha256 = ANY(%s)", [list(replaced)])
     _tell_of(removed)
     return removed
@@ -155,10 +163,39 @@ async def _collect_at_once(pool: Pool, storage: Storage) -> Collected:
             began_unix = await _oldest_unix(connection)
             named, entered = await _named(connection)
         named |= await _published(connection, storage, entered)
+        await connection.commit()
         limit_unix = min(now - _SETTLED_SECONDS, began_unix)
-        removed = await asyncio.to_thread(remove_unchanged, storage, found, named, before_unix=limit_unix)
+        removed = await _remove(connection, storage, unchanged(found, named, before_unix=limit_unix))
     _tell_of(removed)
     return removed
+
+
+async def _remove(connection: Connection, storage: Storage, contents: Sequence[Unused]) -> Collected:
+    """Remove contents, some at a time, while nobody names anything.
+
+    Whoever stored one of them once more in this very moment names it afterwards and then looks whether it is
+    there, see :meth:`workers.queue.storing.Note.confirm`; or has named it before, and then it stays.
+    """
+    removed = Collected()
+    for start in range(0, len(contents), AT_ONCE):
+        some = contents[start : start + AT_ONCE]
+        async with connection.transaction():
+            await removing(connection)
+            named = await _named_now(connection, [content.sha256 for content in some])
+            left = [content for content in some if content.sha256 not in named]
+            removed += await asyncio.to_thread(remove, storage, left)
+    return removed
+
+
+async def _named_now(connection: Connection, contents: Sequence[str]) -> set[str]:
+    cursor = await connection.execute(
+        """
+        SELECT sha256 FROM owner_contents WHERE sha256 = ANY(%(contents)s)
+        UNION SELECT preview->>'sha256' FROM jobs WHERE preview->>'sha256' = ANY(%(contents)s)
+        """,
+        {"contents": list(contents)},
+    )
+    return {row["sha256"] for row in await cursor.fetchall()}
 
 
 async def _give_up_silent(connection: Connection) -> None:

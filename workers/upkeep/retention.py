@@ -21,6 +21,7 @@ logger = logging.getLogger(__name__)
 NOTICE_HOURS = 24.0
 """What is old already when it comes under retention is kept so long from then on, if not shorter anyway."""
 KEY_DAYS = 7
+KEPT_PROGRESS = 1000
 _AT_ONCE = 200
 
 
@@ -107,6 +108,38 @@ async def forget_old_keys(connection: Connection) -> None:
     await connection.execute(
         "DELETE FROM idempotency_keys WHERE created_at < now() - make_interval(days => %s)", [KEY_DAYS]
     )
+
+
+async def thin_progress(connection: Connection, keep: int = KEPT_PROGRESS) -> int:
+    """Leave out some of the progress in the journals of long jobs; their curves keep their form.
+
+    Args:
+        connection: to the database.
+        keep: a journal with more than twice as many events of progress keeps about so many, the first and the
+            newest among them.
+
+    Returns:
+        Number of events that were forgotten.
+    """
+    cursor = await connection.execute(
+        """
+        WITH long AS (
+            SELECT id FROM jobs
+            WHERE (state IN ('running', 'canceling') OR finished_at > now() - interval '1 day')
+              AND (SELECT count(*) FROM job_events e WHERE e.job_id = jobs.id AND kind = 'progress')
+                > 2 * %(keep)s
+        ), ranked AS (
+            SELECT job_events.id, count(*) OVER (PARTITION BY job_id) AS total,
+                row_number() OVER (PARTITION BY job_id ORDER BY job_events.id DESC) AS place
+            FROM job_events JOIN long ON long.id = job_events.job_id WHERE kind = 'progress'
+        )
+        DELETE FROM job_events USING ranked
+        WHERE job_events.id = ranked.id AND ranked.place < ranked.total
+          AND (ranked.place - 1) %% (ranked.total / %(keep)s) <> 0
+        """,
+        {"keep": keep},
+    )
+    return cursor.rowcount
 
 
 async def _expired(connection: Connection, table: str) -> list[uuid.UUID]:

@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 
 from engine.errors import Cancelled, OctasplatError
 from engine.events import Event
+from workers.isolation.confining import confine, limit_growth
 from workers.parent import die_with
 from workers.store.os_errors import lacks_room
 from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE, Task
@@ -49,6 +50,7 @@ def main() -> NoReturn:
     given: dict[str, Any] = json.loads(sys.stdin.readline())
     die_with(given["parent_pid"], signal.SIGKILL)  # elsewhere than on Linux the end of stdin does
     _be_first_to_go()
+    _confine(given)
     stop = threading.Event()
     threading.Thread(target=_watch_stdin, args=(stop,), daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -67,6 +69,8 @@ def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
             importlib.import_module(module)
         module_name, _, function = given["program"].partition(":")
         program = getattr(importlib.import_module(module_name), function)
+        if given.get("probe"):
+            return 0
         # After all imports, as pycolmap takes SIGTERM for itself.
         signal.signal(signal.SIGTERM, lambda _number, _frame: stop.set())
         lines.write({"kind": "ready"})
@@ -92,6 +96,8 @@ def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
         lines.write({"kind": "error", "type": "out_of_memory", "message": "The job ran out of memory."})
         return EXIT_REFUSED
     except Exception as error:  # noqa: BLE001 - told to the worker, which tells the user
+        if given.get("probe"):
+            sys.stderr.write(f"{type(error).__name__}: {error}\n")
         kind = NO_SPACE if lacks_room(error) else "unexpected"
         message = f"{type(error).__name__}: {error}"
         cause = "".join(traceback.format_exception(error)).splitlines()[-MAX_CAUSE_LINES:]
@@ -124,6 +130,24 @@ def _be_first_to_go() -> None:
     """Where memory runs out, the system shall end this process rather than the database."""
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE), encoding="ascii")
+
+
+def _confine(given: dict[str, Any]) -> None:
+    """Give up what the work does not need, while there is one thread; those that come later have no more."""
+    limit_growth(given.get("memory_limit_bytes"))
+    written: tuple[Path, ...] = ()
+    if "folder" in given:
+        written = (Path(given["folder"]),)
+        temporary = written[0] / "tmp"
+        temporary.mkdir(exist_ok=True)
+        os.environ["TMPDIR"] = str(temporary)
+    confine(
+        hidden=[Path(path) for path in given.get("hidden", ())],
+        written=written,
+        read=[Path(given["scene"])] if given.get("scene") else (),
+        may_start_processes=True,
+        elsewhere_reads_only=False,
+    )
 
 
 def _snake(name: str) -> str:

@@ -62,6 +62,7 @@ class ChildProcess:
         self.last_heard = time.monotonic()
         self.last_words: deque[str] = deque(maxlen=LAST_WORDS)
         self.error: dict[str, Any] | None = None
+        self.is_ready = False
         assert process.stdout is not None and process.stderr is not None
         self._readers = (
             asyncio.create_task(self._read(process.stdout, self._hear)),
@@ -130,6 +131,12 @@ class ChildProcess:
                     total += memory.rss - getattr(memory, "shared", 0)
         return total
 
+    def process_count(self) -> int:
+        """Number of processes that the child has started and that live."""
+        with contextlib.suppress(psutil.Error):
+            return len(psutil.Process(self._process.pid).children(recursive=True))
+        return 0
+
     def _send(self, line: str) -> None:
         assert self._process.stdin is not None
         with contextlib.suppress(OSError, RuntimeError):
@@ -155,6 +162,8 @@ class ChildProcess:
             return
         if not isinstance(event, dict) or not isinstance(event.get("kind"), str):
             return
+        if event["kind"] == "ready":
+            self.is_ready = True
         if event["kind"] == "error":
             self.error = {"type": str(event.get("type")), "message": str(event.get("message"))}
         self._on_event(event)

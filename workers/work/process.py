@@ -8,9 +8,12 @@ import os
 import platform
 import signal
 import socket
+import tempfile
 import time
 import uuid
-from collections.abc import Awaitable, Callable, Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -19,39 +22,52 @@ from procrastinate.exceptions import ConnectorException
 import engine
 from engine.files import writable_formats
 from engine.threads import available_threads
+from workers.isolation.abilities import abilities, tell_what_lacks
+from workers.isolation.hiding import hide_memory
 from workers.parent import die_with_server
-from workers.queue.attempts import claim
-from workers.queue.jobs import get_job, queue_again
+from workers.queue.attempts import Fenced, claim
+from workers.queue.fairness import choose
 from workers.queue.limits import end_abandoned
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.queue.rescue import rescue_lost_jobs
+from workers.records.audit import forget_old_entries
 from workers.records.database import Pool, open_pool
 from workers.records.ids import new_id
-from workers.records.migrate import migrate
+from workers.records.migrate import wait_for_tables
+from workers.records.sessions import forget_old_sessions
 from workers.records.workers import forget_lost_workers, forget_worker, see_worker
-from workers.settings import WorkerSettings
+from workers.settings import WorkerSettings, worker_connections
 from workers.store.errors import StorageError
+from workers.store.local import LocalStorage
 from workers.store.opening import open_storage
-from workers.store.room import LEAST_BYTES, Room
-from workers.upkeep.collecting import collect, collect_at_once
-from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries
+from workers.store.room import Room
+from workers.upkeep.collecting import collect
+from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries, thin_progress
 from workers.upkeep.webhooks.outbox import forget_old
-from workers.upkeep.webhooks.sending import send_due
+from workers.upkeep.webhooks.sending import Sender
+from workers.work.chores import Chore, ChoreFailed, keep_doing
 from workers.work.contact import DATABASE_ERRORS
+from workers.work.fitness import announced, unfit
+from workers.work.host import Host
 from workers.work.memory import memory_limit_bytes
-from workers.work.supervisor import LostDatabase, Supervisor, Surroundings
-from workers.work.workspace import sweep_workspaces
+from workers.work.openings import Openings, put_off
+from workers.work.supervisor import Supervisor
+from workers.work.surroundings import LostDatabase, Surroundings
+from workers.work.workspace import sweep_temporary, sweep_workspaces
 
 logger = logging.getLogger(__name__)
 
+RESCUE_LATE_SECONDS = 60.0
+"""Looking for lost jobs is begun again after this time, so that nothing that hangs keeps them waiting."""
 SWEEP_SECONDS = 60.0
 STORE_SWEEP_SECONDS = 3600.0
+THIN_SECONDS = 600.0
 ABANDONED_SECONDS = 86_400.0
-ROOM_SECONDS = 60.0
-"""How long a worker without room keeps a job from others that may have some."""
 ROOM_LOOK_SECONDS = 5.0
-CRAMPED_SECONDS = 300.0
-"""A job that met a full disk is tried again after this time, or as soon as there is more room."""
+LEFT_POLLS = 3
+"""A job that is left to workers of another version is kept from all for so many looks at the queue ..."""
+LEFT_SECONDS = 15.0
+"""... and for twice as many each further time, up to this time."""
 EXIT_LOST_DATABASE = 69
 
 
@@ -83,17 +99,30 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
         DatabaseError: the database cannot be reached or is of another version.
         StorageError: the store cannot be used.
     """
-    die_with_server()
+    hide_memory()
+    if not die_with_server():
+        tell_what_lacks()
     settings.checked()
     for module in settings.kind_modules:
         importlib.import_module(module)
     conninfo = settings.conninfo()
-    await asyncio.to_thread(migrate, conninfo)
+    await asyncio.to_thread(wait_for_tables, conninfo)
     floor_bytes = settings.floor_bytes // 4  # the rest of it is for what jobs under way have to store
     storage = await asyncio.to_thread(lambda: open_storage(settings.storage_address, floor_bytes=floor_bytes))
-    room = Room(storage, settings.work_folder, settings.floor_bytes, settings.floor_bytes - floor_bytes)
+    name = name or f"{socket.gethostname()}-{os.getpid()}"
+    room = Room(
+        storage, settings.work_folder, settings.floor_bytes,
+        above_bytes=settings.floor_bytes - floor_bytes, reserve_bytes=floor_bytes,
+        store_folder=storage.root if isinstance(storage, LocalStorage) else None,
+    )  # fmt: skip
+    host = Host(
+        name, settings.work_folder, storage,
+        kind_modules=settings.kind_modules, rest_seconds=settings.recover_seconds,
+    )  # fmt: skip
     slots = sum(queues.values())
-    async with open_pool(conninfo, max_size=6 + 4 * slots, wait_seconds=settings.stale_seconds) as pool:
+    async with open_pool(
+        conninfo, max_size=worker_connections(queues), wait_seconds=settings.stale_seconds
+    ) as pool:
         worker = _Worker(
             settings,
             pool,
@@ -102,10 +131,11 @@ async def run_worker(settings: WorkerSettings, queues: Mapping[str, int], *, nam
                 make_slips(settings, pool),
                 storage,
                 room,
+                host,
                 asyncio.Event(),
                 memory_limit_bytes(settings.memory_limit_bytes, slots),
             ),
-            name or f"{socket.gethostname()}-{os.getpid()}",
+            name,
             queues,
         )
         return await worker.run()
@@ -127,8 +157,9 @@ class _Worker:
         self._queues = queues
         self._id = new_id()
         self._lost = False
-        self._told_of_room = False
-        self._cramped: dict[uuid.UUID, tuple[int, float]] = {}
+        self._openings = Openings(name, pool, around)
+        self._left: Counter[uuid.UUID] = Counter()
+        self._sender = Sender(pool, settings.webhook_hosts)
 
     async def run(self) -> int:
         loop = asyncio.get_running_loop()
@@ -137,40 +168,65 @@ class _Worker:
             loop.add_signal_handler(number, self._leave)
         settings = self._settings
         chores = [
-            asyncio.create_task(self._regularly(settings.heartbeat_seconds, self._say_alive)),
-            asyncio.create_task(self._regularly(settings.rescue_seconds, self._rescue)),
-            asyncio.create_task(self._regularly(SWEEP_SECONDS, self._sweep)),
-            asyncio.create_task(self._regularly(STORE_SWEEP_SECONDS, self._sweep_store)),
-            asyncio.create_task(self._regularly(settings.poll_seconds, self._send_webhooks)),
-            asyncio.create_task(self._regularly(SWEEP_SECONDS, self._forget)),
-            asyncio.create_task(self._regularly(settings.collect_seconds, self._collect)),
-            asyncio.create_task(self._regularly(ROOM_LOOK_SECONDS, self._keep_room)),
-        ]
-        takers = [
-            asyncio.create_task(self._around.slips.work(queue, slots, self._deliver))
-            for queue, slots in self._queues.items()
+            asyncio.create_task(keep_doing(chore))
+            for chore in (
+                Chore(self._say_alive, settings.heartbeat_seconds, max(60.0, settings.stale_seconds)),
+                Chore(self._rescue, settings.rescue_seconds, RESCUE_LATE_SECONDS),
+                Chore(self._sweep, SWEEP_SECONDS),
+                Chore(self._sweep_store, STORE_SWEEP_SECONDS),
+                Chore(self._send_webhooks, settings.poll_seconds),
+                Chore(self._forget, SWEEP_SECONDS),
+                Chore(self._thin, THIN_SECONDS),
+                Chore(self._collect, settings.collect_seconds),
+                Chore(self._openings.keep, ROOM_LOOK_SECONDS),
+            )
         ]
         logger.info("worker %s takes %s", self._name, dict(self._queues) or "no jobs, only care of lost ones")
         try:
-            left = asyncio.create_task(self._around.leaving.wait())
-            await asyncio.wait({left, *takers}, return_when=asyncio.FIRST_COMPLETED)
-            # A queue that ends by itself has lost the database; running jobs go on as long as they may.
-            self._lost = self._lost or not self._around.leaving.is_set()
-            self._around.slips.stop()
-            for outcome in await asyncio.gather(*takers, return_exceptions=True):
-                if isinstance(outcome, Exception):
-                    logger.warning("a queue ended: %s", outcome)
-            left.cancel()
+            await self._take_jobs(chores)
         finally:
             for chore in chores:
                 chore.cancel()
-            await asyncio.gather(*chores, return_exceptions=True)
+            for outcome in await asyncio.gather(*chores, return_exceptions=True):
+                if isinstance(outcome, ChoreFailed):
+                    logger.error("worker %s ends, as %s", self._name, outcome)
+            await self._sender.close()
         if self._lost:
             return EXIT_LOST_DATABASE
         with contextlib.suppress(*DATABASE_ERRORS):
             async with asyncio.timeout(5), self._pool.connection() as connection:
                 await forget_worker(connection, self._id)
         return 0
+
+    async def _take_jobs(self, chores: Sequence["asyncio.Task[None]"]) -> None:
+        """Take jobs until asked to stop, or all is lost; none while something ails the machine."""
+        host, slips = self._around.host, self._around.slips
+        left = asyncio.create_task(self._around.leaving.wait())
+        while not self._around.leaving.is_set() and not self._lost:
+            host.changed.clear()
+            ails = asyncio.create_task(host.changed.wait())
+            takers = [
+                asyncio.create_task(slips.work(queue, slots, self._deliver))
+                for queue, slots in self._queues.items()
+            ]
+            await asyncio.wait({left, ails, *chores, *takers}, return_when=asyncio.FIRST_COMPLETED)
+            # A queue that ends by itself has lost the database; running jobs go on as long as they may. What
+            # a chore did nobody does any more after its end, so that they are handed back.
+            self._lost = self._lost or not (self._around.leaving.is_set() or host.ailing)
+            if any(chore.done() for chore in chores):
+                self._lost = True
+                self._around.leaving.set()
+            slips.pause()
+            for outcome in await asyncio.gather(*takers, return_exceptions=True):
+                if isinstance(outcome, Exception):
+                    logger.warning("a queue ended: %s", outcome)
+            ails.cancel()
+            while host.ailing and not self._around.leaving.is_set() and not self._lost:
+                seconds = self._settings.recover_seconds
+                await asyncio.wait({left, *chores}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+                if any(chore.done() for chore in chores) or await host.recover():
+                    break
+        left.cancel()
 
     def _leave(self) -> None:
         logger.info("worker %s stops and hands back its jobs", self._name)
@@ -181,79 +237,52 @@ class _Worker:
         if self._around.leaving.is_set():
             await self._refuse(job_id, slip)
             return
-        if not await self._room_comes(job_id):
+        if (fault := await self._around.host.look()) is not None:
+            self._around.host.fail(fault)
+        if self._around.host.ailing is not None:
             await self._refuse(job_id, slip)
             return
+        chosen = await choose(self._pool, self._around.slips, job_id, slip)
+        if chosen is None or await self._leaves(*chosen) or not await self._openings.come(*chosen):
+            return
+        job_id, slip = chosen
         since = time.monotonic()
         attempt = await claim(self._pool, job_id, slip, self._name)
         if attempt is None:
             return
-        supervisor = Supervisor(attempt, self._around, since)
         try:
-            await supervisor.run()
+            await Supervisor(attempt, self._around, since).run()
         except LostDatabase as error:
             logger.warning("job %s was let go: %s", job_id, error)
             self._lost = True
             self._around.slips.stop()
-        if supervisor.lacked_room:
-            self._cramped[job_id] = await self._around.free_bytes(), time.monotonic()
+        except Exception as error:
+            # A fault of this program, or of what it runs on, and not of the job.
+            logger.exception("the attempt at job %s failed in its worker", job_id)
+            self._around.host.fail(f"it cannot look after jobs ({type(error).__name__}: {error})")
+            with contextlib.suppress(Fenced, *DATABASE_ERRORS):
+                await attempt.hand_back(self._around.slips, "its worker failed")
 
-    async def _room_comes(self, job_id: uuid.UUID) -> bool:
-        """Wait a while for room where there is none; jobs stay queued meanwhile."""
-        deadline = time.monotonic() + ROOM_SECONDS
-        while (lacking := await self._lacking_room(job_id)) is not None:
-            if not self._told_of_room:
-                logger.warning("worker %s takes no jobs: %s", self._name, lacking)
-            self._told_of_room = True
-            await self._make_room()
-            if time.monotonic() > deadline or self._around.leaving.is_set():
-                return False
-            await asyncio.sleep(self._settings.poll_seconds)
-        if self._told_of_room:
-            logger.info("worker %s has room again", self._name)
-        self._told_of_room = False
+    async def _leaves(self, job_id: uuid.UUID, slip: int) -> bool:
+        """Whether a job was left to workers of another version."""
+        why = await unfit(self._pool, job_id, self._settings.stale_seconds)
+        if why is None:
+            return False
+        if not self._left[job_id]:
+            logger.warning("worker %s leaves job %s to others: %s", self._name, job_id, why)
+        # Rarer each time, so that however many there are they do not keep it from those that it can do.
+        wait_seconds = LEFT_POLLS * self._settings.poll_seconds * 2 ** min(self._left[job_id], 10)
+        wait_seconds = min(wait_seconds, LEFT_SECONDS)
+        self._left[job_id] += 1
+        await put_off(self._pool, self._around.slips, job_id, slip, wait_seconds)
         return True
-
-    async def _lacking_room(self, job_id: uuid.UUID) -> str | None:
-        """What lacks room for a job, in a sentence, or None."""
-        if (lacking := await self._around.lacking_room()) is not None:
-            return lacking
-        if job_id in self._cramped:
-            left_bytes, at = self._cramped[job_id]
-            more = await self._around.free_bytes() > 1.05 * max(0, left_bytes) + LEAST_BYTES
-            if not more and time.monotonic() - at < CRAMPED_SECONDS:
-                return f"A disk was full when the job was tried, and {left_bytes} bytes were left after it."
-            del self._cramped[job_id]
-        return None
-
-    async def _keep_room(self) -> None:
-        if await self._around.lacking_room() is not None:
-            await self._make_room()
-
-    async def _make_room(self) -> None:
-        """Remove what nobody names, and photographs that can be had from the store again."""
-        try:
-            await asyncio.to_thread(sweep_workspaces, self._settings.work_folder, 0.0)
-            await collect_at_once(self._pool, self._around.storage)
-        except (StorageError, *DATABASE_ERRORS) as error:
-            logger.info("unused contents were not collected: %s", error)
 
     async def _refuse(self, job_id: uuid.UUID, slip: int) -> None:
         """Leave a job to other workers whose slip came too late to this one."""
-        async with self._pool.connection() as connection, connection.transaction():
-            job = await get_job(connection, job_id, lock=True)
-            if job is not None and job.state == "queued" and job.slip == slip:
-                await queue_again(connection, self._around.slips, job, keep_slip=True)
-
-    async def _regularly(self, seconds: float, chore: Callable[[], Awaitable[None]]) -> None:
-        while True:
-            try:
-                await chore()
-            except DATABASE_ERRORS as error:
-                logger.info("%s has to wait: %s", chore.__name__, error)
-            await asyncio.sleep(seconds)
+        await put_off(self._pool, self._around.slips, job_id, slip)
 
     async def _say_alive(self) -> None:
+        facts = await asyncio.to_thread(self._facts)
         async with self._pool.connection() as connection:
             await see_worker(
                 connection,
@@ -261,12 +290,17 @@ class _Worker:
                 name=self._name,
                 queues=list(self._queues),
                 slots=sum(self._queues.values()),
-                facts=self._facts(),
+                facts=facts,
             )
 
     def _facts(self) -> dict[str, Any]:
-        memory = psutil.virtual_memory()
+        memory, room = psutil.virtual_memory(), self._around.room
+        try:
+            disk = {"disk_bytes": room.capacity_bytes(), "disk_free_bytes": room.free_bytes()}
+        except StorageError:
+            disk = {}
         return {
+            **disk,
             "host": socket.gethostname(),
             "pid": os.getpid(),
             "version": engine.__version__,
@@ -277,6 +311,9 @@ class _Worker:
             "memory_bytes": memory.total,
             "memory_free_bytes": memory.available,
             "memory_limit_bytes": self._around.memory_limit_bytes,
+            "ailing": self._around.host.ailing,
+            "isolation": abilities(),
+            **announced(),
         }
 
     async def _rescue(self) -> None:
@@ -285,7 +322,7 @@ class _Worker:
             await forget_lost_workers(connection, max(60.0, 3 * self._settings.stale_seconds))
 
     async def _send_webhooks(self) -> None:
-        await send_due(self._pool, self._settings.webhook_hosts)
+        await self._sender.begin()
 
     async def _forget(self) -> None:
         """Let go of what is older than it is to be kept."""
@@ -294,6 +331,8 @@ class _Worker:
             await forget_expired(connection)
             await forget_old(connection)
             await forget_old_keys(connection)
+            await forget_old_sessions(connection)
+            await forget_old_entries(connection, self._settings.keep_audit_hours)
         for job_id in await end_abandoned(
             self._pool,
             self._around.slips,
@@ -301,6 +340,10 @@ class _Worker:
             hours=self._settings.absent_queue_hours,
         ):
             logger.warning("job %s waited too long in a queue that no worker takes", job_id)
+
+    async def _thin(self) -> None:
+        async with self._pool.connection() as connection:
+            await thin_progress(connection)
 
     async def _collect(self) -> None:
         try:
@@ -315,6 +358,7 @@ class _Worker:
 
     async def _sweep(self) -> None:
         await asyncio.to_thread(sweep_workspaces, self._settings.work_folder)
+        await asyncio.to_thread(sweep_temporary, Path(tempfile.gettempdir()), ABANDONED_SECONDS)
 
     async def _sweep_store(self) -> None:
         """Remove what killed uploads left in the store; no upload takes a day."""

@@ -2,13 +2,14 @@
 
 import json
 import os
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from engine.config import read_config
-from engine.errors import Cancelled, ExportFailed
+from engine.errors import Cancelled, CheckpointError, ConfigError, ExportFailed
 from engine.evaluate.runs import evaluate as evaluate_run
 from engine.events import CheckpointWritten, Event, Listener, StageFinished, StageProgress, Warned, broadcast
 from engine.files import ExportOptions
@@ -44,7 +45,24 @@ KEEP_SECONDS_OF_FRAME = 0.03
 
 
 def reconstruct(task: Task) -> None:
-    """Photographs to a scene, its meshes and measurements; goes on from what an earlier attempt left."""
+    """Photographs to a scene, its meshes and measurements; goes on from what an earlier attempt left.
+
+    If that is of other settings, as another version may understand the same options, it begins anew.
+    """
+    has_left = (task.run / CONFIG).exists()
+    try:
+        _reconstruct(task)
+    except (CheckpointError, ConfigError) as error:
+        if not has_left:
+            raise
+        told = _places(task).named(str(error))
+        task.listener(Warned(f"What was there cannot be gone on with, so the job begins anew: {told}"))
+        shutil.rmtree(task.run)
+        shutil.rmtree(task.results)
+        _reconstruct(task)
+
+
+def _reconstruct(task: Task) -> None:
     assert task.scene is not None
     config = ReconstructOptions.model_validate(task.options).config()
 

@@ -17,6 +17,7 @@ from psycopg_pool import PoolTimeout
 from engine.events import Warned
 from workers.queue.attempts import Attempt, Fenced
 from workers.queue.storing import storing
+from workers.records.quotas import QuotaExceeded
 from workers.store.errors import StorageError
 from workers.telling.events import journal_progress, told_event
 from workers.telling.lines import PlainLines
@@ -63,9 +64,15 @@ class Reporter:
         self._wanted: tuple[str, int] | None = None
         self._preview: dict[str, Any] | None = None
         self._kept: Checkpoint | None = None
+        self._keeps = True
         self._wake = asyncio.Event()
         self._flushing = asyncio.Lock()
         self._tasks = [asyncio.create_task(self._flush_forever()), asyncio.create_task(self._keep_forever())]
+
+    @property
+    def kept_bytes(self) -> int:
+        """What the newest checkpoint takes in the store."""
+        return sum(file.size_bytes for file in self._kept.files) if self._kept is not None else 0
 
     def expect(self, stages: Sequence[str]) -> None:
         """Say which stages there will be."""
@@ -172,6 +179,8 @@ class Reporter:
                 return
             except _IGNORED as error:
                 logger.info("progress of job %s was not written: %s", self._attempt.job.id, error)
+            except Exception:
+                logger.exception("progress of job %s was not written", self._attempt.job.id)
 
     async def _flush(self) -> None:
         progress, self._progress = self._progress, None
@@ -192,6 +201,8 @@ class Reporter:
                 await self._keep()
             except Fenced:
                 return
+            except Exception:
+                logger.exception("a checkpoint of job %s was not kept", self._attempt.job.id)
 
     async def _keep(self) -> None:
         """Store the newest checkpoint and picture, if there are new ones."""
@@ -201,7 +212,7 @@ class Reporter:
             if wanted is not None:
                 await self._keep_checkpoint(*wanted)
             if preview is not None:
-                async with storing(self._attempt.pool) as note:
+                async with storing(self._attempt.pool, self._workspace.storage) as note:
                     sha256 = await asyncio.to_thread(self._workspace.store_file, f"{RUN}/{preview['path']}")
                     row = {"sha256": sha256, "step": preview["step"], "view": preview["view"]}
                     await self._attempt.keep_preview(row, note)
@@ -214,10 +225,18 @@ class Reporter:
             self._wanted = self._wanted or wanted
 
     async def _keep_checkpoint(self, stage: str, step: int) -> None:
-        async with storing(self._attempt.pool) as note:
+        if not self._keeps:
+            return
+        async with storing(self._attempt.pool, self._workspace.storage) as note:
             checkpoint = await asyncio.to_thread(self._workspace.keep, stage, step)
             if checkpoint is None:
                 return
             advances = checkpoint.is_beyond(self._kept)
-            await self._attempt.keep_checkpoint(checkpoint.as_row(), advances=advances, note=note)
+            try:
+                await self._attempt.keep_checkpoint(checkpoint.as_row(), advances=advances, note=note)
+            except QuotaExceeded as error:
+                # No more of them, as each would lie in the store for a while although nothing names it.
+                self._keeps = False
+                self.note(f"Warning: from here on no checkpoints are kept: {error}")
+                return
             self._kept = checkpoint

@@ -4,32 +4,28 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from engine.errors import OctasplatError
-from workers.queue.attempts import MAX_RESCUES, Attempt, Fenced, Result
+from engine import versions
+from engine.errors import ConfigError, OctasplatError
+from workers.isolation.confining import MOST_PROCESSES
+from workers.queue.attempts import Attempt, Fenced
 from workers.queue.jobs import artifacts_of
 from workers.queue.limits import seconds_spent
-from workers.queue.port import Slips
-from workers.queue.storing import Note, storing
 from workers.records.datasets import files_of, get_dataset
-from workers.settings import WorkerSettings
-from workers.store.errors import BlobMissing, DigestMismatch, StorageError
-from workers.store.os_errors import lacks_room
-from workers.store.protocol import Storage
-from workers.store.room import Room
+from workers.store.errors import BlobMissing, DigestMismatch, StorageError, StorageFull
 from workers.work.child_process import ChildProcess
 from workers.work.contact import DATABASE_ERRORS, Contact
 from workers.work.kinds import JobKind, kind_named
 from workers.work.places import Places, shown_in
 from workers.work.reporter import Reporter
+from workers.work.surroundings import LostDatabase, Surroundings
 from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE
+from workers.work.verdicts import Verdicts
 from workers.work.workspace import Checkpoint, Workspace
 
 logger = logging.getLogger(__name__)
@@ -38,10 +34,6 @@ T = TypeVar("T")
 CANCEL_SECONDS = 10.0
 _EYE = ThreadPoolExecutor(1, "watch")
 """A thread for watching children; the common ones may all be waiting for a store that is cut off as well."""
-
-
-class LostDatabase(Exception):
-    """The worker cannot say any more whether its jobs are its own, so it has let go of them."""
 
 
 class End(Enum):
@@ -54,32 +46,9 @@ class End(Enum):
     SILENT = "its program said nothing for too long"
     TIME = "it ran for longer than allowed"
     MEMORY = "its program needed more memory than allowed"
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """What all attempts of a worker share."""
-
-    settings: WorkerSettings
-    slips: Slips
-    storage: Storage
-    room: Room
-    leaving: asyncio.Event
-    memory_limit_bytes: int | None = None
-
-    async def lacking_room(self) -> str | None:
-        """What lacks room for jobs, in a sentence, or None."""
-        try:
-            return await asyncio.to_thread(self.room.lacking)
-        except StorageError as error:
-            return str(error)
-
-    async def free_bytes(self) -> int:
-        """Room for jobs; 0 where that cannot be said."""
-        try:
-            return await asyncio.to_thread(self.room.free_bytes)
-        except StorageError:
-            return 0
+    PROCESSES = "it started more processes than allowed"
+    DISK = "its folder took more than allowed"
+    ROOM = "it took room that is reserved"
 
 
 class Supervisor:
@@ -90,25 +59,27 @@ class Supervisor:
         around: the worker.
         since: when the claim was asked for, by ``time.monotonic()``.
 
-    Attributes:
-        lacked_room: whether the job was handed back because a disk was full.
     """
 
     def __init__(self, attempt: Attempt, around: Surroundings, since: float) -> None:
         self._workspace = Workspace(around.settings.work_folder, attempt.job, around.storage)
         others = (Path(around.settings.storage_address), around.settings.data)
         places = Places(self._workspace.folder, around.settings.work_folder, others)
-        self._attempt = attempt = replace(attempt, shown=lambda value: shown_in(value, places))
+        self._attempt = attempt = replace(
+            attempt, shown=lambda value: shown_in(value, places), quota=around.quota
+        )
         self._around = around
         self._settings = around.settings
         self._job = attempt.job
         self._reporter = Reporter(attempt, self._workspace)
-        self.lacked_room = False
         self._child: ChildProcess | None = None
         self._end: End | None = None
         self._kill_at = math.inf
         self._news = asyncio.Event()
         self._contact = Contact(attempt, around.settings, since)
+        self._verdicts = Verdicts(
+            attempt, around, self._workspace, self._reporter, self._contact, _program(attempt.job.kind)
+        )
         self._time_up = math.inf
 
     async def run(self) -> None:
@@ -122,7 +93,6 @@ class Supervisor:
             for watch in (self._watch_contact, self._watch_clock, self._watch_leaving)
         ]
         try:
-            await asyncio.to_thread(self._workspace.open)
             await self._work()
         except Fenced:
             logger.warning("attempt %d of job %s is over: others have it", self._job.attempt, self._job.id)
@@ -136,32 +106,42 @@ class Supervisor:
             await asyncio.gather(*watches, return_exceptions=True)
             await self._reporter.close()
             await asyncio.to_thread(self._workspace.close)
+            self._around.taken_bytes.pop(self._job.id, None)
 
     async def _work(self) -> None:
         try:
+            await asyncio.to_thread(self._workspace.open)
             earlier = await asyncio.to_thread(self._workspace.published_before)
             if earlier is not None:
-                await self._succeed(earlier)
+                await self._verdicts.succeed(earlier)
                 return
             kind = kind_named(self._job.kind)
             task = await self._prepare(kind)
         except OctasplatError as error:
-            await self._said(partial(self._give_up_preparing, error))
+            await self._verdicts.give_up(error)
             return
         if self._end is not None:
             await self._after_stop(self._end)
             return
-        self._child = await ChildProcess.start(task, self._reporter.hear, self._reporter.log)
+        try:
+            self._child = await ChildProcess.start(task, self._reporter.hear, self._reporter.log)
+        except OSError as error:
+            what = f"The job's program cannot be started ({error.strerror or error})."
+            await self._verdicts.blame(what)
+            return
         code = await self._wait_for_child(self._child)
         if self._end not in (End.FENCED, End.LOST):
             await self._reporter.finish()
         # A program that was done before it heard of the wish to stop has succeeded.
         if code == 0 and self._end in (None, End.CANCELED, End.LEAVING):
-            await self._publish()
+            await self._verdicts.publish()
         elif self._end is not None:
             await self._after_stop(self._end)
-        else:
+        elif self._child.is_ready:
             await self._after_exit(self._child, code)
+        else:
+            said = self._child.error["message"] if self._child.error is not None else f"code {code}"
+            await self._verdicts.blame(f"The job's program ended before it began: {said}")
 
     async def _prepare(self, kind: JobKind) -> dict[str, Any]:
         """Fill the workspace; returns the child's task."""
@@ -175,6 +155,10 @@ class Supervisor:
             named = await files_of(connection, job.files_id) if job.files_id else []
             left = 3600 * settings.max_job_hours - await seconds_spent(connection, job)
         self._time_up = time.monotonic() + left
+        checkpoint = None if job.checkpoint is None else Checkpoint.from_row(job.checkpoint)
+        copied = sum(a.size_bytes for a in artifacts if a.name in kind.source_files)
+        copied += sum(file.size_bytes for file in checkpoint.files) if checkpoint is not None else 0
+        await asyncio.to_thread(self._around.room.ensure_for_work, copied)
         if dataset is not None and (kind.needs == "dataset" or kind.needs_photographs(options)):
             title = dataset.name
             scene = await asyncio.to_thread(self._workspace.fetch_dataset, dataset.id, files, dataset.name)
@@ -182,8 +166,8 @@ class Supervisor:
             await asyncio.to_thread(self._workspace.fetch_source, artifacts, kind.source_files)
         if named:
             await asyncio.to_thread(self._workspace.fetch_files, named)
-        if job.checkpoint is not None:
-            await self._restore(Checkpoint.from_row(job.checkpoint))
+        if checkpoint is not None:
+            await self._restore(checkpoint)
         self._reporter.expect(kind.stages(options))
         return {
             "program": kind.program,
@@ -193,9 +177,17 @@ class Supervisor:
             "scene": str(scene) if scene else None,
             "title": title,
             "threads": settings.threads,
+            "hidden": [str(folder) for folder in settings.own_folders],
+            "memory_limit_bytes": self._around.memory_limit_bytes,
         }
 
     async def _restore(self, checkpoint: Checkpoint) -> None:
+        if checkpoint.results != versions.RESULTS:
+            self._reporter.note(
+                "Warning: the checkpoint is of a version in which the same settings gave other results, so "
+                "the job begins anew."
+            )
+            return
         try:
             await asyncio.to_thread(self._workspace.restore, checkpoint)
         except (BlobMissing, DigestMismatch) as error:
@@ -206,125 +198,61 @@ class Supervisor:
         data = {"stage": checkpoint.stage, "step": checkpoint.step, "attempt": checkpoint.attempt}
         await self._attempt.tell("resumed", data)
 
-    async def _give_up_preparing(self, error: OctasplatError) -> None:
-        described = _described(error)
-        if isinstance(error, StorageError) and not isinstance(error, BlobMissing | DigestMismatch):
-            await self._let_go(described)
-        else:
-            await self._attempt.fail(described)
-
-    async def _publish(self) -> None:
-        try:
-            results = await self._store_results()
-        except StorageError as error:
-            described = _described(error)
-            await self._said(lambda: self._let_go(described))
-            return
-        await self._succeed(results)
-
-    async def _succeed(self, results: list[Result]) -> None:
-        psnr = await asyncio.to_thread(self._workspace.measured_psnr, results)
-        await self._said(lambda: self._attempt.succeed(results, psnr))
-
-    async def _store_results(self) -> list[Result]:
-        """Store the results and publish their manifest, again and again while the job is surely ours."""
-        while True:
-            try:
-                async with storing(self._attempt.pool) as note:
-                    manifest = await asyncio.to_thread(self._workspace.store_results)
-                    async with self._attempt.pool.connection() as connection:
-                        await note.confirm(connection)
-                        return await asyncio.to_thread(self._workspace.publish, manifest)
-            except DATABASE_ERRORS as error:
-                if self._contact.is_lost:
-                    raise LostDatabase(str(error)) from error
-                await asyncio.sleep(self._settings.poll_seconds)
-
-    async def _fail(self, error: dict[str, Any]) -> None:
-        """End the job with what its program has finished."""
-        try:
-            await self._with_partial_results(lambda results, note: self._attempt.fail(error, results, note))
-        except StorageError as storage_error:
-            described = _described(storage_error)
-            await self._said(lambda: self._let_go(described))
-
-    async def _lose(self, error: dict[str, Any]) -> None:
-        """Let go of the job, which may end it: then with what its program has finished."""
-        if self._job.rescues >= MAX_RESCUES:
-            try:
-                await self._with_partial_results(lambda results, note: self._let_go(error, results, note))
-                return
-            except StorageError as storage_error:
-                logger.warning("the results there are could not be stored: %s", storage_error)
-        await self._said(lambda: self._let_go(error))
-
-    async def _with_partial_results(self, say: Callable[[list[Result], Note], Awaitable[None]]) -> None:
-        """Store what a program has finished and say so, again and again while the job is surely ours."""
-        while True:
-            try:
-                async with storing(self._attempt.pool) as note:
-                    results = await asyncio.to_thread(self._workspace.store_partial_results)
-                    await say(results, note)
-                    return
-            except DATABASE_ERRORS as error:
-                if self._contact.is_lost:
-                    raise LostDatabase(str(error)) from error
-                await asyncio.sleep(self._settings.poll_seconds)
-
-    async def _let_go(
-        self, error: dict[str, Any], results: Sequence[Result] = (), note: Note | None = None
-    ) -> None:
-        """Put the job back for a reason that may pass; where room is lacking, that is no fault of the job."""
-        lacking = await self._around.lacking_room()
-        if lacking is None and error["type"] != NO_SPACE:
-            await self._attempt.lose(self._around.slips, error, results, note)
-        else:
-            self.lacked_room = True
-            await self._attempt.hand_back(self._around.slips, f"{error['message']} {lacking or ''}".strip())
-
     async def _after_stop(self, end: End) -> None:
         if end is End.FENCED:
             raise Fenced
         if end is End.LOST:
             raise LostDatabase(end.value)
         if end is End.CANCELED:
-            await self._said(self._attempt.cancel)
+            await self._verdicts.cancel()
         elif end is End.LEAVING:
-            await self._said(lambda: self._attempt.hand_back(self._around.slips, end.value))
+            await self._verdicts.hand_back(end.value)
         elif end is End.SILENT:
             seconds = self._settings.silent_seconds
             message = f"The job's program said nothing for {seconds:g} s and was stopped."
-            await self._lose({"type": "silent", "message": message})
+            await self._verdicts.lose({"type": "silent", "message": message})
         elif end is End.TIME:
             message = (
                 f"The job ran for {self._settings.max_job_hours:g} hours, as long as it may; ask for fewer "
                 "iterations or rays, or retry it, which goes on from its checkpoint."
             )
-            await self._fail({"type": "time_limit", "message": message})
+            await self._verdicts.fail({"type": "time_limit", "message": message})
+        elif end is End.PROCESSES:
+            message = f"The job's program started more than {MOST_PROCESSES} others and was stopped."
+            await self._verdicts.fail({"type": "process_limit", "message": message})
+        elif end is End.DISK:
+            taken, most = self._workspace.most_taken_bytes(), self._settings.max_workspace_bytes
+            message = f"The job's folder took {taken} bytes, and {most} are allowed; ask for fewer images."
+            await self._verdicts.fail({"type": "disk_limit", "message": message})
+        elif end is End.ROOM:
+            taken = self._workspace.most_taken_bytes()
+            message = f"The job was stopped with {taken} bytes in its folder, as its disk was full."
+            await self._verdicts.let_go({"type": NO_SPACE, "message": message})
         else:
             limit = (self._around.memory_limit_bytes or 0) / 2**30
             message = (
                 f"The job needed more than the {limit:.1f} GB of memory that it may use; "
                 "use fewer Gaussians, smaller photographs, or a machine with more."
             )
-            await self._fail({"type": "memory_limit", "message": message})
+            await self._verdicts.fail({"type": "memory_limit", "message": message})
 
     async def _after_exit(self, child: ChildProcess, code: int) -> None:
         if code in (EXIT_REFUSED, EXIT_UNEXPECTED) and child.error is not None:
             error = child.error
             # What fails on a full disk may well succeed on another.
             if error["type"] == NO_SPACE or await self._around.lacking_room() is not None:
-                await self._said(lambda: self._let_go(error))
+                await self._verdicts.let_go(error)
             else:
-                await self._fail(error)
+                await self._verdicts.fail(error)
         elif code == EXIT_STOPPED:
             # Somebody else asked the child to stop; it wrote what is needed to go on.
-            await self._said(lambda: self._attempt.hand_back(self._around.slips, "its program was stopped"))
+            await self._verdicts.hand_back("its program was stopped")
         else:
             how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
             last = f" Its last words: {child.last_words[-1]}" if child.last_words else ""
             message = f"The job's program ended {how}.{last}"
-            await self._lose({"type": "crashed", "message": message})
+            self._around.host.crashed(self._job.id, self._job.owner)
+            await self._verdicts.lose({"type": "crashed", "message": message})
 
     async def _wait_for_child(self, child: ChildProcess) -> int:
         """Wait for the child's end, which is brought about if anything asks for it."""
@@ -376,6 +304,24 @@ class Supervisor:
             limit = self._around.memory_limit_bytes
             if limit is not None and await loop.run_in_executor(_EYE, child.memory_bytes) > limit:
                 self._stop(End.MEMORY)
+            if await loop.run_in_executor(_EYE, child.process_count) > MOST_PROCESSES:
+                self._stop(End.PROCESSES)
+            await self._watch_disk()
+
+    async def _watch_disk(self) -> None:
+        """Stop a child that fills the disk; of several the one that took most."""
+        around, loop = self._around, asyncio.get_running_loop()
+        taken = await loop.run_in_executor(_EYE, self._workspace.taken_bytes)
+        around.taken_bytes[self._job.id] = taken
+        if 0 < self._settings.max_workspace_bytes < taken:
+            self._stop(End.DISK)
+        try:
+            await loop.run_in_executor(_EYE, around.room.ensure_for_work, 0)
+        except StorageFull:
+            if taken >= max(around.taken_bytes.values()):
+                self._stop(End.ROOM)
+        except StorageError as error:
+            logger.info("the disk of job %s was not looked at: %s", self._job.id, error)
 
     def _stop(self, end: End) -> None:
         """The first reason counts, but for the two that forbid writing; of the deadlines the earliest."""
@@ -393,21 +339,10 @@ class Supervisor:
             return now + min(CANCEL_SECONDS, grace)
         return now + grace if end in (End.LEAVING, End.TIME) else now
 
-    async def _said(self, say: Callable[[], Awaitable[T]]) -> T:
-        """Write the verdict, trying again for as long as the job is surely ours.
 
-        Raises:
-            LostDatabase: that time is over.
-        """
-        while True:
-            try:
-                async with asyncio.timeout(self._settings.heartbeat_seconds):
-                    return await say()
-            except DATABASE_ERRORS as error:
-                if self._contact.is_lost:
-                    raise LostDatabase(str(error)) from error
-                await asyncio.sleep(self._settings.poll_seconds)
-
-
-def _described(error: OctasplatError) -> dict[str, Any]:
-    return {"type": NO_SPACE if lacks_room(error) else type(error).__name__, "message": str(error)}
+def _program(kind: str) -> str:
+    """The program of a kind of jobs; none where this version does not know it."""
+    try:
+        return kind_named(kind).program
+    except ConfigError:
+        return ""

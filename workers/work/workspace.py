@@ -7,17 +7,20 @@ import math
 import os
 import re
 import shutil
+import stat
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from engine import versions
 from engine.render.kept import RECORD
 from workers.queue.attempts import Result
 from workers.records.rows import Artifact, DatasetFile, Job
 from workers.store.errors import StorageError
+from workers.store.os_errors import told
 from workers.store.protocol import Storage
 from workers.store.trees import Manifest, TreeFile, fetch_tree, publish_manifest, read_manifest, store_tree
 from workers.work.media_types import media_type
@@ -30,7 +33,7 @@ _LOCK = ".lock"
 _CHECKPOINT = re.compile(r"run/checkpoints/iteration_\d+\.npz")
 _ALWAYS_KEPT = (
     "run/config.json", "run/held_out.json", "run/views.json", "run/events.jsonl", "run/training.json",
-    "run/scene.ply", "run/checkpoints/best.npz",
+    "run/plan.json", "run/scene.ply", "run/checkpoints/best.npz",
 )  # fmt: skip
 _TRIES = 5
 METRICS = "metrics.json"
@@ -39,12 +42,22 @@ MAX_METRICS_BYTES = 16 << 20
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a later attempt goes on from, as the job's row keeps it."""
+    """What a later attempt goes on from, as the job's row keeps it.
+
+    Attributes:
+        attempt: that made it.
+        stage: of the work.
+        step: of the stage.
+        files: what is needed.
+        results: what the same settings gave in the version that made it, see
+            :data:`engine.versions.RESULTS`; versions that did not say so gave the first.
+    """
 
     attempt: int
     stage: str
     step: int
     files: tuple[TreeFile, ...]
+    results: int = field(default_factory=lambda: versions.RESULTS)
 
     def as_row(self) -> dict[str, Any]:
         """As JSON values."""
@@ -53,13 +66,14 @@ class Checkpoint:
             "stage": self.stage,
             "step": self.step,
             "files": [file.model_dump() for file in self.files],
+            "results": self.results,
         }
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> "Checkpoint":
         """From JSON values."""
         files = tuple(TreeFile.model_validate(file) for file in row["files"])
-        return cls(row["attempt"], row["stage"], row["step"], files)
+        return cls(row["attempt"], row["stage"], row["step"], files, row.get("results", 1))
 
     def is_beyond(self, other: "Checkpoint | None") -> bool:
         """Whether the work is further than at ``other``."""
@@ -81,17 +95,23 @@ class Workspace:
     def __init__(self, root: Path, job: Job, storage: Storage) -> None:
         self._root = root
         self._job = job
-        self._storage = storage
+        self.storage = storage
         self.folder = root / "attempts" / f"{job.id}.{job.attempt}"
         self._lock: IO[bytes] | None = None
         self._dataset_lock: IO[bytes] | None = None
         self._frames: dict[str, TreeFile] = {}
+        self._most_taken = 0
 
     def open(self) -> None:
-        """Make the folder, anew if there is one of that name."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-        self.folder.mkdir(parents=True, mode=0o700)
-        self._lock = _locked(self.folder / _LOCK)
+        """Make the folder, anew if there is one of that name.
+
+        Raises:
+            StorageError: it cannot be made.
+        """
+        with told(self._root):
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self.folder.mkdir(parents=True, mode=0o700)
+            self._lock = _locked(self.folder / _LOCK)
 
     def close(self) -> None:
         """Remove the folder."""
@@ -103,6 +123,25 @@ class Workspace:
             self._dataset_lock.close()
             self._dataset_lock = None
 
+    def taken_bytes(self) -> int:
+        """What the folder takes on its disk, without what it shares with the store."""
+        blocks: dict[int, int] = {}
+        for folder, names, files in os.walk(self.folder):
+            if Path(folder) == self.folder and FILES in names:
+                names.remove(FILES)
+            for name in files:
+                with contextlib.suppress(FileNotFoundError):
+                    facts = os.lstat(os.path.join(folder, name))  # noqa: PTH118 - thousands of them, each second
+                    blocks[facts.st_ino] = facts.st_blocks
+        taken = 512 * sum(blocks.values())
+        self._most_taken = max(taken, self._most_taken)
+        return taken
+
+    def most_taken_bytes(self) -> int:
+        """The most that the folder was found to take."""
+        self.taken_bytes()
+        return self._most_taken
+
     def fetch_dataset(self, dataset_id: uuid.UUID, files: Sequence[DatasetFile], name: str) -> Path:
         """A folder with the photographs for all attempts on this machine; its files must not be changed."""
         folder = self._root / "datasets" / str(dataset_id)
@@ -111,7 +150,7 @@ class Workspace:
         if not place.exists():
             partial = folder / f".{uuid.uuid4().hex}.partial"
             try:
-                fetch_tree(self._storage, _tree(files), partial)
+                fetch_tree(self.storage, _tree(files), partial)
                 with contextlib.suppress(OSError):  # another attempt was faster
                     partial.rename(place)
             finally:
@@ -121,7 +160,7 @@ class Workspace:
 
     def fetch_files(self, files: Sequence[DatasetFile]) -> None:
         """Files that the options name; they must not be changed."""
-        fetch_tree(self._storage, _tree(files), self.folder / FILES)
+        fetch_tree(self.storage, _tree(files), self.folder / FILES)
 
     def fetch_source(self, artifacts: Sequence[Artifact], wanted: Sequence[str]) -> None:
         """Results of the source job into the run folder."""
@@ -135,7 +174,7 @@ class Workspace:
             for a in artifacts
             if a.name.startswith(f"{POSES}/")
         ]
-        fetch_tree(self._storage, [*tree, *poses], self.folder / RUN, writable=True)
+        fetch_tree(self.storage, [*tree, *poses], self.folder / RUN, writable=True)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Put back what an earlier attempt kept.
@@ -143,7 +182,7 @@ class Workspace:
         Raises:
             StorageError: some of it is gone or damaged.
         """
-        fetch_tree(self._storage, checkpoint.files, self.folder, writable=True)
+        fetch_tree(self.storage, checkpoint.files, self.folder, writable=True)
 
     def discard_run(self) -> None:
         """Forget what was restored."""
@@ -169,28 +208,28 @@ class Workspace:
     def store_results(self) -> Manifest:
         """Store the results, which belong to nothing yet."""
         return store_tree(
-            self._storage,
+            self.storage,
             self.folder / RESULTS,
             about={"job": str(self._job.id), "attempt": self._job.attempt, "kind": self._job.kind},
         )
 
     def publish(self, manifest: Manifest) -> list[Result]:
         """Publish the manifest of the stored results; the job's row makes them visible."""
-        if not publish_manifest(self._storage, _document(self._job, self._job.attempt), manifest):
+        if not publish_manifest(self.storage, _document(self._job, self._job.attempt), manifest):
             raise StorageError("Another result was published for this attempt; ask for a retry.")
         return _results(manifest)
 
     def store_partial_results(self) -> list[Result]:
         """Store what results there are of a program that failed; its job's row shows them, nothing else."""
         folder = self.folder / RESULTS
-        return _results(store_tree(self._storage, folder)) if folder.is_dir() else []
+        return _results(store_tree(self.storage, folder)) if folder.is_dir() else []
 
     def measured_psnr(self, results: Sequence[Result]) -> float | None:
         """Mean PSNR over the held-out views, dB, as the results say; None if they do not."""
         for result in results:
             if result.name == METRICS and result.size_bytes <= MAX_METRICS_BYTES:
                 try:
-                    mean = json.loads(b"".join(self._storage.read(result.sha256)))["mean"]["psnr"]
+                    mean = json.loads(b"".join(self.storage.read(result.sha256)))["mean"]["psnr"]
                 except (StorageError, ValueError, TypeError, KeyError):
                     return None
                 return float(mean) if isinstance(mean, int | float) and math.isfinite(mean) else None
@@ -199,19 +238,19 @@ class Workspace:
     def published_before(self) -> list[Result] | None:
         """Results that an earlier attempt published without getting to say so."""
         for attempt in range(self._job.attempt - 1, self._job.fresh_after, -1):
-            manifest = read_manifest(self._storage, _document(self._job, attempt))
+            manifest = read_manifest(self.storage, _document(self._job, attempt))
             if manifest is not None:
                 return _results(manifest)
         return None
 
     def store_file(self, name: str) -> str:
         """Store one file of the folder and return its digest."""
-        return store_tree(self._storage, self.folder, [name]).files[0].sha256
+        return store_tree(self.storage, self.folder, [name]).files[0].sha256
 
     def _stored(self, names: Sequence[str]) -> tuple[TreeFile, ...]:
         """Store files; finished frames never change, so that each of them is read once."""
         new = [name for name in names if name not in self._frames]
-        files = {file.path: file for file in store_tree(self._storage, self.folder, new).files}
+        files = {file.path: file for file in store_tree(self.storage, self.folder, new).files}
         found = tuple(self._frames.get(name) or files[name] for name in names)
         record = f"{RUN}/{FRAMES}/{RECORD}"
         self._frames |= {n: f for n, f in files.items() if n.startswith(f"{RUN}/{FRAMES}/") and n != record}
@@ -279,6 +318,27 @@ def sweep_workspaces(root: Path, dataset_seconds: float = 86_400.0) -> int:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(folder, ignore_errors=True)
             removed += 1
+    return removed
+
+
+def sweep_temporary(folder: Path, older_than_seconds: float) -> int:
+    """Remove folders that killed checks of COLMAP models have left among the temporary files of this machine.
+
+    Args:
+        folder: of temporary files.
+        older_than_seconds: what was changed since may be in use.
+
+    Returns:
+        Number of folders removed.
+    """
+    removed = 0
+    for left in folder.glob("octasplat-model-????????"):
+        with contextlib.suppress(OSError):
+            facts = left.lstat()
+            old = time.time() - facts.st_mtime > older_than_seconds
+            if stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.geteuid() and old:
+                shutil.rmtree(left, ignore_errors=True)
+                removed += 1
     return removed
 
 

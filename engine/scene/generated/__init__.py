@@ -65,12 +65,13 @@ def write_generated_scene(
     root = root.resolve()
     partial = root.with_name(f".{root.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.partial")
     try:
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise OutputError(
-            f"{root.parent} cannot be written to; name another folder ({error.strerror})."
-        ) from error
-    try:
+        # Inside, as a signal may end the program as soon as the folder is there.
+        try:
+            partial.mkdir(parents=True)
+        except OSError as error:
+            raise OutputError(
+                f"{root.parent} cannot be written to; name another folder ({error.strerror})."
+            ) from error
         write_files(partial, config, progress or (lambda _done, _total: None))
         write_json(partial / _STAMP, stamp)
         _take_place(partial, root)

@@ -1,5 +1,4 @@
-"""The tracer for any CPU: packets of neighbouring rays, and Embree for rays that come alone."""
+"""The tracer for any CPU: packets of neighbouring rays, and Embree for rays that come alone.
 
-from engine.trace.cpu.tracer import CpuTracer
-
-__all__ = ["CpuTracer"]
+It is in :mod:`engine.trace.cpu.tracer`, and not loaded for those that take no more than its vectors.
+"""

@@ -19,17 +19,18 @@ from engine.trace.protocol import TraceSettings
 
 
 class Rays(NamedTuple):
-    """A :class:`engine.rays.RayBatch`; a single origin or limit stands for all."""
+    """A :class:`engine.rays.RayBatch`; a single origin, limit or viewer stands for all."""
 
     origins: Float32[np.ndarray, "#r 3"]
     directions: Float32[np.ndarray, "r 3"]
     t_min: Float32[np.ndarray, "#r"]
     t_max: Float32[np.ndarray, "#r"]
+    t_viewer: Float32[np.ndarray, "#r"]
 
     @classmethod
     def of(cls, rays: RayBatch) -> "Rays":
         """The arrays of ``rays``, not copied."""
-        return cls(rays.origins_world, rays.directions_world, rays.t_min, rays.t_max)
+        return cls(rays.origins_world, rays.directions_world, rays.t_min, rays.t_max, rays.t_viewer)
 
 
 class Scene(NamedTuple):

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from engine.trace.cpu.kernels_hit import MEAN
-from engine.trace.cpu.kernels_sh import colour, write_view
+from engine.trace.cpu.kernels_rays import ray_viewer
+from engine.trace.cpu.kernels_sh import colour, write_ray_view
 from engine.trace.kernels_native import lean
 
 
@@ -60,8 +61,8 @@ def composite(front, hit, forward, r, origin, direction, basis):
     """
     i, t, alpha = hit.gaussian, hit.t, hit.alpha
     record = forward.scene.records[i]
-    x, y, z = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
-    write_view(basis, forward.scene.sh.shape[1], x, y, z)
+    to_mean = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
+    write_ray_view(basis, forward.scene.sh.shape[1], to_mean, direction, ray_viewer(forward.rays, r))
     weight = alpha * front.t1
     red, green, blue = colour(forward.scene.sh, i, basis)
     along = direction[0] * hit.normal_x + direction[1] * hit.normal_y + direction[2] * hit.normal_z

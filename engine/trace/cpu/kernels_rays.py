@@ -1,4 +1,4 @@
-"""Single rays out of a bundle, where one origin or limit may stand for all."""
+"""Single rays out of a bundle, where one origin, limit or viewer may stand for all."""
 
 import numpy as np
 
@@ -29,6 +29,12 @@ def ray_direction(rays, r):
 def ray_limits(rays, r):
     """Between which distances ray ``r`` sees; a single limit stands for all rays."""
     return rays.t_min[r if len(rays.t_min) > 1 else 0], rays.t_max[r if len(rays.t_max) > 1 else 0]
+
+
+@lean(forceinline=True)
+def ray_viewer(rays, r):
+    """Where on ray ``r`` its viewer stands; a single one stands for all rays."""
+    return np.float64(rays.t_viewer[r if len(rays.t_viewer) > 1 else 0])
 
 
 @lean(forceinline=True)

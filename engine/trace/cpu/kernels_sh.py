@@ -1,7 +1,6 @@
 """Real spherical harmonics of degree 0 to 3 in the sign and order of the 3DGS family.
 
-A Gaussian has one colour for all rays from one origin, that in the direction from there to its mean, as splat
-viewers draw it.
+A Gaussian has one colour for all rays with one viewer, that in the direction from there to its mean.
 """
 
 import math
@@ -51,15 +50,28 @@ def colour(sh, i, basis):
 
 @lean(forceinline=True, fastmath={"contract"})
 def write_view(basis, count, x, y, z):
-    """The first ``count`` harmonics for a mean at (x, y, z) from the origin.
+    """The first ``count`` harmonics for a mean at (x, y, z) from the viewer.
 
-    Returns the direction there, and one over the distance. A mean at the origin has the direction zero.
+    Returns the direction there, and one over the distance. A mean at the viewer has the direction zero.
     """
     length = math.sqrt(x * x + y * y + z * z)
     scale = 1.0 / length if length > 0.0 else 0.0
     x, y, z = x * scale, y * scale, z * scale
     write_basis(basis, count, x, y, z)
     return x, y, z, scale
+
+
+@lean(forceinline=True, fastmath={"contract"})
+def write_ray_view(basis, count, to_mean, direction, t_viewer):
+    """:func:`write_view` for a ray, ``to_mean`` from its origin; no slope where its viewer is at infinity."""
+    x, y, z = to_mean
+    if math.isinf(t_viewer):
+        x, y, z = direction
+        write_basis(basis, count, x, y, z)
+        return x, y, z, 0.0
+    return write_view(
+        basis, count, x - t_viewer * direction[0], y - t_viewer * direction[1], z - t_viewer * direction[2]
+    )
 
 
 @lean(forceinline=True, fastmath={"contract"})
@@ -72,7 +84,8 @@ def _by(sh, i, k, by_colour):
 def slope_by_mean(sh, i, count, view, by_colour):
     """Gradient by the mean of Gaussian ``i``, through the direction in which its colour is seen.
 
-    ``view`` is that direction and one over the distance, as :func:`write_view` gives them.
+    ``view`` is that direction and one over the distance, as :func:`write_view` gives them; 0 for a viewer at
+    infinity, where the mean changes nothing.
     """
     x, y, z, scale = view
 

@@ -14,9 +14,9 @@ from numba import njit, prange
 
 from engine.gaussians.model import SH_C0
 from engine.trace.cpu.kernels_hit import NORMAL, OPACITY
-from engine.trace.cpu.kernels_rays import ray_direction, ray_origin
+from engine.trace.cpu.kernels_rays import ray_direction, ray_origin, ray_viewer
 from engine.trace.cpu.kernels_records import rotation_columns
-from engine.trace.cpu.kernels_sh import slope_by_mean, write_view
+from engine.trace.cpu.kernels_sh import slope_by_mean, write_ray_view
 from engine.trace.kernels_native import lean, next_from_counter
 
 RED_OFF, GREEN_OFF, BLUE_OFF = 1 << 28, 1 << 29, 1 << 30
@@ -205,7 +205,7 @@ def gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shar
             d0, d1, d2 = ray_direction(rays, r)
             o0, o1, o2 = ray_origin(rays, r)
             x, y, z = o0 - m0, o1 - m1, o2 - m2
-            from_mean = x, y, z
+            to_mean = -x, -y, -z
             inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
             t = -(x * n0 + y * n1 + z * n2) * inverse
             x += t * d0
@@ -239,7 +239,7 @@ def gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shar
                 sh_sum[0, 1] += gg
                 sh_sum[0, 2] += gb
             else:
-                view = write_view(basis, basis_count, -from_mean[0], -from_mean[1], -from_mean[2])
+                view = write_ray_view(basis, basis_count, to_mean, (d0, d1, d2), ray_viewer(rays, r))
                 m_x, m_y, m_z = slope_by_mean(scene.sh, i, basis_count, view, (gr, gg, gb))
                 s_m0, s_m1, s_m2 = s_m0 + m_x, s_m1 + m_y, s_m2 + m_z
                 for j in range(basis_count):

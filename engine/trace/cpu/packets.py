@@ -48,22 +48,24 @@ Ways = Literal["auto", "always", "never"]
 
 
 def find_packets(
-    rays: RayBatch, ways: Ways = "auto"
+    rays: RayBatch, ways: Ways = "auto", *, coloured: bool = True
 ) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
     """Which rays go in packets, and which alone.
 
     A group are neighbours in the batch that share an origin, to the bit, and look about one way. Each is
-    judged by its own size, but few small ones go as packets, too.
+    judged by its own size, but few small ones go as packets, too. A packet sees a Gaussian in one colour, so
+    that where colours matter the viewers have to stand at the origins.
 
     Args:
         rays: any rays.
-        ways: ``auto`` by what is faster; ``always`` or ``never`` in packets.
+        ways: ``auto`` by what is faster; ``always`` (where that is possible) or ``never`` in packets.
+        coloured: whether colours matter.
 
     Returns:
         First ray of each packet and the one behind its last; and the rays that go alone.
     """
     count = len(rays)
-    if ways == "never" or count == 0:
+    if ways == "never" or count == 0 or (coloured and rays.t_viewer.any()):
         return np.empty((0, 2), np.int64), np.arange(count)
     starts = np.empty(count + 1, np.int64)
     groups = packet_starts(rays.origins_world, rays.directions_world, MAX_RAYS, LEAST_COSINE, starts)

@@ -24,8 +24,8 @@ MAX_RAYS_PER_TRACE = 1 << 28
 class CpuTracer:
     """Flat Gaussians for a CPU; follows :class:`engine.trace.protocol.Tracer`.
 
-    Rays that lie beside each other in the batch, share their origin and look about one way form packets; the
-    others are followed one by one (:func:`engine.trace.cpu.packets.find_packets`).
+    Rays that lie beside each other in the batch, share their origin, have their viewer there and look about
+    one way form packets; the others are followed one by one (:func:`engine.trace.cpu.packets.find_packets`).
 
     Hits are exact: a hierarchy only says which octagons to test, the octagon test and the distance come
     from the parameters in float64, and hits are ordered by (float32 distance, id). So neither the shape of
@@ -96,7 +96,7 @@ class CpuTracer:
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Follow rays; see the protocol. Directions must have unit length."""
-        packets, alone = self._sorted_out(rays)
+        packets, alone = self._sorted_out(rays, coloured=True)
         count = len(rays)
         result = empty_result(count, self._features.shape[1])
         hits = self._room(count if record else 0)
@@ -112,7 +112,7 @@ class CpuTracer:
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
         """What light is left along each ray; see the protocol."""
-        packets, alone = self._sorted_out(rays)
+        packets, alone = self._sorted_out(rays, coloured=False)
         left = np.empty(len(rays), np.float32)
         if len(packets):
             self._packets.absorb(Rays.of(rays), self._scene, packets, left)
@@ -141,11 +141,13 @@ class CpuTracer:
         assert self._gaussians is not None, "build first"
         return Scene(self._records, self._gaussians.sh, self._features)
 
-    def _sorted_out(self, rays: RayBatch) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
+    def _sorted_out(
+        self, rays: RayBatch, *, coloured: bool
+    ) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
         """Packets and single rays of a batch, with what they need ready."""
         assert len(rays) < MAX_RAYS_PER_TRACE
         use_threads(self.threads)
-        packets, alone = find_packets(rays, self._ways)
+        packets, alone = find_packets(rays, self._ways, coloured=coloured)
         if len(alone) and not self._built_singles:
             assert self._gaussians is not None, "build first"
             write_boxes(self._boxes, *Parameters.of(self._gaussians), self.settings.q, self._padding)

@@ -34,15 +34,31 @@ from workers.cli.options import quiet_option
     type=click.FloatRange(0, min_open=True),
     help="Neighbours belong together up to this many times their summed standard deviations.  [default: 1]",
 )
+@click.option(
+    "--near",
+    "near_share",
+    type=click.FloatRange(0, 1, max_open=True),
+    default=0.25,
+    show_default=True,
+    metavar="SHARE",
+    help="Where IN is the folder of a run: remove those in a training view that are nearer than this share "
+    "of the depth at which its sparse points begin; 0 for none.",
+)
 @quiet_option
-def clean(source: Path, output: Path | None, dry_run: bool, quiet: bool, **given: Any) -> None:
-    """Remove Gaussians of IN that cannot be seen, are too large, or float by themselves."""
+def clean(
+    source: Path, output: Path | None, dry_run: bool, near_share: float, quiet: bool, **given: Any
+) -> None:
+    """Remove Gaussians of IN that cannot be seen, are too large, too near to a camera, or float.
+
+    octasplat info IN tells how large and how opaque they are.
+    """
     if (output is None) != dry_run:
         raise click.UsageError("Name the result with -o, or say --dry-run.")
 
     from engine.edit.cleaning import CleanOptions
     from engine.edit.cleaning import clean as find_clean
     from engine.errors import ConfigError
+    from engine.run_folder import is_run, run_near_zones
     from workers.cli.editing import checked_options, speaker, targets_for, write_scene
     from workers.cli.scene_files import open_scene
     from workers.cli.signals import orderly_termination
@@ -51,15 +67,20 @@ def clean(source: Path, output: Path | None, dry_run: bool, quiet: bool, **given
     targets = targets_for(output, [source], [source]) if output is not None else ()
     gaussians = open_scene(source, quiet=quiet)
     with orderly_termination():
-        keep, report = find_clean(gaussians, options)
+        zones = run_near_zones(source, near_share) if near_share > 0 and is_run(source) else None
+        keep, report = find_clean(gaussians, options, zones)
         say = click.echo if dry_run else speaker(quiet)
         say(
             f"{source}: {len(gaussians):,} Gaussians; {report.faint:,} too faint, "
             f"{report.small:,} too small, {report.large:,} too large, "
+            f"{report.near:,} too near to a camera, "
             f"{report.floating:,} in {report.groups:,} groups of floaters; "
             f"{report.kept:,} kept."
         )
         if not keep.any():
-            raise ConfigError(f"{source}: nothing of it would be left; ask for less.")
+            raise ConfigError(
+                f"{source}: nothing of it would be left; ask for less (octasplat info tells its sizes and "
+                "opacities)."
+            )
         for target in targets:
             write_scene(gaussians.select(keep), target, say)

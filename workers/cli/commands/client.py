@@ -44,9 +44,10 @@ def set_option(command: F) -> F:
 @contextmanager
 def connected(server: str | None) -> Iterator["Api"]:
     """The service that the user means; the token is no option, as others on a machine see those."""
-    from workers.client.api import TOKEN, Api, find_address
+    from workers.client.api import Api, find_address, find_token
 
-    with Api(server or find_address(os.environ), os.environ.get(TOKEN)) as api:
+    address = server or find_address(os.environ)
+    with Api(address, find_token(os.environ, address)) as api:
         yield api
 
 
@@ -66,6 +67,7 @@ def connected(server: str | None) -> Iterator["Api"]:
 @click.option(
     "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
 )
+@click.option("--minutes", type=click.FloatRange(0.1), metavar="N", help="End the training within N minutes.")
 @exports_option
 @set_option
 @click.option("--label", help="What to call the job.")
@@ -271,7 +273,9 @@ def download(
 def _options(given: dict[str, Any]) -> dict[str, Any]:
     """The options of the job."""
     options: dict[str, Any] = {
-        name: given[name] for name in ("preset", "poses", "max_side") if given.get(name) is not None
+        name: given[name]
+        for name in ("preset", "poses", "max_side", "minutes")
+        if given.get(name) is not None
     }
     exports = export_names(given["exports"])
     if exports is not None:

@@ -21,7 +21,10 @@ def crop(
     inverse: bool,
     quiet: bool,
 ) -> None:
-    """Keep those Gaussians of IN for which all that is given holds; boxes and spheres ask for centres."""
+    """Keep those Gaussians of IN for which all that is given holds; boxes and spheres ask for centres.
+
+    octasplat info IN tells where they lie.
+    """
     if where is None and box is None and sphere is None:
         raise click.UsageError("Say what to keep: --box, --sphere or --where.")
 
@@ -40,7 +43,10 @@ def crop(
     if not keep.any():
         low, high = gaussians.means_world.min(axis=0), gaussians.means_world.max(axis=0)
         bounds = " to ".join(" ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
-        raise ConfigError(f"{source}: nothing of it would be kept; its centres lie in {bounds}.")
+        raise ConfigError(
+            f"{source}: nothing of it would be kept; its centres lie in {bounds} (octasplat info tells where "
+            "its solid part is)."
+        )
     say = speaker(quiet)
     say(f"{source}: {int(keep.sum()):,} of {len(keep):,} Gaussians kept.")
     with orderly_termination():

@@ -1,12 +1,11 @@
 """``octasplat demo``: the whole way on a scene that octasplat makes itself."""
 
-import os
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
+from workers.cli.browsing import has_display
 from workers.cli.options import quiet_option, threads_option
 
 DEFAULT_OUTPUT = Path("octasplat-demo")
@@ -55,13 +54,7 @@ def demo(output: Path, open_report: bool | None, **options: Any) -> None:
         output / "scene", output / "result", options["preset"], threads=threads, quiet=quiet
     )
     click.echo(f"Open {report} in a browser to see the result.")
-    if _can_open() if open_report is None else open_report:
+    if has_display() if open_report is None else open_report:
         import webbrowser
 
         webbrowser.open(report.resolve().as_uri())
-
-
-def _can_open() -> bool:
-    """Whether somebody sits in front of a display."""
-    has_display = sys.platform == "darwin" or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
-    return has_display and sys.stdout.isatty()

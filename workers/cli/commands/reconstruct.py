@@ -37,6 +37,12 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
 @click.option(
     "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
 )
+@click.option(
+    "--minutes",
+    type=click.FloatRange(0.1),
+    metavar="N",
+    help="End the training within N minutes on this machine: chooses iterations and Gaussians by its pace.",
+)
 @click.option("--rays", type=int, metavar="N", help="Rays of one iteration.")
 @click.option(
     "--max-gaussians",
@@ -120,6 +126,7 @@ def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
             "held_out": options["held_out"] or None,
             "masks": options["masks"],
             "evaluate_background": options["background"],
+            "minutes": options["minutes"],
             "exports": exports,
         },
         assignments=[*assignments, *options["assignments"]],

@@ -21,14 +21,26 @@ import click
     is_flag=True,
     help="Submit a generated scene, save its result in octasplat-demo, and stop.",
 )
-def serve(data: Path | None, host: str | None, port: int | None, queues: str, demo: bool) -> None:
+@click.option(
+    "--open/--no-open", "open_page", default=None, help="Open the page, signed in.  [default: on a desktop]"
+)
+def serve(
+    data: Path | None, host: str | None, port: int | None, queues: str, demo: bool, open_page: bool | None
+) -> None:
     """Run the API, the web page, a worker and, unless DATABASE_URL names another, a database of its own.
 
-    Ctrl-C stops everything; jobs under way write a checkpoint and go on at the next start.
+    It makes itself a token, kept in the data folder, that the commands of the same user find by themselves;
+    octasplat open signs a browser in. Ctrl-C stops everything; jobs under way write a checkpoint and go on at
+    the next start.
     """
     import asyncio
+    import contextlib
+    import threading
 
+    from engine.errors import OctasplatError
+    from workers.cli.browsing import has_display, open_signed_in
     from workers.cli.commands.worker import parse_queues
+    from workers.client.api import Api
     from workers.logs import log_to_stderr
     from workers.serve.machine import Plan, serve
     from workers.settings import WorkerSettings, load_settings
@@ -37,13 +49,20 @@ def serve(data: Path | None, host: str | None, port: int | None, queues: str, de
     settings = load_settings(WorkerSettings, data=data)
     plan = Plan(settings, host, port, parse_queues(queues))
 
+    def show_page() -> None:
+        with contextlib.suppress(OctasplatError), Api.local(settings.data) as api:
+            open_signed_in(api)
+
     def say(address: str) -> None:
-        click.echo(f"octasplat serves at {address}  (Ctrl-C stops it)")
+        click.echo(f"octasplat serves at {address}  (Ctrl-C stops it; octasplat open signs a browser in)")
+        if (has_display() if open_page is None else open_page) and not demo:
+            threading.Thread(target=show_page, daemon=True).start()
 
     async def show(address: str) -> None:
         from workers.cli.submitting import run_demo
 
         say(address)
-        await asyncio.to_thread(run_demo, address)
+        with Api.local(settings.data) as api:
+            await asyncio.to_thread(run_demo, api)
 
     raise SystemExit(asyncio.run(serve(plan, show if demo else say)))

@@ -1,5 +1,6 @@
 """``octasplat surface``: one coloured triangle mesh of a scene."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,8 @@ import click
 
 from workers.cli.camera_options import AXES
 from workers.cli.options import quiet_option, threads_option
+
+FACTORS = {"": 1, "k": 1000, "M": 1_000_000}
 
 
 def _rim(_context: click.Context, _parameter: click.Parameter, value: str) -> float | None:
@@ -35,6 +38,22 @@ def _box(_context: click.Context, _parameter: click.Parameter, value: str | None
     return numbers
 
 
+def _levels(_context: click.Context, _parameter: click.Parameter, value: str | None) -> dict[str, int] | None:
+    """Numbers such as 5k with commas between them, each under what was written."""
+    if value is None:
+        return None
+    levels: dict[str, int] = {}
+    for part in value.split(","):
+        written = re.fullmatch(r"(\d+(?:\.\d+)?)([kM]?)", part.strip())
+        count = round(float(written[1]) * FACTORS[written[2]]) if written else 0
+        if not 4 <= count < 1 << 31:
+            raise click.BadParameter(f"{part!r} is no number of triangles from 4 on, such as 60000 or 50k.")
+        if count in levels.values():
+            raise click.BadParameter(f"{part!r} is there twice.")
+        levels[part.strip()] = count
+    return levels
+
+
 @click.command(short_help="One coloured triangle mesh of a scene.")
 @click.argument("source", metavar="IN", type=click.Path(path_type=Path))
 @click.option(
@@ -45,7 +64,8 @@ def _box(_context: click.Context, _parameter: click.Parameter, value: str | None
     "--bounds",
     callback=_box,
     metavar="X0,Y0,Z0,X1,Y1,Z1",
-    help="The box to mesh.  [default: what is seen of the space that the cameras surround]",
+    help="The box to mesh; octasplat info tells where the scene lies.  "
+    "[default: what is seen of the space that the cameras surround]",
 )
 @click.option("--voxel", type=click.FloatRange(0, min_open=True), help="Side of a voxel, in scene units.")
 @click.option(
@@ -79,7 +99,10 @@ def _box(_context: click.Context, _parameter: click.Parameter, value: str | None
     metavar="VOXELS",
     help="Close holes with rims up to this; or 'all'.",
 )
-@click.option("--max-triangles", type=click.IntRange(4), metavar="N", help="Decimate to so many triangles.")
+@click.option(
+    "--max-triangles", callback=_levels, metavar="N[,N...]",
+    help="Decimate to so many triangles, such as 60000 or 60k; 5k,50k,500k writes a file each, NAME_5k.glb.",
+)  # fmt: skip
 @click.option(
     "--texture", "texture_side", type=click.IntRange(64, 16384), metavar="PX",
     help="Colours in a square texture of this side instead of in the vertices; .glb and .obj.",
@@ -109,6 +132,7 @@ def surface(
     up: str | None,
     threads: int,
     quiet: bool,
+    max_triangles: dict[str, int] | None,
     **given: Any,
 ) -> None:
     """Mesh IN, the folder of a run or a file of Gaussians, into one surface of coloured triangles.
@@ -127,10 +151,13 @@ def surface(
 
     # None means "all" for the holes, and the default for everything else.
     options = {name: value for name, value in given.items() if value is not None or name == "fill_holes"}
+    levels = max_triangles or {}
+    if len(levels) == 1:
+        options["max_triangles"], levels = next(iter(levels.values())), {}
     with stop_on_signals() as should_stop:
         try:
             run_surface(
-                Asked(source, output, scene, materials=materials, up=up),
+                Asked(source, output, scene, materials=materials, up=up, levels=levels),
                 options, threads=threads, quiet=quiet, should_stop=should_stop,
             )  # fmt: skip
         except Cancelled as error:

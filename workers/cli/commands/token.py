@@ -1,7 +1,10 @@
 """``octasplat token``: who may use the service."""
 
+import getpass
+import os
 import uuid
 from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -24,15 +27,26 @@ def token() -> None:
 @click.argument("name")
 @click.option("--owner", help="Whose things it shows.  [default: NAME]")
 @click.option("--scope", "scopes", multiple=True, type=click.Choice(SCOPES), help="[default: write]")
+@click.option("--days", type=click.FloatRange(min=0, min_open=True), help="How long it is valid.")
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
-def create(name: str, owner: str | None, scopes: tuple[str, ...], data: Path | None) -> None:
+def create(
+    name: str, owner: str | None, scopes: tuple[str, ...], days: float | None, data: Path | None
+) -> None:
     """Make a token called NAME and show its secret, this once. From the first on, nobody gets in without."""
     from workers.records.tokens import add_token, new_secret
 
     secret = new_secret()
 
     async def add(connection: "Connection") -> None:
-        await add_token(connection, secret, owner=owner or name, name=name, scopes=scopes or ("write",))
+        made = await add_token(
+            connection,
+            secret,
+            owner=owner or name,
+            name=name,
+            scopes=scopes or ("write",),
+            hours=None if days is None else 24 * days,
+        )
+        await _write_down(connection, "token create", f"/v1/tokens/{made.id}")
 
     _with_database(data, add)
     click.echo(secret)
@@ -44,8 +58,11 @@ def list_all(data: Path | None) -> None:
     """List all tokens, without their secrets."""
     from workers.records.tokens import list_tokens
 
+    now = datetime.now(UTC)
     for row in _with_database(data, list_tokens):
         state = "revoked" if row.revoked_at else ",".join(row.scopes)
+        if row.expires_at is not None and not row.revoked_at:
+            state += f"  {'expired' if row.expires_at < now else 'until'} {row.expires_at:%Y-%m-%d}"
         click.echo(f"{row.id}  {row.name:20}  {row.owner:20}  {state}")
 
 
@@ -53,26 +70,50 @@ def list_all(data: Path | None) -> None:
 @click.argument("token_id", type=click.UUID)
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
 def revoke(token_id: uuid.UUID, data: Path | None) -> None:
-    """Shut the token TOKEN_ID out."""
+    """Shut the token TOKEN_ID out, with the sessions of browsers that were begun with it."""
     from workers.records.tokens import revoke_token
 
-    found = _with_database(data, lambda connection: revoke_token(connection, token_id))
-    click.echo("Revoked." if found else "There is no such token.")
+    async def shut(connection: "Connection") -> bool:
+        await _write_down(connection, "token revoke", f"/v1/tokens/{token_id}")
+        return await revoke_token(connection, token_id)
+
+    click.echo("Revoked." if _with_database(data, shut) else "There is no such token.")
+
+
+async def _write_down(connection: "Connection", action: str, target: str) -> None:
+    from workers.records.audit import add_entry
+
+    await add_entry(connection, address="command line", owner=_user(), action=action, target=target)
+
+
+def _user() -> str:
+    """The name of whoever gives the command, on this machine."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # no name
+        return str(os.getuid())
 
 
 def _with_database(data: Path | None, what: Callable[["Connection"], Awaitable[T]]) -> T:
-    """Run something on a connection, after bringing the tables up to date."""
+    """Run something on a connection."""
     import asyncio
 
+    import psycopg
+
     from workers.records.database import open_pool
-    from workers.records.migrate import migrate
+    from workers.records.errors import DatabaseError
     from workers.settings import WorkerSettings, load_settings
 
     conninfo = load_settings(WorkerSettings, data=data).conninfo()
-    migrate(conninfo)
 
     async def run() -> T:
-        async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
-            return await what(connection)
+        try:
+            async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
+                return await what(connection)
+        except (psycopg.errors.UndefinedTable, psycopg.errors.UndefinedColumn):
+            raise DatabaseError(
+                "The database lacks tables of this version; run octasplat migrate, or start octasplat "
+                "serve or the front end."
+            ) from None
 
     return asyncio.run(run())

@@ -1,5 +1,6 @@
 """The queue of messages: who takes one has it for a while, and says what became of it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from psycopg.rows import class_row
@@ -12,6 +13,7 @@ LEASE_SECONDS = 60
 WAITS_SECONDS = (5, 60, 300, 1800, 7200, 14_400, 28_800, 33_000)
 """Between the tries; 23.7 hours in all, to which up to a tenth is added by chance."""
 KEPT_DAYS = 30
+NOTHING: Mapping[str, int] = {}
 
 
 @dataclass(frozen=True)
@@ -32,22 +34,49 @@ class Outcome:
         return self.status == 410
 
 
-async def take_due(connection: Connection, limit: int) -> list[tuple[Delivery, Endpoint]]:
-    """Messages to send now; nobody else gets them for :data:`LEASE_SECONDS`."""
+async def take_due(
+    connection: Connection,
+    limit: int,
+    *,
+    of_one_owner: int | None = None,
+    under_way: Mapping[str, int] = NOTHING,
+) -> list[tuple[Delivery, Endpoint]]:
+    """Messages to send now; nobody else gets them for :data:`LEASE_SECONDS`.
+
+    Args:
+        connection: to the database.
+        limit: at most so many.
+        of_one_owner: at most so many of one owner, with those under way; None sets no limit.
+        under_way: how many messages of an owner are being sent.
+    """
     async with connection.transaction(), connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
             """
-            WITH due AS (
-                SELECT deliveries.id FROM webhook_deliveries deliveries
+            WITH ranked AS (
+                SELECT deliveries.id, endpoints.owner,
+                    row_number() OVER (PARTITION BY endpoints.owner ORDER BY deliveries.due_at) AS place
+                FROM webhook_deliveries deliveries
                 JOIN webhook_endpoints endpoints ON endpoints.id = deliveries.endpoint_id
                 WHERE deliveries.state = 'pending' AND deliveries.due_at <= now() AND endpoints.enabled
-                ORDER BY deliveries.due_at LIMIT %(limit)s FOR UPDATE OF deliveries SKIP LOCKED
+            ), due AS (
+                SELECT deliveries.id FROM webhook_deliveries deliveries JOIN ranked USING (id)
+                LEFT JOIN unnest(%(owners)s::text[], %(counts)s::int[]) AS busy (owner, n) USING (owner)
+                WHERE deliveries.state = 'pending' AND deliveries.due_at <= now()
+                  AND (%(each)s::int IS NULL OR ranked.place + coalesce(busy.n, 0) <= %(each)s)
+                ORDER BY ranked.place, deliveries.due_at LIMIT %(limit)s
+                FOR UPDATE OF deliveries SKIP LOCKED
             )
             UPDATE webhook_deliveries SET tries = tries + 1, tried_at = now(),
                 due_at = now() + make_interval(secs => %(lease)s)
             FROM due WHERE webhook_deliveries.id = due.id RETURNING webhook_deliveries.*
             """,
-            {"limit": limit, "lease": LEASE_SECONDS},
+            {
+                "limit": limit,
+                "lease": LEASE_SECONDS,
+                "each": of_one_owner,
+                "owners": list(under_way),
+                "counts": list(under_way.values()),
+            },
         )
         taken = await cursor.fetchall()
         with_endpoints = [

@@ -10,7 +10,8 @@ from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
 from engine.errors import OctasplatError
-from workers.records.database import Connection
+from workers.records.database import Connection, naming
+from workers.records.errors import Missing
 from workers.records.ids import new_id
 
 EventName = Literal[
@@ -115,10 +116,13 @@ async def add_endpoint(
         if row is not None and row["n"] >= limit:
             raise TooManyEndpoints(f"There are {limit} such webhooks already; delete some first.")
         await cursor.execute(
-            """
+            naming(
+                """
             INSERT INTO webhook_endpoints (id, owner, job_id, url, secret, events)
-            VALUES (%s, %s, %s, %s, %s, %s) RETURNING *
+            VALUES (%s, %s, %s, %s, %s, %s) RETURNING {}
             """,
+                Endpoint,
+            ),
             [new_id(), owner, job_id, url, secret, list(events)],
         )
         endpoint = await cursor.fetchone()
@@ -129,7 +133,9 @@ async def add_endpoint(
 async def get_endpoint(connection: Connection, endpoint_id: uuid.UUID) -> Endpoint | None:
     """The endpoint of that id, or None."""
     async with connection.cursor(row_factory=class_row(Endpoint)) as cursor:
-        await cursor.execute("SELECT * FROM webhook_endpoints WHERE id = %s", [endpoint_id])
+        await cursor.execute(
+            naming("SELECT {} FROM webhook_endpoints WHERE id = %s", Endpoint), [endpoint_id]
+        )
         return await cursor.fetchone()
 
 
@@ -150,12 +156,15 @@ async def list_endpoints(
     """
     async with connection.cursor(row_factory=class_row(Endpoint)) as cursor:
         await cursor.execute(
-            """
-            SELECT * FROM webhook_endpoints
+            naming(
+                """
+            SELECT {} FROM webhook_endpoints
             WHERE (%(owner)s::text IS NULL OR owner = %(owner)s)
               AND (%(before)s::uuid IS NULL OR id < %(before)s)
             ORDER BY id DESC LIMIT %(limit)s
             """,
+                Endpoint,
+            ),
             {"owner": owner, "before": before, "limit": limit},
         )
         return await cursor.fetchall()
@@ -173,7 +182,7 @@ async def change_endpoint(
     """Change what is given; None leaves a value as it is.
 
     Raises:
-        KeyError: there is no such endpoint.
+        Missing: there is no such endpoint.
     """
     await connection.execute(
         """
@@ -192,7 +201,7 @@ async def change_endpoint(
     )
     endpoint = await get_endpoint(connection, endpoint_id)
     if endpoint is None:
-        raise KeyError(endpoint_id)
+        raise Missing("webhook")
     return endpoint
 
 
@@ -207,13 +216,16 @@ async def add_delivery(
     """Put a message into the queue."""
     async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
-            """
+            naming(
+                """
             INSERT INTO webhook_deliveries (endpoint_id, kind, payload)
             VALUES (%(endpoint)s, %(kind)s, jsonb_build_object(
                 'type', %(kind)s::text, 'data', %(data)s::jsonb,
                 'timestamp', to_char(now() AT TIME ZONE 'UTC', 'YYYY-MM-DD"T"HH24:MI:SS.US"Z"')))
-            RETURNING *
+            RETURNING {}
             """,
+                Delivery,
+            ),
             {"endpoint": endpoint_id, "kind": kind, "data": Jsonb(data)},
         )
         delivery = await cursor.fetchone()
@@ -227,7 +239,8 @@ async def get_delivery(
     """A message to an endpoint, or None."""
     async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
-            "SELECT * FROM webhook_deliveries WHERE id = %s AND endpoint_id = %s", [delivery_id, endpoint_id]
+            naming("SELECT {} FROM webhook_deliveries WHERE id = %s AND endpoint_id = %s", Delivery),
+            [delivery_id, endpoint_id],
         )
         return await cursor.fetchone()
 
@@ -236,7 +249,12 @@ async def list_deliveries(connection: Connection, endpoint_id: uuid.UUID, limit:
     """The newest messages to an endpoint."""
     async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
-            "SELECT * FROM webhook_deliveries WHERE endpoint_id = %s ORDER BY created_at DESC, id LIMIT %s",
+            naming(
+                """
+                SELECT {} FROM webhook_deliveries WHERE endpoint_id = %s ORDER BY created_at DESC, id LIMIT %s
+                """,
+                Delivery,
+            ),
             [endpoint_id, limit],
         )
         return await cursor.fetchall()
@@ -246,17 +264,20 @@ async def send_again(connection: Connection, delivery_id: uuid.UUID) -> Delivery
     """Put a message into the queue once more, with all its tries; its id and body stay.
 
     Raises:
-        KeyError: there is no such message.
+        Missing: there is no such message.
     """
     async with connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
-            """
+            naming(
+                """
             UPDATE webhook_deliveries SET state = 'pending', failures = 0, due_at = now() WHERE id = %s
-            RETURNING *
+            RETURNING {}
             """,
+                Delivery,
+            ),
             [delivery_id],
         )
         delivery = await cursor.fetchone()
     if delivery is None:
-        raise KeyError(delivery_id)
+        raise Missing("message")
     return delivery

@@ -2,9 +2,12 @@
 
 import asyncio
 import logging
+from collections import Counter
 from datetime import UTC, datetime
 
 import httpx
+import psycopg
+from psycopg_pool import PoolTimeout
 
 from workers.records.database import Pool
 from workers.upkeep.webhooks.addresses import AddressRefused, check_url
@@ -16,31 +19,87 @@ from workers.upkeep.webhooks.signing import message
 logger = logging.getLogger(__name__)
 
 TIMEOUT_SECONDS = 15.0
-AT_ONCE = 20
+AT_ONCE = 40
+OF_ONE_OWNER = 5
+"""Messages of an owner that are being sent; those of others do not wait for slow answers to them."""
 
 
-async def send_due(pool: Pool, allowed_hosts: tuple[str, ...] = ()) -> int:
-    """Send what is due, until nothing is.
+class Sender:
+    """Sends messages, each by itself.
 
     Args:
         pool: connections.
         allowed_hosts: see :func:`workers.upkeep.webhooks.addresses.check_url`.
-
-    Returns:
-        Number of messages sent, whether they arrived or not.
     """
-    sent = 0
-    while True:
-        async with pool.connection() as connection:
-            taken = await take_due(connection, AT_ONCE)
-        if not taken:
-            return sent
-        async with guarded_client(allowed_hosts) as client:
-            sends = (_send(pool, client, *each, allowed_hosts) for each in taken)
-            for outcome in await asyncio.gather(*sends, return_exceptions=True):
-                if outcome is not None:
-                    raise outcome
-        sent += len(taken)
+
+    def __init__(self, pool: Pool, allowed_hosts: tuple[str, ...] = ()) -> None:
+        self._pool = pool
+        self._allowed_hosts = allowed_hosts
+        self._client = guarded_client(allowed_hosts)
+        self._under_way: Counter[str] = Counter()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.sent = 0
+
+    async def begin(self) -> int:
+        """Begin to send what is due and may be sent now; returns how many messages these are."""
+        async with self._pool.connection() as connection:
+            taken = await take_due(
+                connection,
+                max(0, AT_ONCE - len(self._tasks)),
+                of_one_owner=OF_ONE_OWNER,
+                under_way=self._under_way,
+            )
+        for delivery, endpoint in taken:
+            self._under_way[endpoint.owner] += 1
+            task = asyncio.create_task(self._send(delivery, endpoint))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        return len(taken)
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether messages are under way."""
+        return bool(self._tasks)
+
+    async def wait(self) -> None:
+        """Until one of the messages under way is settled."""
+        if self._tasks:
+            await asyncio.wait(set(self._tasks), return_when=asyncio.FIRST_COMPLETED)
+
+    async def close(self) -> None:
+        """Give up what is under way; it will be sent again."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._client.aclose()
+
+    async def _send(self, delivery: Delivery, endpoint: Endpoint) -> None:
+        try:
+            outcome = await send(self._client, delivery, endpoint, self._allowed_hosts)
+            if not outcome.is_success:
+                logger.info("message %s of webhook %s: %s", delivery.id, endpoint.id, outcome.error)
+            async with self._pool.connection() as connection:
+                await settle(connection, delivery, outcome)
+            self.sent += 1
+        except (psycopg.Error, PoolTimeout, OSError) as error:
+            logger.info("what became of message %s was not entered: %s", delivery.id, error)
+        except Exception:
+            logger.exception("message %s was not sent and is tried again", delivery.id)
+        finally:
+            self._under_way[endpoint.owner] -= 1
+            if not self._under_way[endpoint.owner]:
+                del self._under_way[endpoint.owner]
+
+
+async def send_due(pool: Pool, allowed_hosts: tuple[str, ...] = ()) -> int:
+    """Send what is due, until nothing is; returns how many messages, whether they arrived or not."""
+    sender = Sender(pool, allowed_hosts)
+    try:
+        while await sender.begin() or sender.is_busy:
+            await sender.wait()
+        return sender.sent
+    finally:
+        await sender.close()
 
 
 def guarded_client(allowed_hosts: tuple[str, ...] = ()) -> httpx.AsyncClient:
@@ -74,17 +133,3 @@ async def send(
     except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
         return Outcome(None, f"The address cannot be reached ({type(error).__name__}).")
     return Outcome(status, None if 200 <= status < 300 else f"The address answered {status}.")
-
-
-async def _send(
-    pool: Pool,
-    client: httpx.AsyncClient,
-    delivery: Delivery,
-    endpoint: Endpoint,
-    allowed_hosts: tuple[str, ...],
-) -> None:
-    outcome = await send(client, delivery, endpoint, allowed_hosts)
-    if not outcome.is_success:
-        logger.info("message %s of webhook %s: %s", delivery.id, endpoint.id, outcome.error)
-    async with pool.connection() as connection:
-        await settle(connection, delivery, outcome)

@@ -6,13 +6,15 @@ from typing import cast
 from pydantic import BaseModel
 
 from engine.light.stage_file import named_files
-from engine.train.config import iteration_count, most_gaussians
+from engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from workers.records.sizes import Sizes
 from workers.work.kinds.demands import Demand
 from workers.work.kinds.estimates import (
     estimate_reconstruction,
     estimate_relight,
     estimate_render,
+    image_bytes,
+    reconstruction_bytes,
     rendered_pixels,
     training_pixels,
 )
@@ -156,8 +158,9 @@ def _reconstruction_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple
     train = asked.train
     pixels = training_pixels(asked, sizes)
     gaussians = most_gaussians(train, pixels)
+    iterations = MOST_PLANNED_ITERATIONS if asked.minutes else iteration_count(train, pixels)
     return (
-        Demand("train.iterations", "iterations", iteration_count(train, pixels)),
+        Demand("train.iterations", "iterations", iterations),
         Demand("train.max_gaussians", "gaussians", gaussians),
         Demand("train.rays", "rays", train.rays),
         Demand("train.probe_rays", "rays", train.probe_rays),
@@ -165,6 +168,7 @@ def _reconstruction_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple
         Demand("train.patch_side", "rays", train.patch_side**2),
         Demand("max_side", "side_px", asked.max_side or 0),
         Demand("exports", "exports", len(asked.exports)),
+        Demand("max_side", "workspace_bytes", reconstruction_bytes(asked, sizes)),
     )
 
 
@@ -172,12 +176,15 @@ def _render_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand,
     asked = cast(RenderJobOptions, options)
     path = "frames" if asked.mode == "turntable" else "max_side"
     pixels = rendered_pixels(asked, sizes)
-    if asked.stage is None:
-        return (Demand(path, "render_pixels", pixels),)
-    paths = pixels * asked.stage.integrator.samples
-    return (
+    always = (
         Demand(path, "render_pixels", pixels),
-        Demand("stage.integrator.samples", "render_paths", paths),
+        Demand("format", "workspace_bytes", image_bytes(asked, sizes)),
+    )
+    if asked.stage is None:
+        return always
+    return (
+        *always,
+        Demand("stage.integrator.samples", "render_paths", pixels * asked.stage.integrator.samples),
     )
 
 
@@ -187,6 +194,7 @@ def _relight_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand
     pixels = rendered_pixels(asked, sizes)
     return (
         Demand(path, "render_pixels", pixels * len(asked.environments)),
+        Demand("format", "workspace_bytes", image_bytes(asked, sizes, len(asked.environments))),
         Demand("samples", "render_paths", pixels * asked.rays),
     )
 

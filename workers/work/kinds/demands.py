@@ -11,6 +11,7 @@ CEILINGS: Mapping[str, str] = {
     "exports": "files",
     "render_pixels": "pixels of all images together",
     "render_paths": "paths of light of all images together",
+    "workspace_bytes": "bytes of disk for its work",
 }
 """Names of the ceilings, as the settings have them with ``max_`` before, and what they count."""
 

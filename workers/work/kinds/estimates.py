@@ -44,6 +44,10 @@ _START_BYTES = 300 << 20
 _RAY_BYTES = 21_000
 _PIXEL_BYTES = 290
 """For a pixel of the largest photograph, when a view is measured; what training needed is free by then."""
+_CACHED_PIXEL_BYTES = 3
+_IMAGE_PIXEL_BYTES = {"exr": 7.0, "png": 0.4, "mp4": 0.4}
+"""The least that a pixel of a rendered image takes on disk, as measured where most of it is empty (28 and 1.1
+where nothing is). Images of a film are kept as PNG until it is written."""
 _CORE_POWER = 0.79
 """Two cores train 1.73 times as fast as one."""
 _TYPICAL_RENDER_GAUSSIANS = 100_000
@@ -57,6 +61,7 @@ class Estimate(BaseModel):
         seconds: by the clock, on so many cores with nothing else to do.
         cores: of the machine that is reckoned with.
         memory_bytes: largest private memory of the job's process.
+        disk_bytes: the least that its folder takes on the worker's disk; 0 where nobody knows.
         finds_poses: whether poses are found first, which takes time that is not in it.
     """
 
@@ -65,6 +70,7 @@ class Estimate(BaseModel):
     cores: int
     memory_bytes: int
     finds_poses: bool = False
+    disk_bytes: int = 0
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -90,17 +96,34 @@ def estimate_reconstruction(
     trained_on = training_pixels(options, photographs)
     iterations = iteration_count(train, trained_on)
     gaussians = _gaussians(train, trained_on)
+    training_cpu_seconds = iterations * train.rays * _ray_cpu_seconds(train, gaussians)
+    if options.minutes is not None:
+        training_cpu_seconds = 60 * options.minutes * max(1, cores) ** _CORE_POWER
     full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
     cpu_seconds = (
         _START_CPU_SECONDS
         + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels
         + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.lift_pixels
         + _EVALUATE_CPU_SECONDS_PER_PIXEL * pixels * held_out
-        + iterations * train.rays * _ray_cpu_seconds(train, gaussians)
+        + training_cpu_seconds
     )
     training = _gaussian_bytes(train.sh_degree) * gaussians + _RAY_BYTES * max(train.rays, train.probe_rays)
     memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
-    return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto")
+    disk = reconstruction_bytes(options, photographs)
+    return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto", disk_bytes=disk)
+
+
+def reconstruction_bytes(options: ReconstructOptions, photographs: Sequence[Sizes]) -> int:
+    """The least that the folder of a reconstruction takes: decoded photographs, and one checkpoint."""
+    shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
+    pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
+    gaussians = _gaussians(options.train, training_pixels(options, photographs))
+    return _CACHED_PIXEL_BYTES * pixels + _checkpoint_bytes(options.train.sh_degree) * gaussians
+
+
+def image_bytes(options: PictureOptions, photographs: Sequence[Sizes], turns: int = 1) -> int:
+    """The least that the images of a render take, in each of so many environments."""
+    return round(_IMAGE_PIXEL_BYTES[options.format] * rendered_pixels(options, photographs) * turns)
 
 
 def training_pixels(options: ReconstructOptions, photographs: Sequence[Sizes]) -> int:
@@ -119,7 +142,7 @@ def estimate_render(options: RenderJobOptions, photographs: Sequence[Sizes], cor
         each += _PATH_CPU_SECONDS * options.stage.integrator.samples
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * pixels
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
-    return _estimate(cpu_seconds, memory, cores)
+    return _estimate(cpu_seconds, memory, cores, disk_bytes=image_bytes(options, photographs))
 
 
 def estimate_relight(options: RelightJobOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
@@ -127,7 +150,8 @@ def estimate_relight(options: RelightJobOptions, photographs: Sequence[Sizes], c
     each = _PATH_CPU_SECONDS * options.rays * (1 if options.by == "path" else 0.5)
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
-    return _estimate(cpu_seconds, memory, cores)
+    disk = image_bytes(options, photographs, len(options.environments))
+    return _estimate(cpu_seconds, memory, cores, disk_bytes=disk)
 
 
 def rendered_pixels(options: PictureOptions, photographs: Sequence[Sizes]) -> int:
@@ -141,13 +165,16 @@ def rendered_pixels(options: PictureOptions, photographs: Sequence[Sizes]) -> in
     return sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
 
 
-def _estimate(cpu_seconds: float, memory_bytes: float, cores: int, *, finds_poses: bool = False) -> Estimate:
+def _estimate(
+    cpu_seconds: float, memory_bytes: float, cores: int, *, finds_poses: bool = False, disk_bytes: int = 0
+) -> Estimate:
     return Estimate(
         cpu_seconds=round(cpu_seconds, 1),
         seconds=round(cpu_seconds / max(1, cores) ** _CORE_POWER, 1),
         cores=max(1, cores),
         memory_bytes=round(memory_bytes),
         finds_poses=finds_poses,
+        disk_bytes=disk_bytes,
     )
 
 
@@ -181,3 +208,8 @@ def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
 def _gaussian_bytes(sh_degree: int) -> int:
     """Parameters, gradients and two moments as float32, and the hierarchy: 789 for degree 2, as measured."""
     return 197 + 16 * (10 + 3 * (sh_degree + 1) ** 2)
+
+
+def _checkpoint_bytes(sh_degree: int) -> int:
+    """Parameters and two moments as float32."""
+    return 12 * (10 + 3 * (sh_degree + 1) ** 2)

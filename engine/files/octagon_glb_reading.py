@@ -1,0 +1,105 @@
+"""The Gaussians of a GLB of octagons, as far as such a file holds them.
+
+Geometry comes from the corners, the radius of an octagon in standard deviations from its texture coordinates,
+colour and opacity from ``COLOR_0``. Harmonics and Gaussians too faint for an octagon are not in the file.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from engine.colour import linear_to_srgb
+from engine.errors import SceneFileError
+from engine.files import gltf
+from engine.files.channel_columns import ChannelChoice, chosen_columns
+from engine.files.encodings import sh0_from_rgb
+from engine.files.gltf import GlbFile
+from engine.gaussians.channels import Channels
+from engine.gaussians.flattening import GaussianCloud
+from engine.gaussians.frames import rotation_matrices
+from engine.gaussians.octagon import SIDES, coordinate_rounding, corner_directions, frames_from_octagons
+from engine.gaussians.rows import join_rows, select_rows
+
+TOLERANCE = 1e-3
+"""Octagons further from a regular one than this, as a share of their size, were edited."""
+UNLIT = "KHR_materials_unlit"
+
+
+def octagon_q(file: GlbFile) -> float | None:
+    """The chi-square quantile of a file's octagons; None where it holds none, or holds them to be lit."""
+    q = file.document.get("asset", {}).get("extras", {}).get("octasplat_q")
+    return float(q) if q is not None and UNLIT in file.document.get("extensionsUsed", []) else None
+
+
+def read_octagons(file: GlbFile, path: Path, q: float, channels: ChannelChoice) -> GaussianCloud:
+    """The Gaussians in the order of their numbers, if the octagons are as they were exported.
+
+    Raises:
+        SceneFileError: they were edited, so that only the scene they came from can bring them back; or there
+            is no such channel.
+        KeyError, IndexError, TypeError, ValueError: the document is damaged.
+    """
+    parts = [_part(file, path, q, channels, *found) for found in file.primitives()]
+    ids = np.concatenate([own for _, own in parts])
+    cloud = select_rows(join_rows([part for part, _ in parts]), np.argsort(ids, kind="stable"))
+    missing = int(file.document["asset"]["extras"].get("octasplat_gaussians", 0)) - len(ids)
+    notes = [f"Left out of its octagons were {missing:,} fainter Gaussians."] if missing > 0 else []
+    return replace(cloud, notes=("It holds one colour of each Gaussian, no harmonics.", *notes))
+
+
+def _part(
+    file: GlbFile,
+    path: Path,
+    q: float,
+    channels: ChannelChoice,
+    matrix: Float64[np.ndarray, "4 4"],
+    primitive: Mapping[str, Any],
+) -> tuple[GaussianCloud, Float32[np.ndarray, " n"]]:
+    """The Gaussians of a primitive, and their numbers in the scene."""
+    attributes = primitive["attributes"]
+    turned = np.diag([1.0, -1.0, -1.0, 1.0]) @ matrix
+    vertices = file.array(attributes["POSITION"], np.float64) @ turned[:3, :3].T + turned[:3, 3]
+    offset = 2.0 * file.array(attributes["TEXCOORD_0"], np.float64) - 1.0
+    if len(vertices) % SIDES or len(offset) != len(vertices):
+        raise _edited(path)
+    corners = vertices.astype(np.float32).reshape(-1, SIDES, 3)
+    offset = offset.reshape(-1, SIDES, 2)
+    share = np.linalg.norm(offset, axis=2).mean(axis=1)
+    if np.abs(offset - share[:, None, None] * corner_directions()).max(initial=0.0) > TOLERANCE:
+        raise _edited(path)
+    radii = (share * np.sqrt(q)).astype(np.float32)
+    means, quats, log_scales, good = frames_from_octagons(corners, radii)
+    legs = rotation_matrices(quats.astype(np.float64))[:, :, 1:] * np.exp(log_scales)[:, None, :]
+    again = means[:, None] + np.einsum("kc,nic->nki", corner_directions(), legs * radii[:, None, None])
+    size = np.linalg.norm(corners - means[:, None], axis=2).max(axis=1)
+    off = np.linalg.norm(corners - again, axis=2).max(axis=1)
+    if not good.all() or (off > TOLERANCE * size + 4.0 * coordinate_rounding(corners)).any():
+        raise _edited(path)
+    rgba = file.array(attributes["COLOR_0"], np.float32)[::SIDES]
+    with np.errstate(divide="ignore"):
+        logits = np.log(rgba[:, 3].astype(np.float64)) - np.log1p(-rgba[:, 3].astype(np.float64))
+    columns = {name[1:].lower(): number for name, number in attributes.items() if name[0] == "_"}
+    wanted = chosen_columns(path, gltf.declared_channels(file.document), columns, channels)
+    named = {
+        name: np.concatenate([file.array(columns[column], np.float32)[::SIDES] for column in own], axis=1)
+        for name, own in wanted.items()
+    }
+    ids = np.arange(len(corners), dtype=np.float32)
+    if "_GID" in attributes:
+        ids = file.array(attributes["_GID"], np.float32)[::SIDES, 0]
+    cloud = GaussianCloud(
+        means, quats, log_scales, logits.astype(np.float32), sh0_from_rgb(linear_to_srgb(rgba[:, :3])),
+        channels=Channels(named),
+    )  # fmt: skip
+    return cloud, ids
+
+
+def _edited(path: Path) -> SceneFileError:
+    return SceneFileError(
+        f"{path}: its octagons are not as they were exported; bring them back with octasplat edit --mesh, "
+        "which needs the scene that they came from."
+    )

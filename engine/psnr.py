@@ -1,0 +1,52 @@
+"""How near a picture comes to another: PSNR, as it is and with the exposure left out."""
+
+import numpy as np
+from jaxtyping import Float32
+
+
+def psnr(
+    render: Float32[np.ndarray, "*shape 3"],
+    reference: Float32[np.ndarray, "*shape 3"],
+    weight: Float32[np.ndarray, "*shape"] | None = None,
+) -> float:
+    """Peak signal-to-noise ratio in dB, for a peak of 1.
+
+    Args:
+        render: Display values.
+        reference: Display values.
+        weight: How much each pixel counts, 0 for invalid; ``None`` counts all alike.
+
+    Returns:
+        The PSNR; infinite for images that agree wherever they count, not-a-number when no pixel counts.
+    """
+    squared = np.square(render.astype(np.float64) - reference).mean(axis=-1)
+    if weight is None:
+        error = float(squared.mean())
+    else:
+        total = float(weight.sum(dtype=np.float64))
+        if total <= 0:
+            return float("nan")
+        error = float((squared * weight).sum()) / total
+    return float("inf") if error == 0 else float(-10.0 * np.log10(error))
+
+
+def colour_corrected(
+    render: Float32[np.ndarray, "*shape 3"],
+    reference: Float32[np.ndarray, "*shape 3"],
+    weight: Float32[np.ndarray, "*shape"],
+) -> Float32[np.ndarray, "*shape 3"]:
+    """The render under the gain and offset of each channel that come closest to the reference.
+
+    Weighted least squares, then cut to [0, 1]; without a pixel that counts, the render as it is.
+    """
+    corrected = render.copy()
+    if weight.sum(dtype=np.float64) <= 0:
+        return corrected
+    for channel in range(3):
+        x, y = render[..., channel].astype(np.float64), reference[..., channel].astype(np.float64)
+        x_mean, y_mean = np.average(x, weights=weight), np.average(y, weights=weight)
+        x -= x_mean
+        variance = np.average(x * x, weights=weight)
+        gain = np.average(x * (y - y_mean), weights=weight) / variance if variance > 0 else 0.0
+        corrected[..., channel] = np.clip(gain * x + y_mean, 0.0, 1.0)
+    return corrected

@@ -1,0 +1,223 @@
+"""How well each photograph fits the scene, and those that do not fit what the others show.
+
+A photograph whose pose is wrong is rendered as something else, whether it was trained on or not, while its
+neighbours are rendered well.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from engine.colour import composited
+from engine.psnr import colour_corrected, psnr
+from engine.scene import View
+from engine.shading.protocol import ShadingModel, Sight
+from engine.trace.protocol import Tracer
+from engine.train.batches import TrainingData, still_background, view_sizes_px
+from engine.train.config import TrainConfig
+
+TILES, TILE_PX = 3, 8
+"""A view is measured on a grid of ``TILES * TILE_PX`` pixels each way, traced in tiles of neighbours."""
+VIEWS_AT_ONCE = 64
+LEAST_VIEWS = 6
+"""Among fewer views nobody can say which of them is odd."""
+NEIGHBOURS = 8
+MOST_DB = 100.0
+"""A view that is shown without an error counts as so many."""
+FAR_BELOW_DB, FAR_BELOW_SIGMAS = 3.0, 5.0
+"""A view that is so much worse than those around it, also in robust standard deviations, is misplaced."""
+MOST_LEFT_OUT = 0.25
+"""No larger share of the training views is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFits:
+    """How well views are rendered, each on a fixed grid of its pixels, as new views are.
+
+    Attributes:
+        indices: the views.
+        psnr: dB; not-a-number where a mask leaves nothing.
+        psnr_colour_corrected: dB, after the gain and offset of each channel that fit best.
+    """
+
+    indices: Int64[np.ndarray, " v"]
+    psnr: Float64[np.ndarray, " v"]
+    psnr_colour_corrected: Float64[np.ndarray, " v"]
+
+
+def view_fits(
+    dataset: TrainingData,
+    indices: Int64[np.ndarray, " v"],
+    config: TrainConfig,
+    tracer: Tracer,
+    shading: ShadingModel,
+) -> ViewFits:
+    """Measure the Gaussians that ``tracer`` holds on the views ``indices``; changes nothing."""
+    plain, corrected = [], []
+    for start in range(0, len(indices), VIEWS_AT_ONCE):
+        some = indices[start : start + VIEWS_AT_ONCE]
+        view, y, x = _grid(some, view_sizes_px(dataset))
+        rays = dataset.rays(view, y, x)
+        rgb, alpha, weight = dataset.pixels(view, y, x)
+        background = still_background(config)
+        developed = shading.develop(Sight(rays, tracer.trace(rays), tracer))
+        render = np.clip(developed.over(background), 0, 1)
+        target = composited(rgb, alpha, background)
+        shape, counts = (len(some), -1, 3), (weight > 0).astype(np.float32)
+        for shown, photograph, valid in zip(
+            render.reshape(shape), target.reshape(shape), counts.reshape(len(some), -1), strict=True
+        ):
+            plain.append(psnr(shown, photograph, valid))
+            corrected.append(psnr(colour_corrected(shown, photograph, valid), photograph, valid))
+    return ViewFits(indices, *(np.minimum(values, MOST_DB) for values in (plain, corrected)))
+
+
+def misfits(
+    fits: ViewFits, views: Sequence[View], train_indices: Int64[np.ndarray, " t"]
+) -> Int64[np.ndarray, " m"]:
+    """The views that are rendered far worse than the training views around them, worst first.
+
+    Each is compared with the middle of its neighbours, so that a part of the scene that is hard to learn is
+    not taken for wrong poses; how much that difference varies among the training views says what is far.
+    Held-out views are as a rule worse than their neighbours and are taken as such. Exposure does not count.
+
+    Args:
+        fits: of views, training views among them.
+        views: all views of the dataset.
+        train_indices: views that are trained on.
+    """
+    known = np.isfinite(fits.psnr_colour_corrected)
+    indices, psnr = fits.indices[known], fits.psnr_colour_corrected[known]
+    trained = np.isin(indices, train_indices)
+    if int(trained.sum()) < LEAST_VIEWS:
+        return np.zeros(0, np.int64)
+    low = np.zeros(len(indices), np.bool_)
+    below = np.zeros(len(indices))
+    for _ in range(2):  # the second time without those that the first found as neighbours
+        above = psnr - _around(indices, psnr, trained & ~low, views)
+        usual = float(np.median(above[trained]))
+        sigma = 1.4826 * float(np.median(np.abs(above[trained] - usual)))
+        below = usual - above
+        if not trained.all():
+            below[~trained] -= max(0.0, float(np.median(below[~trained])))
+        low = below > max(FAR_BELOW_DB, FAR_BELOW_SIGMAS * sigma)
+    worst_first = np.argsort(-below, kind="stable")
+    return indices[worst_first[low[worst_first]]]
+
+
+def _around(
+    indices: Int64[np.ndarray, " v"],
+    psnr: Float64[np.ndarray, " v"],
+    counts: Bool[np.ndarray, " v"],
+    views: Sequence[View],
+) -> Float64[np.ndarray, " v"]:
+    """The middle of the PSNR of the nearest views of each among those that count, dB.
+
+    Near are views from near places that look the same way.
+    """
+    origins = np.stack([views[i].origin_world for i in indices.tolist()])
+    forward = np.stack([views[i].rotation_cam_from_world[2] for i in indices.tolist()])
+    away = np.linalg.norm(origins[:, None] - origins, axis=2)
+    away = away / max(float(np.median(away)), 1e-12) + (1 - forward @ forward.T)
+    away[:, ~counts] = np.inf
+    np.fill_diagonal(away, np.inf)
+    others = min(NEIGHBOURS, int(counts.sum()) - 1)
+    nearest = np.argsort(away, axis=1, kind="stable")[:, :others]
+    return np.asarray(np.median(psnr[nearest], axis=1))
+
+
+def _grid(
+    indices: Int64[np.ndarray, " v"], sizes_px: Int64[np.ndarray, "n 2"]
+) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+    """The measured pixels (view, y, x) of views, tile by tile."""
+    side = TILES * TILE_PX
+    order = np.arange(side * side).reshape(TILES, TILES, TILE_PX, TILE_PX)
+    tile_y, tile_x, y, x = np.unravel_index(np.arange(order.size), order.shape)
+    down, across = tile_y * TILE_PX + y + 0.5, tile_x * TILE_PX + x + 0.5
+    width, height = sizes_px[indices].T
+    rows = (down * height[:, None] / side).astype(np.int64)
+    columns = (across * width[:, None] / side).astype(np.int64)
+    view = np.broadcast_to(indices[:, None], rows.shape)
+    return view.reshape(-1), rows.reshape(-1), columns.reshape(-1)
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """How the training ended for its views, see :class:`ViewFits`.
+
+    Attributes:
+        psnr: dB, by name, of the views that were trained on to the end.
+        misfits: names of views that do not fit the others, worst first, held-out ones and those left out too.
+        left_out: names of those that were left out of the training.
+    """
+
+    psnr: dict[str, float]
+    misfits: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready, with the mean and the worst view."""
+        known = {name: round(value, 4) for name, value in self.psnr.items() if np.isfinite(value)}
+        worst = min(known, key=lambda name: known[name], default=None)
+        return {
+            "psnr": float(np.mean(list(known.values()))) if known else None,
+            "worst": worst,
+            "worst_psnr": None if worst is None else known[worst],
+            "misfits": list(self.misfits),
+            "left_out": list(self.left_out),
+            "views": known,
+        }
+
+    def complaint(self) -> str | None:
+        """What the user should know."""
+        loose = [name for name in self.misfits if name not in self.left_out]
+        if not loose:
+            return None
+        which = "This photograph does" if len(loose) == 1 else f"These {len(loose)} photographs do"
+        its = "its pose" if len(loose) == 1 else "their poses"
+        return (
+            f"{which} not fit the others; {its} may be wrong, or the picture blurred: {', '.join(loose)}. "
+            "The setting leave_out_misfits trains without such photographs."
+        )
+
+
+class ViewJudge:
+    """Looks for views that do not fit.
+
+    Args:
+        dataset: the photographs.
+        config: says what is behind them.
+    """
+
+    def __init__(self, dataset: TrainingData, config: TrainConfig) -> None:
+        self._dataset = dataset
+        self._config = config
+
+    def misfits(
+        self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " k"]
+    ) -> Int64[np.ndarray, " m"]:
+        """Training views to leave out besides others, as the Gaussians that ``tracer`` holds show them."""
+        train = self._dataset.train_indices
+        used = np.setdiff1d(train, left_out)
+        fits = view_fits(self._dataset, used, self._config, tracer, shading)
+        room = int(MOST_LEFT_OUT * len(train)) - len(left_out)
+        return np.sort(misfits(fits, self._dataset.views, used)[: max(0, room)])
+
+    def conclude(
+        self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " m"]
+    ) -> TrainingViews:
+        """How well the finished Gaussians, which ``tracer`` holds, show the views."""
+        dataset = self._dataset
+        used = np.setdiff1d(dataset.train_indices, left_out)
+        indices = np.concatenate([used, dataset.test_indices])
+        fits = view_fits(dataset, indices, self._config, tracer, shading)
+        found = misfits(fits, dataset.views, used)
+        names = [view.name for view in dataset.views]
+        psnr = dict(zip(fits.indices.tolist(), fits.psnr.tolist(), strict=True))
+        return TrainingViews(
+            psnr={names[i]: psnr[i] for i in used.tolist()},
+            misfits=tuple(names[i] for i in [*found.tolist(), *left_out.tolist()]),
+            left_out=tuple(names[i] for i in left_out.tolist()),
+        )

@@ -1,0 +1,27 @@
+"""Who did what."""
+
+from fastapi import APIRouter, Request, Response
+
+from service.actions.audit import list_entries
+from service.auth import Admin
+from service.paging import Cursor, Limit, next_cursor, read_number_cursor
+from service.routes import problems
+from service.schemas.audit import AuditPage, AuditView
+from service.state import ServiceDep
+
+router = APIRouter(prefix="/v1/audit", tags=["service"])
+
+
+@router.get("", responses=problems())
+async def get_audit(
+    _who: Admin, service: ServiceDep, request: Request, response: Response, limit: Limit = 50,
+    cursor: Cursor = None,
+) -> AuditPage:  # fmt: skip
+    """Changes that were asked for, by whom and with what outcome, the newest first.
+
+    Single files of datasets are not listed, their commits are; of wrong tokens the first of each address.
+    """
+    part = await list_entries(service, before=read_number_cursor(cursor), limit=limit)
+    following = next_cursor(request, response, part.following)
+    views = [AuditView.model_validate(row, from_attributes=True) for row in part.rows]
+    return AuditPage(entries=views, next=following)

@@ -1,0 +1,58 @@
+"""A job is followed to its end although the service is away for a while."""
+
+import json
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from workers.client import api
+from workers.client.watch import watch_job
+
+
+class Front(BaseHTTPRequestHandler):
+    """Ends each stream of events after one, as one that is stopped does; in the end the job is over."""
+
+    state = "running"
+
+    def do_GET(self) -> None:
+        body = b'id: 1\nevent: state\ndata: {"state": "running"}\n\n'
+        if not self.path.endswith("/events"):
+            body = json.dumps({"state": self.state}).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_arguments: object) -> None: ...
+
+
+def serving(address: tuple[str, int]) -> ThreadingHTTPServer:
+    server = ThreadingHTTPServer(address, Front)
+    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+    return server
+
+
+def test_a_service_may_be_away_for_longer_than_one_request_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api, "TRIES", 2)
+    server = serving(("127.0.0.1", 0))
+    host, port = server.server_address[0], server.server_address[1]
+    found: list[str] = []
+    with api.Api(f"http://127.0.0.1:{port}") as client:
+
+        def watch() -> None:
+            found.append(watch_job(client, "x", lambda _event: None, lambda _state: None)["state"])
+
+        watching = threading.Thread(target=watch, daemon=True)
+        watching.start()
+        server.shutdown()
+        server.server_close()
+        time.sleep(2.5)
+        assert watching.is_alive()
+        monkeypatch.setattr(Front, "state", "succeeded")
+        server = serving((str(host), int(port)))
+        watching.join(120)
+        server.shutdown()
+        server.server_close()
+    assert found == ["succeeded"]

@@ -1,0 +1,112 @@
+"""A backup made while the service runs, restored elsewhere: everything is there and goes on."""
+
+import asyncio
+import os
+import subprocess
+import sys
+import uuid
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from postgres_for_tests import EmbeddedPostgres, copied_database
+from service_bench import claimed, committed_dataset, running, stored, with_token
+from worker_bench import Bench
+
+from service.state import Service
+from workers.queue.attempts import Result
+
+sys.path.append(str(Path(__file__).parents[1] / "intake"))
+from model_builder import photograph
+
+ROOT = Path(__file__).parents[2]
+
+
+def octasplat(conninfo: str, data: Path, *arguments: object) -> "subprocess.CompletedProcess[str]":
+    environment = {
+        **os.environ,
+        "DATABASE_URL": conninfo,
+        "OCTASPLAT_DATA": str(data),
+        "OCTASPLAT_STORAGE": str(data / "store"),
+        "OCTASPLAT_FLOOR_BYTES": "0",
+    }
+    command = [sys.executable, "-m", "workers", *map(str, arguments)]
+    return subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def test_a_service_restored_elsewhere_goes_on(
+    conninfo: str, postgres: EmbeddedPostgres, template: str, tmp_path: Path
+) -> None:
+    backup, here, there = tmp_path / "backup", tmp_path / "here", tmp_path / "there"
+    made: dict[str, Any] = {}
+
+    async def before(http: httpx.AsyncClient, service: Service) -> None:
+        made["headers"] = await with_token(service, "me", "write")
+        http.headers.update(made["headers"])
+        made["dataset"] = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
+        address = f"{made['dataset']}/files/images/a.png"
+        assert (await http.put(address, content=photograph())).status_code == 201
+        scene = await committed_dataset(service, "me")
+        body = {"dataset_id": scene, "kind": "toy", "options": {"steps": 3, "seconds": 0.0}}
+        done, under_way, queued = [(await http.post("/v1/jobs", json=body)).json() for _ in range(3)]
+        attempt = await claimed(service, done)
+        result = Result("a.txt", stored(service, b"a result"), 8, "text/plain")
+        await attempt.succeed([result])
+        await claimed(service, under_way)
+        made["jobs"] = [job["id"] for job in (done, under_way, queued)]
+        for again in range(2):
+            saved = await asyncio.to_thread(octasplat, conninfo, here, "backup", backup)
+            assert saved.returncode == 0, saved.stderr
+            stored(service, f"named by nothing {again}".encode())
+        # What happens afterwards is not in it.
+        assert (await http.delete(made["dataset"])).status_code == 204
+        made["usage"] = (len(list((backup / "store").rglob("*"))), len(list(backup.glob("tables-*"))))
+
+    async def after(http: httpx.AsyncClient, service: Service) -> None:
+        assert (await http.get("/v1/jobs")).status_code == 401
+        http.headers.update(made["headers"])
+        answer = await http.get(f"{made['dataset']}/files/images/a.png")
+        assert answer.content == photograph()
+        done, *others = made["jobs"]
+        assert (await http.get(f"/v1/jobs/{done}/artifacts/a.txt")).content == b"a result"
+        assert [(await http.get(f"/v1/jobs/{job}")).json()["state"] for job in others] == ["queued"] * 2
+        body = {"dataset_id": (await http.get(f"/v1/jobs/{done}")).json()["dataset_id"], "kind": "toy"}
+        new = (await http.post("/v1/jobs", json={**body, "options": {"steps": 3, "seconds": 0.0}})).json()
+        made["jobs"].append(new["id"])
+
+    async def talk(database: str, folder: Path, conversation: Any) -> None:
+        async with running(database, folder) as (http, service):
+            await conversation(http, service)
+
+    asyncio.run(talk(conninfo, here, before))
+    assert made["usage"][1] == 1
+    with copied_database(postgres, "template1") as elsewhere:
+        restored = octasplat(elsewhere, there, "restore", backup)
+        assert restored.returncode == 0, restored.stderr
+        again = octasplat(elsewhere, there, "restore", backup)
+        assert again.returncode == 1 and "not empty" in again.stderr and again.stderr.count("\n") == 1
+        assert octasplat(elsewhere, there, "fsck").returncode == 0
+        asyncio.run(talk(elsewhere, there, after))
+        bench = Bench(elsewhere, there)
+        try:
+            bench.worker(STALE_SECONDS="10")
+            for job in made["jobs"][1:]:
+                row = bench.over(uuid.UUID(job))
+                assert (row.state, row.rescues) == ("succeeded", 0)
+                assert bench.results(row.id)["sum.txt"] == b"6"
+        finally:
+            bench.close()
+
+
+@pytest.mark.parametrize("folder", ["nothing", "other"])
+def test_what_is_no_backup_is_refused(conninfo: str, tmp_path: Path, folder: str) -> None:
+    (tmp_path / "nothing").mkdir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "a.txt").write_text("mine")
+    answer = octasplat(conninfo, tmp_path / "data", "restore", tmp_path / folder)
+    assert answer.returncode == 1 and "holds no backup" in answer.stderr and answer.stderr.count("\n") == 1
+    if folder == "other":
+        answer = octasplat(conninfo, tmp_path / "data", "backup", tmp_path / folder)
+        assert answer.returncode == 1 and "no backup" in answer.stderr
+        assert [path.name for path in (tmp_path / "other").iterdir()] == ["a.txt"]

@@ -1,0 +1,120 @@
+"""Requests that meet each other get an answer that fits, never a fault of the service."""
+
+import asyncio
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from service_bench import claimed, committed_dataset, running, stored
+
+sys.path.append(str(Path(__file__).parents[1] / "intake"))
+from model_builder import photograph
+
+from service.actions import datasets as actions
+from service.intake.dataset import DatasetSummary
+from service.state import Service
+from workers.queue.attempts import Result
+
+ROUNDS = 12
+
+
+@pytest.fixture
+def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
+    def run(conversation: Any, **settings: Any) -> None:
+        async def whole() -> None:
+            async with running(conninfo, tmp_path, **settings) as (http, service):
+                await conversation(http, service)
+
+        asyncio.run(whole())
+
+    return run
+
+
+async def new_dataset(http: httpx.AsyncClient) -> str:
+    return str((await http.post("/v1/datasets", json={"name": "d"})).headers["Location"])
+
+
+def statuses(answers: list[httpx.Response]) -> list[int]:
+    return sorted(answer.status_code for answer in answers)
+
+
+def test_deletions_and_uploads_at_once(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        for _ in range(ROUNDS):
+            dataset = await new_dataset(http)
+            address = f"{dataset}/files/images/a.png"
+            await http.put(address, content=photograph())
+            requests = [
+                http.delete(dataset),
+                http.delete(dataset),
+                http.put(f"{dataset}/files/images/b.png", content=photograph()),
+                http.patch(dataset, json={"name": "e"}),
+                http.delete(address),
+            ]
+            answers = await asyncio.gather(*requests)
+            assert {answer.status_code for answer in answers} <= {200, 201, 204, 404, 409}, answers
+            assert 204 in {answer.status_code for answer in answers}
+
+    talk(conversation)
+
+
+def test_a_dataset_cannot_be_deleted_while_it_is_checked(
+    talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def conversation(http: httpx.AsyncClient, _: Service) -> None:
+        dataset = await new_dataset(http)
+        loop, begun, go_on = asyncio.get_running_loop(), asyncio.Event(), asyncio.Event()
+
+        def check(*_: object) -> DatasetSummary:
+            loop.call_soon_threadsafe(begun.set)
+            asyncio.run_coroutine_threadsafe(go_on.wait(), loop).result(60)
+            return DatasetSummary(photographs=3, pixels=1, size_bytes=1, masks=0, has_model=False)
+
+        monkeypatch.setattr(actions, "check_dataset", check)
+        commit = asyncio.create_task(http.post(f"{dataset}/commit"))
+        await begun.wait()
+        assert statuses([await http.delete(dataset), await http.post(f"{dataset}/commit")]) == [409, 409]
+        go_on.set()
+        assert (await commit).status_code == 200
+        assert (await http.delete(dataset)).status_code == 204
+
+    talk(conversation)
+
+
+def test_a_job_deleted_by_several_at_once(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = await committed_dataset(service)
+        for _ in range(ROUNDS):
+            job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "toy"})).json()
+            address = f"/v1/jobs/{job['id']}"
+            answers = await asyncio.gather(
+                http.delete(address, params={"cancel": True}),
+                http.delete(address, params={"cancel": True}),
+                http.post(f"{address}/cancel"),
+                http.patch(address, json={"label": "x"}),
+            )
+            assert {answer.status_code for answer in answers} <= {200, 202, 204, 404, 409}, answers
+            again = await http.delete(address)
+            assert again.status_code in (204, 404)
+
+    talk(conversation)
+
+
+def test_ranges_with_thousands_of_digits(talk: Callable[..., None], s3_address: str, s3_bucket: str) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = await committed_dataset(service)
+        job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "kind": "toy"})).json()
+        sha256 = stored(service, b"0123456789")
+        attempt = await claimed(service, job)
+        await attempt.succeed([Result("a.bin", sha256, 10, "application/octet-stream")])
+        address = f"/v1/jobs/{job['id']}/artifacts/a.bin"
+        for asked in (f"bytes={'9' * 5000}-", f"bytes=-{'9' * 5000}", f"bytes=0-{'9' * 5000}"):
+            answer = await http.get(address, headers={"Range": asked})
+            assert answer.status_code in (200, 206, 400, 416)
+        assert (await http.get(address, headers={"Range": "bytes=2-4"})).content == b"234"
+
+    talk(conversation, storage=f"s3://{s3_bucket}/some?endpoint_url={s3_address}")
+    talk(conversation)

@@ -1,0 +1,79 @@
+"""Photographs whose poses are wrong are found, named, and left out where that is asked for."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from engine.config import resolve_config
+from engine.errors import Cancelled
+from engine.events import CheckpointWritten, Event, Warned
+from engine.pipeline import reconstruct
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+
+SPOILED = ["view_005.png", "view_018.png"]
+SETTINGS = (
+    "iterations=300", "rays=2048", "max_gaussians=1000", "checkpoint_every=50", "probe_rays=512",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A generated scene in which two photographs have each other's poses."""
+    root = tmp_path_factory.mktemp("spoiled") / "scene"
+    write_generated_scene(
+        root, GeneratedSceneConfig(views=32, width_px=64, height_px=48, samples_per_side=2, points=1500)
+    )
+    one, other = (root / "images" / name for name in SPOILED)
+    first = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(first)
+    return root
+
+
+def run(
+    scene: Path, output: Path, *more: str, should_stop: Callable[[list[Event]], bool] = lambda _events: False
+) -> list[str]:
+    """The warnings of a run."""
+    config = resolve_config("fast", settings={"exports": ()}, assignments=[*SETTINGS, *more])
+    events: list[Event] = []
+    reconstruct(
+        scene, output, config, resume=True, threads=1,
+        listener=events.append, should_stop=lambda: should_stop(events),
+    )  # fmt: skip
+    return [event.message for event in events if isinstance(event, Warned)]
+
+
+def measured(output: Path) -> tuple[dict, float]:
+    training = json.loads((output / "training.json").read_text())["training_views"]
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["training_views"] == training
+    return training, metrics["mean"]["psnr"]
+
+
+def test_exactly_those_of_wrong_poses_are_named_and_left_out(scene: Path, tmp_path: Path) -> None:
+    told = run(scene, tmp_path / "all")
+    with_all, psnr = measured(tmp_path / "all")
+    assert sorted(with_all["misfits"]) == SPOILED
+    assert with_all["left_out"] == [] and len(with_all["views"]) == 28
+    assert any("do not fit the others" in text and all(n in text for n in SPOILED) for text in told)
+    assert with_all["worst"] in SPOILED
+    assert f"dB: {with_all['worst']}" in (tmp_path / "all" / "report.html").read_text()
+
+    told = run(scene, tmp_path / "without", "leave_out_misfits=true")
+    without, better = measured(tmp_path / "without")
+    assert without["left_out"] == SPOILED and len(without["views"]) == 26
+    left = [text for text in told if text.startswith("From iteration ")]
+    assert left and all(any(name in text for text in left) for name in SPOILED)
+    assert not any("do not fit the others;" in text for text in told)  # they are not trained on any more
+    assert better > psnr
+
+    def stop_behind_it(events: list[Event]) -> bool:
+        return any(isinstance(event, CheckpointWritten) and event.iteration == 100 for event in events)
+
+    with pytest.raises(Cancelled):
+        run(scene, tmp_path / "stopped", "leave_out_misfits=true", should_stop=stop_behind_it)
+    run(scene, tmp_path / "stopped", "leave_out_misfits=true")
+    for name in ("scene.ply", "renders/view_008.png"):
+        assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "without" / name).read_bytes()

@@ -1,0 +1,83 @@
+"""Nothing stays nearer to a camera than what its photograph can show."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flat_world import FlatWorld, small_config
+
+from engine.gaussians.model import FlatGaussians, concatenate
+from engine.scene.cameras import Camera
+from engine.scene.model import PosedView, SparsePoints, Viewpoints
+from engine.scene.near import NearZones, nearest_depths
+from engine.train.state import fresh_state
+from engine.train.trainer import Trainer
+
+WIDE = Camera("OPENCV", (50.0, 50.0, 40.0, 40.0, -0.2, 0.0, 0.0, 0.0), 80, 80)
+PINHOLE = Camera("PINHOLE", (40.0, 40.0, 20.0, 20.0), 40, 40)
+
+
+def cloud(points: np.ndarray) -> SparsePoints:
+    n = len(points)
+    return SparsePoints(
+        points.astype(np.float32),
+        np.zeros((n, 3), np.float32),
+        np.full(n, 3, np.int32),
+        np.zeros(n, np.float32),
+    )
+
+
+def seen_from(*positions: tuple[float, float, float]) -> Viewpoints:
+    """Views that look along z: all through the pinhole, the last through the wide lens."""
+    last = len(positions) - 1
+    views = tuple(
+        PosedView(f"{k}.png", int(k == last), np.eye(3), -np.array(position, np.float64), 40, 40)
+        for k, position in enumerate(positions)
+    )
+    return Viewpoints(views, (PINHOLE, WIDE))
+
+
+def test_depths_begin_where_the_sparse_points_do() -> None:
+    rng = np.random.default_rng(0)
+    wall = np.concatenate([rng.uniform(-3, 3, (2000, 2)), np.full((2000, 1), 4.0)], axis=1)
+    strays = np.array([[0.0, 0.0, 0.2]] * 5 + [[0.0, 0.0, -1.0]])
+    scene = seen_from((0, 0, 0), (0, 0, 1), (90, 0, 0), (0, 0, 2))
+    found = nearest_depths(scene, cloud(np.concatenate([wall, strays])))
+    assert found == pytest.approx([4.0, 3.0, 0.0, 2.0], abs=1e-6)
+
+
+def test_a_zone_is_the_near_end_of_a_views_pyramid() -> None:
+    scene = seen_from((0, 0, 0), (10, 0, 0))
+    zones = NearZones.of(scene, np.array([1.0, 2.0]), np.arange(2))
+    points = [
+        (0.0, 0.0, 0.5), (0.2, -0.2, 0.45), (0.3, 0.0, 0.5), (0.0, 0.0, 1.01), (0.0, 0.0, -0.5),
+        (10.0, 0.0, 1.9), (10.0, 0.0, 2.1), (10 + 1.9, 0.0, 0.1),
+    ]  # fmt: skip
+    expected = [True, True, False, False, False, True, False, False]
+    assert zones.holds(np.array(points)).tolist() == expected
+    assert not NearZones.of(scene, np.zeros(2), np.arange(2)).holds(np.array(points)).any()
+
+
+def test_a_cloud_before_a_camera_does_not_outlive_the_training(tmp_path: Path) -> None:
+    world = FlatWorld()
+    veil = world.start(60, opacity=0.9)
+    veil.means_world = (
+        world.origins[3] + [0, 0, 0.4] + np.random.default_rng(4).normal(0, 0.05, (60, 3))
+    ).astype(np.float32)
+    zones = NearZones(world.views, (Camera("PINHOLE", (40.0, 40.0, 20.0, 20.0), 40, 40),), np.full(7, 1.0))
+
+    def trained(near_zones: NearZones | None) -> tuple[FlatGaussians, Trainer]:
+        trainer = Trainer(
+            world, small_config(), fresh_state(concatenate([world.start(), veil]), 0),
+            folder=tmp_path, fingerprint="test", listener=lambda _event: None, threads=1,
+            near_zones=near_zones,
+        )  # fmt: skip
+        return trainer.run(), trainer
+
+    cleared, trainer = trained(zones)
+    assert not zones.holds(cleared.means_world).any()
+    assert trainer.state.taken_near >= 30
+    left, without = trained(None)
+    assert zones.holds(left.means_world).any()
+    assert trainer.views is not None and without.views is not None
+    assert trainer.views.psnr["3.png"] > without.views.psnr["3.png"]

@@ -1,0 +1,164 @@
+"""While a service is brought up to date, two versions of it work side by side and lose nothing."""
+
+import io
+import os
+import subprocess
+import sys
+import tarfile
+import time
+import urllib.request
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from postgres_for_tests import copied_database
+from worker_bench import PATIENCE_SECONDS, ROOT, Bench
+
+from workers.postgres.embedded import EmbeddedPostgres
+from workers.queue.jobs import NewJob, cancel_job, create_job
+from workers.queue.procrastinate_slips import ProcrastinateSlips
+from workers.records.database import Connection
+from workers.records.migrate import migrate
+
+PREVIOUS = "8a6786e625c3"
+"""The commit of the release before this one; it is installed from the repository."""
+STALE_SECONDS = 6.0
+"""After which others take a dead worker's jobs, and by half of which a busy machine does not hold one up."""
+
+
+@pytest.fixture
+def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def previous(tmp_path: Path) -> Path:
+    """The folder of the release before this one."""
+    folder = tmp_path / "previous"
+    command = ["git", "archive", PREVIOUS, "engine", "workers", "service", "tests/work"]
+    try:
+        made = subprocess.run(command, cwd=ROOT, capture_output=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip(f"the commit {PREVIOUS} is not here")
+    with tarfile.open(fileobj=io.BytesIO(made.stdout)) as archive:
+        archive.extractall(folder, filter="data")
+    return folder
+
+
+async def submit_many(connection: Connection) -> list[uuid.UUID]:
+    """Jobs of others, of a kind that only a later version knows."""
+    new = NewJob(owner="you", kind="later", options={"steps": 3}, queue="cpu")
+    return [(await create_job(connection, ProcrastinateSlips(), new)).id for _ in range(16)]
+
+
+async def cancel_many(connection: Connection, jobs: list[uuid.UUID]) -> None:
+    for job_id in jobs:
+        await cancel_job(connection, ProcrastinateSlips(), job_id)
+
+
+def starts(bench: Bench, job_id: object) -> list[int]:
+    """The steps at which the attempts of a finished job began."""
+    return [int(line) for line in bench.results(job_id)["history.txt"].split()]  # type: ignore[arg-type]
+
+
+def test_what_a_worker_does_not_know_it_leaves_to_a_newer_one(bench: Bench) -> None:
+    old = bench.worker(name="old", STALE_SECONDS="60")
+    bench.up("old")
+    many = bench.do(submit_many)
+    later = bench.submit("later", options={"steps": 3})
+    shaded = bench.submit(options={"steps": 3, "shade": 0.5})
+    plain = bench.submit(options={"steps": 3})
+    assert bench.over(plain).worker == "old"  # what it knows it does meanwhile
+    deadline = time.monotonic() + PATIENCE_SECONDS
+    while (bench.folder / "old.log").read_text().count("leaves job") < len(many) + 2:
+        assert time.monotonic() < deadline, bench.worker_logs()
+        time.sleep(0.05)
+    bench.do(lambda connection: cancel_many(connection, many))
+    for job_id in (later, shaded):
+        job = bench.job(job_id)
+        assert (job.state, job.attempt, job.rescues) == ("queued", 0, 0)
+        assert [event.kind for event in bench.events(job_id)] == ["state"]
+    old.terminate()
+    assert old.wait(PATIENCE_SECONDS) == 0
+    bench.worker(name="new", STALE_SECONDS="60", KIND_MODULES='["later_toy"]')
+    for job_id in (later, shaded):
+        job = bench.over(job_id)
+        assert (job.state, job.attempt, job.rescues, job.worker) == ("succeeded", 1, 0, "new")
+
+
+def test_versions_that_give_other_results_are_not_mixed(bench: Bench) -> None:
+    first = bench.worker(name="first")
+    job_id = bench.submit(options=bench.held())
+    bench.wait_at_gate(job_id)
+    bench.worker(name="later", KIND_MODULES='["later_results"]')
+    second = bench.worker(name="second")
+    for name in ("later", "second"):
+        bench.up(name)
+    first.kill()
+    bench.wait(job_id, lambda job: job.worker == "second")  # the one that can go on with it
+    bench.wait(job_id, lambda _job: "the toy begins at 30" in bench.log(job_id))
+    second.kill()
+    bench.wait(job_id, lambda job: job.worker == "later")
+    bench.open_gate()
+    assert bench.over(job_id).state == "succeeded"
+    assert starts(bench, job_id) == [0] and "begins anew" in bench.log(job_id)
+
+
+def test_the_release_before_works_beside_this_one(
+    postgres: EmbeddedPostgres, previous: Path, tmp_path: Path
+) -> None:
+    """Jobs are taken over in both directions, and the earlier front end answers."""
+    with copied_database(postgres, "template0") as conninfo:
+        bench = Bench(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
+        environment = {**os.environ, "DATABASE_URL": conninfo, "PYTHONPATH": str(previous)}
+        settings = {
+            "DATA": str(tmp_path),
+            "PORT": "0",
+            "STORAGE": str(tmp_path / "store"),
+            "FLOOR_BYTES": "0",
+        }
+        front = subprocess.Popen(
+            [sys.executable, "-m", "service"],
+            cwd=previous,
+            env={**environment, **{f"OCTASPLAT_{name}": value for name, value in settings.items()}},
+            stdout=subprocess.PIPE,
+        )
+        assert front.stdout is not None
+        try:
+            address = front.stdout.readline().decode().strip()  # its tables are there
+            old = bench.worker(name="old", root=previous)
+            gates = [str(tmp_path / f"gate-{number}") for number in range(3)]
+            to_new = bench.submit(options=bench.held(gate=gates[0]))
+            bench.wait_at_gate(to_new)
+            bench.worker(name="old-too", root=previous)
+            stays = bench.submit(options=bench.held(gate=gates[1]))
+            bench.wait_at_gate(stays)
+
+            assert migrate(conninfo)
+            new = bench.worker(name="new")
+            bench.up("new")
+            old.kill()
+            bench.wait(to_new, lambda job: job.worker == "new")
+            Path(gates[0]).touch()
+            assert bench.over(to_new).state == "succeeded" and starts(bench, to_new) == [0, 30]
+            with urllib.request.urlopen(f"{address}/v1/jobs/{to_new}", timeout=30) as answer:
+                assert b'"succeeded"' in answer.read()
+
+            to_old = bench.submit(options=bench.held(gate=gates[2]))
+            bench.wait_at_gate(to_old)
+            assert bench.job(to_old).worker == "new"
+            Path(gates[1]).touch()
+            assert bench.over(stays).worker == "old-too"
+            new.kill()
+            bench.wait(to_old, lambda job: job.worker == "old-too")
+            Path(gates[2]).touch()
+            done = bench.over(to_old)
+            assert (done.state, starts(bench, to_old)) == ("succeeded", [0, 30])
+        finally:
+            front.terminate()
+            front.wait(30)
+            front.stdout.close()
+            bench.close()

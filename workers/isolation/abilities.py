@@ -1,0 +1,37 @@
+"""What of the isolation a machine can do, and what it says where it cannot."""
+
+import logging
+import os
+
+from workers.isolation.filters import can_filter
+from workers.isolation.folders import landlock_version
+from workers.isolation.kernel import IS_LINUX
+
+logger = logging.getLogger(__name__)
+
+
+def abilities() -> dict[str, str | None]:
+    """What isolates the programs of jobs and the readers of models here, by subject; None is nothing."""
+    is_filtered, version = can_filter(), landlock_version()
+    return {
+        "environment": "scrubbed",
+        "memory_of_others": "not dumpable" if IS_LINUX else None,
+        "network": "seccomp" if is_filtered else None,
+        "calls": "seccomp" if is_filtered else None,
+        "folders": f"landlock {version}" if version else None,
+        "signals": f"landlock {version}" if version >= 6 else None,
+        "processes": "counted" if os.geteuid() == 0 else "counted, rlimit",
+        "memory": "measured, rlimit",
+        "time_of_readers": "rlimit",
+    }
+
+
+def tell_what_lacks() -> None:
+    """Say in the log, in one line, what isolates nothing here."""
+    lacking = [subject.replace("_", " ") for subject, means in abilities().items() if means is None]
+    if lacking:
+        logger.warning(
+            "nothing keeps the programs of jobs from these here: %s; the kernel takes no part in it, so "
+            "trust whoever sends photographs, or run workers in containers",
+            ", ".join(lacking),
+        )
