@@ -66,7 +66,7 @@ def step_lanes(typingctx, values, gradients, rates, first, second, count, number
             )
 
         def times(a, b):
-            return builder.fmul(a, b, ("contract",))
+            return builder.fmul(a, b, flags=("contract",))
 
         numbers = [everywhere(number, kind) for number in cgutils.unpack_tuple(builder, numbers)]
         correction1, correction2, beta1, beta2, rest1, rest2, epsilon = numbers
@@ -75,8 +75,8 @@ def step_lanes(typingctx, values, gradients, rates, first, second, count, number
         zero, align = ir.Constant(kind, [0.0] * LANES), _word(4)
         places = [builder.inttoptr(place, pointer) for place in places]
         value, gradient, rate, m, v = (builder.call(load, [at, align, mask, zero]) for at in places)
-        m = builder.fadd(times(beta1, m), times(rest1, gradient), ("contract",))
-        v = builder.fadd(times(beta2, v), times(times(rest2, gradient), gradient), ("contract",))
+        m = builder.fadd(times(beta1, m), times(rest1, gradient), flags=("contract",))
+        v = builder.fadd(times(beta2, v), times(times(rest2, gradient), gradient), flags=("contract",))
         below = builder.fadd(builder.call(root, [times(v, correction2)]), epsilon)
         step = builder.fdiv(times(rate, times(m, correction1)), below)
         for found, at in ((builder.fsub(value, step), 0), (m, 3), (v, 4)):
@@ -99,9 +99,10 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
     rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps = rates
     opacity_weight, scale_weight, min_log_scale, max_log_scale = regular
     values, by_values, by_rates = room[0], room[1], room[2]
+    scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
     rate = rate_mean
     if mean_by_size:
-        rate *= math.exp(0.5 * (np.float64(log_scales[i, 0]) + np.float64(log_scales[i, 1])))
+        rate *= math.sqrt(scale_0 * scale_1)
     for axis in range(3):
         values[axis], by_values[axis], by_rates[axis] = 0.0, g_means[k, axis], rate  # the step alone
     for axis in range(4):
@@ -109,10 +110,12 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
             quats[i, axis], g_quats[k, axis], rate_quat,
         )  # fmt: skip
     for axis in range(2):
-        value = np.float64(log_scales[i, axis])
-        values[7 + axis], by_rates[7 + axis] = value, rate_log_scale
-        by_values[7 + axis] = g_log_scales[k, axis] + scale_weight * math.exp(value)
-    opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
+        values[7 + axis], by_rates[7 + axis] = log_scales[i, axis], rate_log_scale
+    by_values[7] = g_log_scales[k, 0] + scale_weight * scale_0
+    by_values[8] = g_log_scales[k, 1] + scale_weight * scale_1
+    opacity = 0.0
+    if opacity_weight != 0.0:
+        opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
     values[9], by_rates[9] = logits[i], rate_opacity
     by_values[9] = g_logits[k] + opacity_weight * opacity * (1.0 - opacity)
     first_at = first.ctypes.data + i * first.shape[1] * 4

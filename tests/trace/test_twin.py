@@ -124,7 +124,7 @@ def test_coincident_planes_and_stacks_are_ordered_by_id(rng: np.random.Generator
     ties = 0
     for ray in range(250):
         rows = ours.hits.place(ray)
-        ids, distances = ours.hits.hits.ids[rows], ours.hits.hits.distances[rows]
+        ids, distances = ours.hits.of_ray(ray), ours.hits.hits.distances[rows]
         equal = np.diff(distances) == 0
         assert (np.diff(distances) >= 0).all()
         assert (np.diff(ids)[equal] > 0).all()

@@ -89,7 +89,7 @@ class Outputs(NamedTuple):
 class Hits(NamedTuple):
     """Hits in order along each ray: those of ray r from ``starts[r]`` on.
 
-    ``rgb`` is for rays that go alone; packets keep a Gaussian's colour once.
+    ``ids`` and ``rgb`` are for rays that go alone; packets keep them once for a Gaussian.
     """
 
     starts: Int64[np.ndarray, " r"]

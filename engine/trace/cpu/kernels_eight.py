@@ -9,12 +9,28 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from engine.trace.cpu.kernels_lanes import (
+    DOUBLE,
+    FLOAT,
+    I32,
+    INT8,
+    LONG8,
+    MASK8,
+    compress,
+    distances_of,
+    first_lanes,
+    gather,
+    lanes_below,
+    load,
+    offset,
+    places_of,
+    scan,
+    shifted,
+    splat,
+    store,
+)
 from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
 
-I1, I32 = ir.IntType(1), ir.IntType(32)
-FLOAT, DOUBLE = ir.FloatType(), ir.DoubleType()
-INT8, MASK8 = ir.VectorType(I32, LANES), ir.VectorType(I1, LANES)
-LONG8 = ir.VectorType(I64, LANES)
 N_X, A_X, B_X, N_0, INNER, ALPHA_0 = 0, 3, 6, 9, 10, 11
 ROWS = 12
 """Rows of a block of eight candidates: u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0."""
@@ -56,13 +72,13 @@ def meet_block(
         met = builder.and_(met, builder.and_(behind, before))
 
         def write(value, array, size):
-            packed = _compress(builder, value, met)
-            _store(builder, packed, _offset(builder, array, tail, size))
+            packed = compress(builder, value, met)
+            store(builder, packed, offset(builder, array, tail, size))
 
         places = builder.add(splat(builder, tail, I64), ir.Constant(LONG8, list(range(LANES))))
-        distance = builder.zext(_compress(builder, builder.bitcast(t, INT8), met), LONG8)
+        distance = builder.zext(compress(builder, builder.bitcast(t, INT8), met), LONG8)
         key = builder.or_(builder.shl(distance, ir.Constant(LONG8, [32] * LANES)), places)
-        _store(builder, key, _offset(builder, keys, tail, 8))
+        store(builder, key, offset(builder, keys, tail, 8))
         write(((u * u + v * v) * -0.5).value, powers, 8)
         write(builder.fptrunc(rows[ALPHA_0].value, FLOAT8), opacities, 4)
         write(builder.fptrunc(u.value, FLOAT8), us, 4)
@@ -87,40 +103,162 @@ def write_alphas(typingctx, powers, opacities, place, alpha_max):
 
     def codegen(context, builder, sig, args):
         powers, opacities, place, alpha_max = args
-        at = _offset(builder, powers, place, 8)
-        opacity = Lanes(builder, _offset(builder, opacities, place, 4), FLOAT8)[0]
+        at = offset(builder, powers, place, 8)
+        opacity = Lanes(builder, offset(builder, opacities, place, 4), FLOAT8)[0]
         found = opacity * _exponential(builder, Lanes(builder, at, DOUBLE8)[0])
         found = found.smaller(broadcast(builder, alpha_max))
         rounded = builder.fpext(builder.fptrunc(found.value, FLOAT8), DOUBLE8)
-        _store(builder, rounded, at)
+        store(builder, rounded, at)
         return context.get_dummy_value()
 
     return signature, codegen
 
 
 @intrinsic
-def weigh(typingctx, alphas, count, t, stop_below, weights, after):
-    """Weights of the first ``count`` of eight hits before which the transmittance is ``t``.
+def sort_few(typingctx, keys, count, sorted_keys):
+    """Sort ``count`` different keys (uint64) in place: each goes behind as many as are smaller than it.
 
-    Writes alpha T to ``weights`` and the transmittance behind each to ``after``; beyond ``count`` no hit
-    changes anything. The bits of the result: those behind which it is below ``stop_below``; and, eight bits
-    higher, those behind which it is one half or less.
+    That takes as many steps as pairs, but no branch that the processor could guess wrongly. Both arrays have
+    room for eight more; ``sorted_keys`` is for the work. Tells whether the upper halves of some are the same.
     """
-    signature = types.int64(types.uintp, types.int64, types.float64, types.float64, types.uintp, types.uintp)
+    signature = types.boolean(types.uintp, types.int64, types.uintp)
 
     def codegen(context, builder, sig, args):
-        alphas, count, t, stop_below, weights, after = args
-        alpha = _first(builder, Lanes(builder, alphas, DOUBLE8)[0], count)
+        keys, count, sorted_keys = args
+        zeros = ir.Constant(LONG8, [0] * LANES)
+        last = builder.sub(count, ir.Constant(I64, 1))
+        blocks = builder.add(builder.ashr(last, ir.Constant(I64, 3)), ir.Constant(I64, 1))
+        words = builder.inttoptr(keys, I64.as_pointer())
+        pointers = ir.VectorType(ir.IntType(8).as_pointer(), LANES)
+        function_type = ir.FunctionType(ir.VoidType(), [LONG8, pointers, I32, MASK8])
+        scatter = cgutils.get_or_insert_function(
+            builder.module, function_type, "llvm.masked.scatter.v8i64.v8p0"
+        )
+        with cgutils.for_range(builder, blocks) as block:
+            first = builder.mul(block.index, ir.Constant(I64, LANES))
+            mine = load(builder, offset(builder, keys, first, 8), LONG8)
+            below = cgutils.alloca_once(builder, LONG8)
+            builder.store(zeros, below)
+            with cgutils.for_range(builder, count) as loop:
+                other = splat(builder, builder.load(builder.gep(words, [loop.index])), I64)
+                so_far = builder.load(below)
+                more = builder.add(so_far, ir.Constant(LONG8, [1] * LANES))
+                smaller = builder.icmp_unsigned("<", other, mine)
+                builder.store(builder.select(smaller, more, so_far), below)
+            places = builder.mul(builder.load(below), ir.Constant(LONG8, [8] * LANES))
+            where = builder.inttoptr(builder.add(places, splat(builder, sorted_keys, I64)), pointers)
+            valid = lanes_below(builder, builder.sub(count, first))
+            builder.call(scatter, [mine, where, ir.Constant(I32, 8), valid])
+        same = cgutils.alloca_once(builder, MASK8)
+        builder.store(ir.Constant(MASK8, [0] * LANES), same)
+        with cgutils.for_range(builder, blocks) as block:
+            first = builder.mul(block.index, ir.Constant(I64, LANES))
+            at = offset(builder, sorted_keys, first, 8)
+            one = load(builder, at, LONG8)
+            # One further on; what lies behind the last counts for nothing.
+            next_one = load(builder, builder.add(at, ir.Constant(I64, 8)), LONG8)
+            alike = builder.icmp_unsigned("<", builder.xor(one, next_one), ir.Constant(LONG8, [1 << 32] * 8))
+            alike = builder.and_(alike, lanes_below(builder, builder.sub(last, first)))
+            builder.store(builder.or_(builder.load(same), alike), same)
+            store(builder, one, offset(builder, keys, first, 8))
+        bits = builder.bitcast(builder.load(same), ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+
+    return signature, codegen
+
+
+@intrinsic
+def weigh_next(typingctx, keys, most, safe, known_alphas, t, stop_below, alphas, weights, after):
+    """Weights of the next of a ray's sorted hits, eight at the most, before which the transmittance is ``t``.
+
+    Counts those of the first ``most`` of the ``keys`` that are below ``safe``. Writes their alphas, read from
+    ``known_alphas`` at the places in the keys, to ``alphas``, alpha T to ``weights``, and the transmittance
+    behind each to ``after``; what lies beyond them changes nothing. The result has the bits of those behind
+    which it is below ``stop_below``; eight bits higher of those behind which it is one half or less; and
+    their number from bit 16 on.
+    """
+    address, double, word = types.uintp, types.float64, types.int64
+    signature = word(address, word, types.uint64, address, double, double, address, address, address)
+
+    def codegen(context, builder, sig, args):
+        keys, most, safe, known_alphas, t, stop_below, alphas, weights, after = args
+        key = load(builder, keys, LONG8)
+        valid = builder.icmp_unsigned("<", key, splat(builder, safe, I64))
+        valid = builder.and_(valid, lanes_below(builder, most))
+        alpha = gather(builder, known_alphas, places_of(builder, key, valid), DOUBLE8)
+        alpha = Vector(builder, builder.select(valid, alpha, ir.Constant(DOUBLE8, [0.0] * LANES)))
+        store(builder, alpha.value, alphas)
         one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
         product = scan(builder, one - alpha, lambda a, b: a * b, 1.0)
         through = shifted(builder, product, 1, 1.0)
         begin = broadcast(builder, t)
         left = product * begin
-        _store(builder, (alpha * (through * begin)).value, weights)
-        _store(builder, left.value, after)
+        store(builder, (alpha * (through * begin)).value, weights)
+        store(builder, left.value, after)
+        count = builder.ctpop(Vector(builder, valid).mask())
         stops = (left < broadcast(builder, stop_below)).mask()
         halves = builder.shl((left <= 0.5).mask(), ir.Constant(I64, LANES))
-        return builder.or_(stops, halves)
+        count = builder.shl(count, ir.Constant(I64, 2 * LANES))
+        return builder.or_(builder.or_(stops, halves), count)
+
+    return signature, codegen
+
+
+@intrinsic
+def know_slots(typingctx, keys, count, known_numbers, slot_of, weights, numbers, slots, depths):
+    """Which candidates the first ``count`` of eight hits are, and under which slots their packet knows them.
+
+    Writes ``numbers``, read from ``known_numbers`` at the places in the keys, and ``slots``, both int64;
+    adds weights times distances to the eight ``depths``. Bit k of the result: hit k has no slot yet.
+    """
+    address, word = types.uintp, types.int64
+    signature = word(address, word, *(address,) * 6)
+
+    def codegen(context, builder, sig, args):
+        keys, count, known_numbers, slot_of, weights, numbers, slots, depths = args
+        key = load(builder, keys, LONG8)
+        valid = lanes_below(builder, count)
+        number = gather(builder, known_numbers, places_of(builder, key, valid), INT8)
+        number = builder.zext(number, LONG8)
+        slot = builder.sext(gather(builder, slot_of, number, INT8), LONG8)
+        store(builder, number, numbers)
+        store(builder, slot, slots)
+        weight = Lanes(builder, weights, DOUBLE8)[0]
+        distance = Vector(builder, builder.fpext(distances_of(builder, key), DOUBLE8))
+        distance = first_lanes(builder, distance, count)
+        store(builder, (Lanes(builder, depths, DOUBLE8)[0] + weight * distance).value, depths)
+        new = builder.icmp_signed("<", slot, ir.Constant(LONG8, [0] * LANES))
+        return Vector(builder, builder.and_(new, valid)).mask()
+
+    return signature, codegen
+
+
+@intrinsic
+def keep_hits(
+    typingctx, keys, count, alphas, slots, known_us, known_vs, place,
+    kept_alphas, kept_distances, kept_us, kept_vs, kept_slots,
+):  # fmt: skip
+    """Store ``count`` of eight hits from ``place`` on, 32 bits a number; what follows them is undefined.
+
+    u and v are read from where the keys say.
+    """
+    address, word = types.uintp, types.int64
+    signature = types.void(address, word, *(address,) * 4, word, *(address,) * 5)
+
+    def codegen(context, builder, sig, args):
+        keys, count, alphas, slots, known_us, known_vs, place, *kept = args
+        key = load(builder, keys, LONG8)
+        where = places_of(builder, key, lanes_below(builder, count))
+        values = (
+            builder.fptrunc(load(builder, alphas, DOUBLE8), FLOAT8),
+            distances_of(builder, key),
+            gather(builder, known_us, where, FLOAT8),
+            gather(builder, known_vs, where, FLOAT8),
+            builder.trunc(load(builder, slots, LONG8), INT8),
+        )
+        for value, array in zip(values, kept, strict=True):
+            store(builder, value, offset(builder, array, place, 4))
+        return context.get_dummy_value()
 
     return signature, codegen
 
@@ -141,136 +279,13 @@ def add_shown(typingctx, sums, shown, slots, weights, count):
         with cgutils.for_range(builder, count) as loop:
             slot = builder.load(builder.gep(slots, [loop.index]))
             weight = broadcast(builder, builder.load(builder.gep(weights, [loop.index])))
-            row = Lanes(builder, _offset(builder, shown, slot, 64), DOUBLE8)[0]
+            row = Lanes(builder, offset(builder, shown, slot, 64), DOUBLE8)[0]
             added = Vector(builder, builder.load(total)) + weight * row
             builder.store(added.value, total)
-        _store(builder, builder.load(total), sums)
+        store(builder, builder.load(total), sums)
         return context.get_dummy_value()
 
     return signature, codegen
-
-
-@intrinsic
-def share_out(typingctx, alphas, through, values, count, behind, alpha_max, weights, shares):
-    """Backwards through the first ``count`` of eight hits: their weights and h = dL/d ln(alpha), as float32.
-
-    Args are the float32 alphas, the transmittance before each, dL by a weight of one of each, and dL by what
-    lies behind the last, summed from the back. Returns that by what lies behind the hit before the first.
-    An alpha of ``alpha_max`` (float32) was clamped: its h is zero.
-    """
-    address, double = types.uintp, types.float64
-    signature = double(address, address, address, types.int64, double, types.float32, address, address)
-
-    def codegen(context, builder, sig, args):
-        alphas, through, values, count, behind, alpha_max, weights, shares = args
-        alpha = Lanes(builder, alphas, FLOAT8)[0]
-        limit = broadcast(builder, builder.fpext(alpha_max, DOUBLE))
-        clamped = alpha >= limit
-        alpha = _first(builder, alpha, count)
-        through = Lanes(builder, through, DOUBLE8)[0]
-        value = Lanes(builder, values, DOUBLE8)[0]
-        one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
-        weight = _first(builder, alpha * through, count)
-        seen = _first(builder, weight * value, count)
-        sums = scan(builder, seen, lambda a, b: a + b, 0.0, backwards=True)
-        later = shifted(builder, sums, -1, 0.0) + broadcast(builder, behind)
-        h = (through * value - later / (one - alpha)) * alpha
-        h = clamped.where(0.0, h)
-        _store(builder, builder.fptrunc(weight.value, FLOAT8), weights)
-        _store(builder, builder.fptrunc(h.value, FLOAT8), shares)
-        first = builder.extract_element(sums.value, ir.Constant(I32, 0))
-        return builder.fadd(first, behind)
-
-    return signature, codegen
-
-
-@intrinsic
-def add_moments(typingctx, row, h, u, v, weight, by_ray):
-    """Add one hit to the row of its Gaussian, sixteen float32.
-
-    The first eight are the moments h (1, u, v, u^2, u v, v^2, u (u^2 + v^2), v (u^2 + v^2)); the others get
-    ``weight`` times the eight float32 at ``by_ray``, but for the second of them, which counts.
-    """
-    single = types.float32
-    signature = types.void(types.uintp, single, single, single, single, types.uintp)
-
-    def codegen(context, builder, sig, args):
-        row, h, u, v, weight, by_ray = args
-        one = ir.Constant(FLOAT, 1.0)
-        square = builder.fadd(
-            builder.fmul(u, u, ("contract",)), builder.fmul(v, v, ("contract",)), ("contract",)
-        )
-        sides = _lanes(builder, (one, u, v, u, u, v, u, v))
-        others = _lanes(builder, (one, one, one, u, v, v, square, square))
-        moments = builder.fmul(builder.fmul(sides, others), splat(builder, h, FLOAT))
-        at = builder.inttoptr(row, FLOAT8.as_pointer())
-        builder.store(builder.fadd(builder.load(at, align=4), moments), at, align=4)
-        at = builder.inttoptr(_offset(builder, row, ir.Constant(I64, 8), 4), FLOAT8.as_pointer())
-        ray = builder.load(builder.inttoptr(by_ray, FLOAT8.as_pointer()), align=4)
-        sums = builder.fadd(
-            builder.load(at, align=4),
-            builder.fmul(ray, splat(builder, weight, FLOAT), ("contract",)),
-            ("contract",),
-        )
-        count = ir.Constant(FLOAT8, [0.0, 1.0, *[0.0] * 6])
-        builder.store(builder.fadd(sums, count), at, align=4)
-        return context.get_dummy_value()
-
-    return signature, codegen
-
-
-def scan(builder, vector, combine, neutral, backwards=False):
-    """Each lane with all before it, or behind it, combined in three steps."""
-    for step in (1, 2, 4):
-        vector = combine(vector, shifted(builder, vector, -step if backwards else step, neutral))
-    return vector
-
-
-def shifted(builder, vector, by, filling):
-    """Lane k moves to lane k + ``by``; ``filling`` comes in."""
-    fill = ir.Constant(DOUBLE8, [float(filling)] * LANES)
-    places = [k - by if 0 <= k - by < LANES else LANES for k in range(LANES)]
-    order = ir.Constant(ir.VectorType(I32, LANES), places)
-    return Vector(builder, builder.shuffle_vector(vector.value, fill, order))
-
-
-def splat(builder, scalar, kind):
-    """A vector of eight times ``scalar``."""
-    vector = ir.VectorType(kind, LANES)
-    one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(I32, 0))
-    return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), ir.Constant(INT8, [0] * LANES))
-
-
-def _lanes(builder, scalars):
-    vector = ir.Constant(FLOAT8, ir.Undefined)
-    for k, scalar in enumerate(scalars):
-        vector = builder.insert_element(vector, scalar, ir.Constant(I32, k))
-    return vector
-
-
-def _first(builder, vector, count):
-    """The first ``count`` lanes; zero in the others."""
-    lanes = ir.Constant(LONG8, list(range(LANES)))
-    valid = builder.icmp_signed("<", lanes, splat(builder, count, I64))
-    return Vector(builder, builder.select(valid, vector.value, ir.Constant(DOUBLE8, [0.0] * LANES)))
-
-
-def _compress(builder, value, mask):
-    """The lanes of ``mask`` without gaps, in order; what follows them is undefined."""
-    element = {FLOAT: "f32", DOUBLE: "f64", I32: "i32"}[value.type.element]
-    kind = ir.FunctionType(value.type, [value.type, MASK8, value.type])
-    function = cgutils.get_or_insert_function(
-        builder.module, kind, f"llvm.experimental.vector.compress.v8{element}"
-    )
-    return builder.call(function, [value, mask, ir.Constant(value.type, ir.Undefined)])
-
-
-def _offset(builder, address, place, size):
-    return builder.add(address, builder.mul(place, ir.Constant(I64, size)))
-
-
-def _store(builder, value, address):
-    builder.store(value, builder.inttoptr(address, value.type.as_pointer()), align=4)
 
 
 def _exponential(builder, x):

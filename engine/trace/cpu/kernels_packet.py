@@ -39,7 +39,7 @@ from numba import njit
 from engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X, ROWS
 from engine.trace.cpu.kernels_footprint import BINS, FRAME_WORDS, footprints, rays_between, write_bins
 from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
-from engine.trace.cpu.kernels_rays import ray_origin
+from engine.trace.cpu.kernels_rays import ray_origin, record_vector
 from engine.trace.cpu.kernels_simd import (
     boxes_in_pyramid,
     ellipses_in_pyramid,
@@ -48,6 +48,7 @@ from engine.trace.cpu.kernels_simd import (
     prefetch,
 )
 from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
+from engine.trace.cpu.memory import LINE
 from engine.trace.kernels_native import lean
 
 STACK = 1024
@@ -162,6 +163,14 @@ def new_walk():
 
 
 @njit(error_model="numpy")
+def aligned_doubles(count):
+    """Room for doubles from a line on, else each vector of eight would lie in two."""
+    raw = np.empty(count + LINE // 8, np.float64)
+    first = (LINE - raw.ctypes.data % LINE) % LINE // 8
+    return raw[first : first + count]
+
+
+@njit(error_model="numpy")
 def new_candidates(room):
     """Room for so many candidates, a multiple of eight."""
     return Candidates(
@@ -174,9 +183,9 @@ def new_candidates(room):
         np.empty(room + 1, np.float32),
         np.empty(room // WIDTH, np.uint64),
         np.empty((room // (WIDTH * WORD) + 1, WORD), np.uint64),
-        np.empty((room // WIDTH, ROWS, WIDTH), np.float64),
+        aligned_doubles(room * ROWS).reshape((room // WIDTH, ROWS, WIDTH)),
         np.empty(room, np.int32),
-        np.empty((room, SHOWN), np.float64),
+        aligned_doubles(room * SHOWN).reshape((room, SHOWN)),
         np.empty(room + WIDTH, np.uint64),
         np.empty(room + WIDTH, np.float64),
         np.empty(room + WIDTH, np.float32),
@@ -285,6 +294,16 @@ def gather_candidates(tree, pyramid, origin, farthest, walk, candidates):
         level = stack[2 * depth + 1]
         mask = boxes_in_pyramid(nodes_at + node * NODE_BYTES, planes_at, ox, oy, oz)
         first_child = (node - level_starts[level]) * WIDTH
+        waiting = mask
+        while waiting != 0:
+            child = first_child + lowest_bit(waiting)
+            waiting &= waiting - 1
+            if level > 0:
+                at, lines = nodes_at + (level_starts[level - 1] + child) * NODE_BYTES, NODE_BYTES // LINE
+            else:
+                at, lines = blocks_at + child * BLOCK_BYTES, (BLOCK_BYTES + LINE - 1) // LINE
+            for line in range(lines):
+                prefetch(at + line * LINE)
         while mask != 0:
             child = first_child + lowest_bit(mask)
             mask &= mask - 1
@@ -358,21 +377,9 @@ def write_rows(candidates, count, scene, origin, coloured):
             continue
         record = records[ids[k]]
         x, y, z = record[MEAN] - ox, record[MEAN + 1] - oy, record[MEAN + 2] - oz
-        n0, n1, n2 = (
-            np.float64(record[NORMAL]),
-            np.float64(record[NORMAL + 1]),
-            np.float64(record[NORMAL + 2]),
-        )
-        a0, a1, a2 = (
-            np.float64(record[AXIS_U]),
-            np.float64(record[AXIS_U + 1]),
-            np.float64(record[AXIS_U + 2]),
-        )
-        b0, b1, b2 = (
-            np.float64(record[AXIS_V]),
-            np.float64(record[AXIS_V + 1]),
-            np.float64(record[AXIS_V + 2]),
-        )
+        n0, n1, n2 = record_vector(record, NORMAL)
+        a0, a1, a2 = record_vector(record, AXIS_U)
+        b0, b1, b2 = record_vector(record, AXIS_V)
         height = x * n0 + y * n1 + z * n2
         xa = x * a0 + y * a1 + z * a2
         xb = x * b0 + y * b1 + z * b2

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 from numba import njit, prange
 
-from engine.trace.cpu.kernels_eight import add_moments, share_out
+from engine.trace.cpu.kernels_eight_backward import add_row, replay_hits, walk_through
 from engine.trace.cpu.kernels_packet import AHEAD
 from engine.trace.cpu.kernels_rays import first_place, ray_origin
 from engine.trace.cpu.kernels_records import rotation_columns
@@ -29,7 +29,7 @@ from engine.trace.kernels_native import lean, next_from_counter
 
 # --- row of sums of a packet's rays for one of its Gaussians, float32, one cache line ---
 H, HU, HV, HUU, HUV, HVV, HUUU, HVVV = range(8)  # the last two: h u (u^2 + v^2), h v (u^2 + v^2)
-W, COUNT, ERROR, RED, GREEN, BLUE = range(8, 14)
+W, COUNT, ERROR, RED, GREEN, BLUE, PACKET = range(8, 15)  # the last is an int32
 ROW_WORDS = 16
 GT, GTU, GTV, N_0, N_1, N_2 = range(6)
 GEOMETRY_WORDS = 6
@@ -43,7 +43,6 @@ class Rows(NamedTuple):
 
     firsts: Int64[np.ndarray, " p1"]
     ids: Int32[np.ndarray, " e"]
-    packets: Int32[np.ndarray, " e"]
     sums: Float32[np.ndarray, "e 16"]
     geometry: Float32[np.ndarray, "e _"]
     features: Float32[np.ndarray, "e f"]
@@ -66,7 +65,7 @@ def new_replay(most_hits, slots):
     return Replay(
         np.empty(most_hits + WIDTH, np.float64),
         np.empty((slots, 3), np.float64),
-        np.empty(WIDTH, np.float64),
+        np.zeros(WIDTH, np.float64),
         np.empty(WIDTH, np.float32),
         np.empty(WIDTH, np.float32),
         np.zeros(WIDTH, np.float32),
@@ -83,7 +82,6 @@ def begin_rows(packet, memory, rays, packets, kept, parameters, limits, g, rows)
     for slot in range(slots):
         i, row = kept.slot_ids[slot_base + slot], base + slot
         rows.ids[row] = i
-        rows.packets[row] = packet
         rows.sums[row, :] = np.float32(0.0)
         for f in range(rows.features.shape[1]):
             rows.features[row, f] = np.float32(0.0)
@@ -113,45 +111,47 @@ def replay_ray(r, slot_base, base, memory, hits, kept, counts, features, limits,
     feature_count = features.shape[1]
     count, start = counts[r], hits.starts[r]
     t, median = 1.0, -1
-    for k in range(count):
-        through[k] = t
-        left = t * (1.0 - np.float64(hits.alphas[start + k]))
-        if t > 0.5 and left <= 0.5:
-            median = k
-        t = left
-    g0, g1, g2 = np.float64(g.rgb[r, 0]), np.float64(g.rgb[r, 1]), np.float64(g.rgb[r, 2])
+    for begin in range(0, count, WIDTH):
+        t = walk_through(
+            hits.alphas.ctypes.data + (start + begin) * 4, min(WIDTH, count - begin), t,
+            through.ctypes.data + begin * 8,
+        )  # fmt: skip
+    through[count] = t
     gn0 = gn1 = gn2 = gd = gm = 0.0
     if g.with_geometry:
         gd, gm = np.float64(g.depth_sum[r]), np.float64(g.depth_median[r])
         gn0, gn1, gn2 = np.float64(g.normal[r, 0]), np.float64(g.normal[r, 1]), np.float64(g.normal[r, 2])
+        for k in range(count):
+            if through[k] > 0.5 and through[k + 1] <= 0.5:
+                median = k
     by_ray[W - 8], by_ray[ERROR - 8] = np.float32(1.0), g.ray_errors[r]
     by_ray[RED - 8], by_ray[GREEN - 8], by_ray[BLUE - 8] = g.rgb[r, 0], g.rgb[r, 1], g.rgb[r, 2]
     behind = np.float64(g.transmittance[r]) * t
     for begin in range((count - 1) // WIDTH * WIDTH, -1, -WIDTH):
         n, e = min(WIDTH, count - begin), start + begin
-        for k in range(n):
-            slot = kept.slots[e + k]
-            place = slot_base + slot
-            value = g0 * kept.slot_rgb[place, 0] + g1 * kept.slot_rgb[place, 1] + g2 * kept.slot_rgb[place, 2]
-            if g.with_geometry:
-                value += gd * hits.distances[e + k]
-                value += gn0 * normals[slot, 0] + gn1 * normals[slot, 1] + gn2 * normals[slot, 2]
-            for f in range(feature_count):
-                value += np.float64(g.features[r, f]) * features[kept.slot_ids[place], f]
-            values[k] = value
-        behind = share_out(
-            hits.alphas.ctypes.data + e * 4, through.ctypes.data + begin * 8, values.ctypes.data, n, behind,
-            np.float32(limits.alpha_max), weights.ctypes.data, shares.ctypes.data,
+        if g.with_geometry or feature_count > 0:
+            for k in range(n):
+                slot = kept.slots[e + k]
+                value = 0.0
+                if g.with_geometry:
+                    value += gd * hits.distances[e + k]
+                    value += gn0 * normals[slot, 0] + gn1 * normals[slot, 1] + gn2 * normals[slot, 2]
+                for f in range(feature_count):
+                    value += np.float64(g.features[r, f]) * features[kept.slot_ids[slot_base + slot], f]
+                values[k] = value
+        behind = replay_hits(
+            hits.alphas.ctypes.data + e * 4, through.ctypes.data + begin * 8, values.ctypes.data,
+            kept.slots.ctypes.data + e * 4, kept.us.ctypes.data + e * 4, kept.vs.ctypes.data + e * 4,
+            kept.slot_rgb.ctypes.data + slot_base * 12, n, behind, np.float32(limits.alpha_max),
+            by_ray.ctypes.data, rows.sums.ctypes.data + base * (ROW_WORDS * 4), weights.ctypes.data,
+            shares.ctypes.data,
         )  # fmt: skip
+        if not (g.with_geometry or feature_count > 0):
+            continue
         for k in range(n):
             row = base + kept.slots[e + k]
-            u, v = kept.us[e + k], kept.vs[e + k]
-            add_moments(
-                rows.sums.ctypes.data + row * (ROW_WORDS * 4), shares[k], u, v, weights[k],
-                by_ray.ctypes.data,
-            )  # fmt: skip
             if g.with_geometry:
-                weight = np.float64(weights[k])
+                u, v, weight = kept.us[e + k], kept.vs[e + k], np.float64(weights[k])
                 gt = (gd * weight + (gm if begin + k == median else 0.0)) * hits.distances[e + k]
                 rows.geometry[row, GT] += gt
                 rows.geometry[row, GTU] += gt * u
@@ -168,11 +168,13 @@ def replay_packet(packet, memory, rays, packets, hits, kept, counts, parameters,
     """Write the rows of one packet, the rays ``packets[packet, 0]`` to ``packets[packet, 1]``."""
     first, last, slots = packets[packet, 0], packets[packet, 1], kept.slot_counts[packet]
     slot_base, base = first_place(first, limits), rows.firsts[packet]
+    words = rows.sums.view(np.int32)
     begin_rows(packet, memory, rays, packets, kept, parameters, limits, g, rows)
     for r in range(first, last):
         if counts[r] > 0:
             replay_ray(r, slot_base, base, memory, hits, kept, counts, features, limits, g, rows)
     for slot in range(slots):
+        words[base + slot, PACKET] = packet
         for channel in range(3):  # a colour clamped at zero gets no gradient
             if kept.slot_rgb[slot_base + slot, channel] <= 0.0:
                 rows.sums[base + slot, RED + channel] = np.float32(0.0)
@@ -213,6 +215,7 @@ def sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, 
     order, starts = by_gaussian.order, by_gaussian.starts
     means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
     basis_count, feature_count = out.sh.shape[1], out.features.shape[1]
+    words = rows.sums.view(np.int32)
     with_geometry = rows.geometry.shape[1] > 0
     for segment in range(first, last):
         i = by_gaussian.ids[starts[segment]]
@@ -224,16 +227,16 @@ def sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, 
             np.float64(quats[i, 0]), np.float64(quats[i, 1]),
             np.float64(quats[i, 2]), np.float64(quats[i, 3]),
         )  # fmt: skip
-        per_s2, per_s3 = math.exp(-np.float64(log_scales[i, 0])), math.exp(-np.float64(log_scales[i, 1]))
+        s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+        per_s2, per_s3 = 1.0 / s2, 1.0 / s3
         tau = tau_u = tau_v = n0 = n1 = n2 = m0 = m1 = m2 = 0.0
         for k in range(starts[segment], starts[segment + 1]):
             if k + AHEAD < len(order):
                 prefetch(rows.sums.ctypes.data + order[k + AHEAD] * (ROW_WORDS * 4))
             row = order[k]
             here = rows.sums[row]
-            for column in range(ROW_WORDS):
-                sums[column] += here[column]
-            ox, oy, oz = ray_origin(rays, packets[rows.packets[row], 0])
+            add_row(sums.ctypes.data, here.ctypes.data)
+            ox, oy, oz = ray_origin(rays, packets[words[row, PACKET], 0])
             x, y, z = means[i, 0] - ox, means[i, 1] - oy, means[i, 2] - oz
             inverse = 1.0 / (x * r1[0] + y * r1[1] + z * r1[2])
             xa = (x * r2[0] + y * r2[1] + z * r2[2]) * per_s2
@@ -267,7 +270,8 @@ def sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, 
             sums[H], sums[HU], sums[HV], sums[HUU], sums[HUV], sums[HVV],
             tau, tau_u, tau_v, n0, n1, n2, m0, m1, m2,
         )  # fmt: skip
-        write_gradients(segment, i, parameters, scene.records, moments, out)
+        frame = r1, r2, r3, s2, s3
+        write_gradients(segment, i, frame, parameters.quats, scene.records, moments, out)
         out.weights[segment] = sums[W]
         out.errors[segment] = sums[ERROR]
         out.counts[segment] = np.int32(sums[COUNT])

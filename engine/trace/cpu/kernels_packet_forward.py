@@ -7,7 +7,15 @@ from jaxtyping import Float64, Int64, UInt64
 from numba import njit, prange
 
 from engine.trace.cpu.bundles import Forward
-from engine.trace.cpu.kernels_eight import add_shown, meet_block, weigh, write_alphas
+from engine.trace.cpu.kernels_eight import (
+    add_shown,
+    keep_hits,
+    know_slots,
+    meet_block,
+    sort_few,
+    weigh_next,
+    write_alphas,
+)
 from engine.trace.cpu.kernels_hit import MEAN, NORMAL
 from engine.trace.cpu.kernels_packet import (
     CHUNK,
@@ -22,9 +30,9 @@ from engine.trace.cpu.kernels_packet import (
     write_rows,
 )
 from engine.trace.cpu.kernels_packet_order import keep_candidates, sort_candidates
-from engine.trace.cpu.kernels_rays import first_place, ray_direction, ray_limits, ray_origin
+from engine.trace.cpu.kernels_rays import first_place, ray_direction, ray_limits, ray_origin, record_vector
 from engine.trace.cpu.kernels_sh import colour, write_view
-from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit, write_ranks
+from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit
 from engine.trace.cpu.kernels_tree import WIDTH
 from engine.trace.kernels_native import lean, next_from_counter
 
@@ -39,15 +47,16 @@ UPPER = np.uint64(32)
 
 
 class Scratch(NamedTuple):
-    """Memory of a thread: harmonics, keys that are sorted and their ranks, sums of a ray, and eight hits."""
+    """Memory of a thread: harmonics, keys that are sorted, sums of a ray, and eight hits."""
 
     basis: Float64[np.ndarray, "16"]
-    ranked: UInt64[np.ndarray, "96"]
-    ranks: Int64[np.ndarray, "104"]
+    ranked: UInt64[np.ndarray, "104"]
     sums: Float64[np.ndarray, "8"]
     alphas: Float64[np.ndarray, "8"]
     weights: Float64[np.ndarray, "8"]
     after: Float64[np.ndarray, "8"]
+    depths: Float64[np.ndarray, "8"]
+    numbers: Int64[np.ndarray, "8"]
     slots: Int64[np.ndarray, "8"]
 
 
@@ -56,36 +65,15 @@ def new_scratch():
     """Memory for rays, one after another."""
     return Scratch(
         np.empty(16, np.float64),
-        np.empty(RANKED, np.uint64),
-        np.empty(RANKED + WIDTH, np.int64),
+        np.empty(RANKED + WIDTH, np.uint64),
         np.empty(SHOWN, np.float64),
         np.empty(WIDTH, np.float64),
         np.empty(WIDTH, np.float64),
         np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.int64),
         np.empty(WIDTH, np.int64),
     )
-
-
-@lean()
-def sort_pending(pending, ranked, ranks, first, last):
-    """Sort keys ``first`` to ``last``, all different; a few by counting the smaller ones."""
-    count = last - first
-    if count > RANKED:
-        for i in range(first + 1, last):
-            key = pending[i]
-            j = i
-            while j > first and pending[j - 1] > key:
-                pending[j] = pending[j - 1]
-                j -= 1
-            pending[j] = key
-        return
-    base = pending.ctypes.data + first * 8
-    for i in range(0, count, WIDTH):
-        write_ranks(base, i, count, ranks.ctypes.data)
-    for i in range(count):
-        ranked[ranks[i]] = pending[first + i]
-    for i in range(count):
-        pending[first + i] = ranked[i]
 
 
 @lean()
@@ -106,6 +94,24 @@ def order_ties(candidates, head, tail):
             pending[j] = pending[j - 1]
             j -= 1
         pending[j] = key
+
+
+@lean()
+def sort_pending(candidates, ranked, head, tail):
+    """Sort the hits ``head`` to ``tail`` of a ray by distance, and by id where they share one."""
+    if tail - head <= RANKED:
+        if sort_few(candidates.pending.ctypes.data + head * 8, tail - head, ranked.ctypes.data):
+            order_ties(candidates, head, tail)
+        return
+    pending = candidates.pending
+    for i in range(head + 1, tail):
+        key = pending[i]
+        j = i
+        while j > head and pending[j - 1] > key:
+            pending[j] = pending[j - 1]
+            j -= 1
+        pending[j] = key
+    order_ties(candidates, head, tail)
 
 
 @lean(forceinline=True)
@@ -146,7 +152,7 @@ def show(shown, i, scene, origin, basis):
     """
     record = scene.records[i]
     x, y, z = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
-    n0, n1, n2 = np.float64(record[NORMAL]), np.float64(record[NORMAL + 1]), np.float64(record[NORMAL + 2])
+    n0, n1, n2 = record_vector(record, NORMAL)
     write_view(basis, scene.sh.shape[1], x, y, z)
     shown[0], shown[1], shown[2] = colour(scene.sh, i, basis)
     shown[3] = shown[7] = 0.0
@@ -162,18 +168,19 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
     ``slots``, which ``kept`` lists from ``slot_base`` on.
     """
     limits, hits, out, features = forward.limits, forward.hits, forward.out, forward.scene.features
-    pending, ids, numbers = candidates.pending, candidates.ids, candidates.numbers
+    pending, ids = candidates.pending, candidates.ids
     slot_of, shown = candidates.slot_of, candidates.shown
     feature_count, recording = features.shape[1], forward.recording
     direction, span = ray_direction(forward.rays, r), ray_limits(forward.rays, r)
     if recording:
         hits.starts[r] = place
     scratch.sums[:] = 0.0
+    scratch.depths[:] = 0.0
     for f in range(feature_count):
         out.features[r, f] = np.float32(0.0)
     # The second phase begins where too little is left, and ends where its own part of it is (Algorithm 1).
     t, stop_below, last_phase = 1.0, limits.eps1, limits.eps2 > 1.0
-    depth, median = 0.0, np.float32(0.0)
+    median = np.float32(0.0)
     found = head = tail = b0 = 0
     block_count = (count + WIDTH - 1) // WIDTH
     stop = False
@@ -183,32 +190,19 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
         tail = meet_blocks(candidates, bit, b0, direction, span, tail)
         if tail > known:
             know_alphas(candidates, known, tail, limits.alpha_max)
-            sort_pending(pending, scratch.ranked, scratch.ranks, head, tail)
-            order_ties(candidates, head, tail)
+            sort_pending(candidates, scratch.ranked, head, tail)
         # What follows lies no nearer than this.
         nearest = candidates.near[min(b1 * WIDTH, count)]
         safe = np.uint64(float32_bits(nearest)) << UPPER
-        while not stop:
-            n = 0
-            while n < WIDTH and head + n < tail and pending[head + n] < safe:
-                key = pending[head + n]
-                m = np.int64(key & LOWER)
-                scratch.alphas[n] = candidates.alphas[m]
-                if recording:
-                    hits.alphas[place + n] = np.float32(candidates.alphas[m])
-                    hits.distances[place + n] = float32_from_bits(np.uint32(key >> UPPER))
-                    kept.us[place + n] = candidates.us[m]
-                    kept.vs[place + n] = candidates.vs[m]
-                n += 1
-            n = min(n, limits.max_hits - found)
-            if n == 0:
-                break
-            bits = weigh(
-                scratch.alphas.ctypes.data, n, t, stop_below,
-                scratch.weights.ctypes.data, scratch.after.ctypes.data,
+        while not stop and head < tail and pending[head] < safe:
+            keys_at = pending.ctypes.data + head * 8
+            bits = weigh_next(
+                keys_at, min(tail - head, limits.max_hits - found), safe, candidates.alphas.ctypes.data, t,
+                stop_below, scratch.alphas.ctypes.data, scratch.weights.ctypes.data,
+                scratch.after.ctypes.data,
             )  # fmt: skip
-            taken, valid = n, (1 << n) - 1
-            if bits & valid != 0:
+            taken = n = bits >> (2 * WIDTH)
+            if bits & ((1 << n) - 1) != 0:
                 last = lowest_bit(bits)
                 if not last_phase:
                     last_phase = True
@@ -218,34 +212,42 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
                         last += 1
                 if last < n:
                     taken, stop = last + 1, True
-            halves = (bits >> WIDTH) & ((1 << taken) - 1)
-            if t > 0.5 and halves != 0:
-                median = float32_from_bits(np.uint32(pending[head + lowest_bit(halves)] >> UPPER))
-            for k in range(taken):
-                key = pending[head + k]
-                number = numbers[np.int64(key & LOWER)]
-                slot = np.int64(slot_of[number])
-                if slot < 0:
-                    slot = slots
-                    slots += 1
-                    slot_of[number] = slot
-                    show(shown[slot], ids[number], forward.scene, origin, scratch.basis)
-                    if recording:
-                        kept.slot_ids[slot_base + slot] = ids[number]
-                        for channel in range(3):
-                            kept.slot_rgb[slot_base + slot, channel] = shown[slot, channel]
-                scratch.slots[k] = slot
-                weight = scratch.weights[k]
-                depth += weight * np.float64(float32_from_bits(np.uint32(key >> UPPER)))
-                for f in range(feature_count):
-                    out.features[r, f] += np.float32(weight * features[ids[number], f])
+            if t > 0.5:
+                halves = (bits >> WIDTH) & ((1 << taken) - 1)
+                if halves != 0:
+                    median = float32_from_bits(np.uint32(pending[head + lowest_bit(halves)] >> UPPER))
+            new = know_slots(
+                keys_at, taken, candidates.numbers.ctypes.data, slot_of.ctypes.data,
+                scratch.weights.ctypes.data, scratch.numbers.ctypes.data, scratch.slots.ctypes.data,
+                scratch.depths.ctypes.data,
+            )  # fmt: skip
+            while new != 0:
+                k = lowest_bit(new)
+                new &= new - 1
+                number = scratch.numbers[k]
+                scratch.slots[k] = slot_of[number] = slots
+                show(shown[slots], ids[number], forward.scene, origin, scratch.basis)
                 if recording:
-                    hits.ids[place + k] = ids[number]
-                    kept.slots[place + k] = slot
+                    kept.slot_ids[slot_base + slots] = ids[number]
+                    for channel in range(3):
+                        kept.slot_rgb[slot_base + slots, channel] = shown[slots, channel]
+                slots += 1
+            for f in range(feature_count):
+                for k in range(taken):
+                    out.features[r, f] += np.float32(
+                        scratch.weights[k] * features[ids[scratch.numbers[k]], f]
+                    )
             add_shown(
                 scratch.sums.ctypes.data, shown.ctypes.data, scratch.slots.ctypes.data,
                 scratch.weights.ctypes.data, taken,
             )  # fmt: skip
+            if recording:
+                keep_hits(
+                    keys_at, taken, scratch.alphas.ctypes.data, scratch.slots.ctypes.data,
+                    candidates.us.ctypes.data, candidates.vs.ctypes.data, place, hits.alphas.ctypes.data,
+                    hits.distances.ctypes.data, kept.us.ctypes.data, kept.vs.ctypes.data,
+                    kept.slots.ctypes.data,
+                )  # fmt: skip
             t = scratch.after[taken - 1]
             head, place, found = head + taken, place + taken, found + taken
             stop = stop or found >= limits.max_hits
@@ -253,6 +255,9 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
         stop = stop or nearest >= span[1]
     out.counts[r] = found
     out.transmittance[r] = t
+    depth = 0.0
+    for k in range(WIDTH):
+        depth += scratch.depths[k]
     out.depth_sum[r] = depth
     out.depth_median[r] = median
     for axis in range(3):

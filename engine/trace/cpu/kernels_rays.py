@@ -1,4 +1,4 @@
-"""Single rays out of a bundle, where one origin, limit or viewer may stand for all."""
+"""Single rays and vectors out of bundles, where one origin, limit or viewer may stand for all."""
 
 import numpy as np
 
@@ -23,6 +23,12 @@ def ray_direction(rays, r):
         np.float64(rays.directions[r, 1]),
         np.float64(rays.directions[r, 2]),
     )
+
+
+@lean(forceinline=True)
+def record_vector(record, at):
+    """Three numbers of a record in float64."""
+    return np.float64(record[at]), np.float64(record[at + 1]), np.float64(record[at + 2])
 
 
 @lean(forceinline=True)

@@ -27,13 +27,13 @@ class Vector:
         return ir.Constant(DOUBLE8, [float(other)] * LANES)
 
     def __add__(self, other):
-        return Vector(self.builder, self.builder.fadd(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fadd(self.value, self._other(other), flags=("contract",)))
 
     def __sub__(self, other):
-        return Vector(self.builder, self.builder.fsub(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fsub(self.value, self._other(other), flags=("contract",)))
 
     def __mul__(self, other):
-        return Vector(self.builder, self.builder.fmul(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fmul(self.value, self._other(other), flags=("contract",)))
 
     def __truediv__(self, other):
         return Vector(self.builder, self.builder.fdiv(self.value, self._other(other)))
@@ -186,34 +186,6 @@ def _plane(builder, planes, side, axis):
     rows = builder.inttoptr(planes, I64.as_pointer())
     row = builder.load(builder.gep(rows, [ir.Constant(I64, side * 6 + 3 + axis)]))
     return broadcast(builder, value), row
-
-
-@intrinsic
-def write_ranks(typingctx, keys, first, count, ranks):
-    """Write how many of ``count`` keys are below each of the eight from ``first`` on to ``ranks``."""
-    signature = types.void(types.uintp, types.int64, types.int64, types.uintp)
-
-    def codegen(context, builder, sig, args):
-        keys, first, count, ranks = args
-        word = ir.Constant(I64, 8)
-        integers = ir.VectorType(I64, LANES)
-        offset = builder.mul(first, word)
-        mine = builder.load(builder.inttoptr(builder.add(keys, offset), integers.as_pointer()), align=8)
-        below = cgutils.alloca_once_value(builder, ir.Constant(integers, [0] * LANES))
-        base = builder.inttoptr(keys, I64.as_pointer())
-        undefined = ir.Constant(integers, ir.Undefined)
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-        with cgutils.for_range(builder, count) as loop:
-            key = builder.load(builder.gep(base, [loop.index]))
-            one = builder.insert_element(undefined, key, ir.Constant(ir.IntType(32), 0))
-            other = builder.shuffle_vector(one, undefined, zeros)
-            smaller = builder.icmp_unsigned("<", other, mine)
-            builder.store(builder.add(builder.load(below), builder.zext(smaller, integers)), below)
-        target = builder.inttoptr(builder.add(ranks, offset), integers.as_pointer())
-        builder.store(builder.load(below), target, align=8)
-        return context.get_dummy_value()
-
-    return signature, codegen
 
 
 @intrinsic

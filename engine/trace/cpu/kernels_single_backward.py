@@ -130,19 +130,17 @@ def replay_rays(rays, which, offsets, hits, counts, scene, limits, g, shares):
 
 
 @lean(forceinline=True, fastmath={"contract"})
-def write_gradients(segment, i, parameters, records, sums, out):
+def write_gradients(segment, i, frame, quats, records, sums, out):
     """Gradients of one Gaussian's raw geometry from its sums over rays.
 
     In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point
     over <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau) r1, dL/dln s = S(h u^2), S(h v^2), and the
-    frame turns by the torque S r_i x dL/dr_i.
+    frame turns by the torque S r_i x dL/dr_i. ``frame`` are r1, r2, r3, s2 and s3.
     """
-    quats, log_scales = parameters.quats, parameters.log_scales
     q0, q1, q2, q3 = (
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
     )  # fmt: skip
-    r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
-    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    r1, r2, r3, s2, s3 = frame
     inv_s2, inv_s3 = 1.0 / s2, 1.0 / s3
     # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(sums.tau_u s2 r2 + sums.tau_v s3 r3) + normal channel
     on_r3, on_r2 = -sums.tau_u * s2, sums.tau_v * s3
@@ -256,7 +254,7 @@ def gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shar
         moments = Moments(
             s_h, s_hu, s_hv, s_huu, s_huv, s_hvv, s_tau, s_tau_u, s_tau_v, s_n0, s_n1, s_n2, s_m0, s_m1, s_m2
         )
-        write_gradients(segment, i, parameters, scene.records, moments, out)
+        write_gradients(segment, i, (r1, r2, r3, s2, s3), quats, scene.records, moments, out)
         for j in range(basis_count):
             for channel in range(3):
                 # degree 0 skips the basis in the loop above

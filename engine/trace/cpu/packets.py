@@ -142,7 +142,6 @@ class PacketTracer:
         rows = Rows(
             firsts=firsts,
             ids=self._pool.empty((count,), np.int32),
-            packets=self._pool.empty((count,), np.int32),
             sums=self._pool.empty((count, ROW_WORDS), np.float32),
             geometry=self._pool.empty((count, geometry), np.float32),
             features=np.empty((count, feature_count), np.float32),

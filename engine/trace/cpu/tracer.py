@@ -107,7 +107,9 @@ class CpuTracer:
         if len(alone):
             self._singles.trace(forward, alone)
         if record:
-            result.hits = CpuRecording(rays, result.hit_counts, packets, alone, hits, kept, self._build)
+            result.hits = CpuRecording(
+                rays, result.hit_counts, packets, alone, hits, kept, self._limits, self._build
+            )
         return result
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
