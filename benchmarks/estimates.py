@@ -20,7 +20,8 @@ import psutil
 from PIL import Image
 
 from engine.config import resolve_config
-from workers.records.sizes import Sizes, estimate_reconstruction
+from workers.records.sizes import Sizes
+from workers.work.kinds.estimates import estimate_reconstruction
 from workers.work.kinds.options import ReconstructOptions
 
 

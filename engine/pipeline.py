@@ -62,6 +62,7 @@ from engine.scene import Dataset, write_held_out
 from engine.scene.colmap import has_model
 from engine.scene.load import photograph_folder
 from engine.scene.near import NearZones, nearest_depths
+from engine.scene.seen import SeenSpace
 from engine.scene.views_file import ViewsRecord, read_views, write_views
 from engine.stages import StageClock, stage
 from engine.threads import use_threads
@@ -292,6 +293,7 @@ def _train(
         clock.add(state.seconds)
     nearest_world = nearest_depths(dataset.viewpoints, dataset.points)
     zones = NearZones.of(dataset.viewpoints, config.near_share * nearest_world, dataset.train_indices)
+    seen = SeenSpace.of(dataset.viewpoints, dataset.train_indices)
     trainer = Trainer(
         dataset,
         config,
@@ -303,6 +305,7 @@ def _train(
         should_stop=should_stop,
         scale_floor=_scale_floor(dataset, config),
         near_zones=zones if config.near_share > 0 else None,
+        seen_space=seen if config.materials.clears_unseen else None,
         onlooker=None if watch is None else lambda iteration, tracer: watch(iteration, dataset, tracer),
     )
     gaussians = trainer.run()

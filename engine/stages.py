@@ -27,6 +27,7 @@ DOING = {
     "meshing": "Meshing",
     "unwrapping": "Unwrapping",
     "colouring": "Colouring",
+    "fitting": "Fitting colours",
 }
 """What is being done at a stage, in a word or two."""
 

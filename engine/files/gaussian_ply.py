@@ -19,6 +19,7 @@ import numpy as np
 
 from engine.errors import ConfigError, SceneFileError
 from engine.files.channel_columns import ChannelChoice, chosen_columns
+from engine.files.octagon_reading import is_octagon_ply
 from engine.files.options import ExportOptions
 from engine.files.ply_container import (
     PlyElement,
@@ -188,7 +189,7 @@ def read_ply_cloud(path: Path, channels: ChannelChoice = "own") -> GaussianCloud
     table = read_ply(path, ["vertex"])[1]["vertex"]
     colours = columns(table, [*_SH_DC, *(f"f_rest_{k}" for k in range(rest_count))])
     rest = colours[:, 3:].reshape(len(table), 3, rest_count // 3).transpose(0, 2, 1)
-    found = chosen_columns(path, _declared(header.comments), vertex.names, channels)
+    found = chosen_columns(path, declared_channels(header.comments), vertex.names, channels)
     try:
         named = Channels({name: columns(table, own) for name, own in found.items()})
     except ConfigError as error:
@@ -203,12 +204,7 @@ def read_ply_cloud(path: Path, channels: ChannelChoice = "own") -> GaussianCloud
     )
 
 
-def channel_comments(widths: Mapping[str, int]) -> tuple[str, ...]:
-    """Comments that say which properties of a PLY are channels."""
-    return tuple(f"{_CHANNEL} {name} {width}" for name, width in widths.items())
-
-
-def _declared(comments: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def declared_channels(comments: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """The channels that a PLY's comments name, with their properties."""
     found = (comment.split() for comment in comments)
     return {
@@ -216,6 +212,11 @@ def _declared(comments: Sequence[str]) -> dict[str, tuple[str, ...]]:
         for words in found
         if len(words) == 3 and words[0] == _CHANNEL and words[2].isdecimal() and 0 < int(words[2]) < 1 << 16
     }
+
+
+def channel_comments(widths: Mapping[str, int]) -> tuple[str, ...]:
+    """Comments that say which properties of a PLY are channels."""
+    return tuple(f"{_CHANNEL} {name} {width}" for name, width in widths.items())
 
 
 def _rest_names(degree: int) -> list[str]:
@@ -263,7 +264,7 @@ def _write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tupl
 
 
 def _recognises(head: bytes) -> bool:
-    return head.startswith(b"ply") and b"packed_position" not in head
+    return head.startswith(b"ply") and b"packed_position" not in head and not is_octagon_ply(head)
 
 
 register(

@@ -32,6 +32,7 @@ from engine.surface.mesh import TriangleMesh
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 COLOURS = ("red", "green", "blue")
+PATTERNS = ("mesh.ply", "*.mesh.ply", "*_mesh.ply", "*-mesh.ply")
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 VERTEX = [
     *((name, "<f4") for name in (*_POSITION, "s", "t")),
@@ -203,7 +204,7 @@ def _face_rows(triangles: Int[np.ndarray, "t 3"]) -> np.ndarray:
 register(
     Exporter(
         "mesh-ply",
-        ("mesh.ply", "*.mesh.ply", "*_mesh.ply", "*-mesh.ply"),
+        PATTERNS,
         "octagon mesh as a binary PLY with Gaussian numbers, for editing",
         write_octagons,
         holds_channels=True,

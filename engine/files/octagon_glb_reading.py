@@ -13,19 +13,16 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from engine.colour import linear_to_srgb
-from engine.errors import SceneFileError
 from engine.files import gltf
 from engine.files.channel_columns import ChannelChoice, chosen_columns
 from engine.files.encodings import sh0_from_rgb
 from engine.files.gltf import GlbFile
+from engine.files.octagon_reading import TOLERANCE, edited, notes, placed_octagons
 from engine.gaussians.channels import Channels
 from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.octagon import SIDES, coordinate_rounding, corner_directions, frames_from_octagons
+from engine.gaussians.octagon import SIDES, corner_directions
 from engine.gaussians.rows import join_rows, select_rows
 
-TOLERANCE = 1e-3
-"""Octagons further from a regular one than this, as a share of their size, were edited."""
 UNLIT = "KHR_materials_unlit"
 
 
@@ -46,9 +43,8 @@ def read_octagons(file: GlbFile, path: Path, q: float, channels: ChannelChoice) 
     parts = [_part(file, path, q, channels, *found) for found in file.primitives()]
     ids = np.concatenate([own for _, own in parts])
     cloud = select_rows(join_rows([part for part, _ in parts]), np.argsort(ids, kind="stable"))
-    missing = int(file.document["asset"]["extras"].get("octasplat_gaussians", 0)) - len(ids)
-    notes = [f"Left out of its octagons were {missing:,} fainter Gaussians."] if missing > 0 else []
-    return replace(cloud, notes=("It holds one colour of each Gaussian, no harmonics.", *notes))
+    stated = int(file.document["asset"]["extras"].get("octasplat_gaussians", 0))
+    return replace(cloud, notes=notes(stated, len(ids)))
 
 
 def _part(
@@ -65,20 +61,14 @@ def _part(
     vertices = file.array(attributes["POSITION"], np.float64) @ turned[:3, :3].T + turned[:3, 3]
     offset = 2.0 * file.array(attributes["TEXCOORD_0"], np.float64) - 1.0
     if len(vertices) % SIDES or len(offset) != len(vertices):
-        raise _edited(path)
+        raise edited(path)
     corners = vertices.astype(np.float32).reshape(-1, SIDES, 3)
     offset = offset.reshape(-1, SIDES, 2)
     share = np.linalg.norm(offset, axis=2).mean(axis=1)
     if np.abs(offset - share[:, None, None] * corner_directions()).max(initial=0.0) > TOLERANCE:
-        raise _edited(path)
+        raise edited(path)
     radii = (share * np.sqrt(q)).astype(np.float32)
-    means, quats, log_scales, good = frames_from_octagons(corners, radii)
-    legs = rotation_matrices(quats.astype(np.float64))[:, :, 1:] * np.exp(log_scales)[:, None, :]
-    again = means[:, None] + np.einsum("kc,nic->nki", corner_directions(), legs * radii[:, None, None])
-    size = np.linalg.norm(corners - means[:, None], axis=2).max(axis=1)
-    off = np.linalg.norm(corners - again, axis=2).max(axis=1)
-    if not good.all() or (off > TOLERANCE * size + 4.0 * coordinate_rounding(corners)).any():
-        raise _edited(path)
+    means, quats, log_scales = placed_octagons(corners, radii, path)
     rgba = file.array(attributes["COLOR_0"], np.float32)[::SIDES]
     with np.errstate(divide="ignore"):
         logits = np.log(rgba[:, 3].astype(np.float64)) - np.log1p(-rgba[:, 3].astype(np.float64))
@@ -96,10 +86,3 @@ def _part(
         channels=Channels(named),
     )  # fmt: skip
     return cloud, ids
-
-
-def _edited(path: Path) -> SceneFileError:
-    return SceneFileError(
-        f"{path}: its octagons are not as they were exported; bring them back with octasplat edit --mesh, "
-        "which needs the scene that they came from."
-    )

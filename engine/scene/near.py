@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from engine.scene.cameras import Camera
 from engine.scene.model import PosedView, SparsePoints, Viewpoints
+from engine.scene.seen import is_shown, least_cosine, points_in_cam
 
 LEAST_POINTS = 50
 """Views that show fewer points say nothing about what is near."""
@@ -34,8 +35,8 @@ def nearest_depths(scene: Viewpoints, points: SparsePoints) -> Float64[np.ndarra
     rank = max(1, NEAREST // step) - 1
     found = np.zeros(len(scene.views))
     for k, view in enumerate(scene.views):
-        in_cam = _in_cam(xyz, view)
-        depths = in_cam[_is_shown(in_cam, scene.cameras[view.camera_index]), 2]
+        in_cam = points_in_cam(xyz, view)
+        depths = in_cam[is_shown(in_cam, scene.cameras[view.camera_index]), 2]
         if len(depths) >= LEAST_POINTS:
             found[k] = np.partition(depths, rank)[rank]
     return found
@@ -70,7 +71,7 @@ class NearZones:
         origins = np.stack([view.origin_world for view in self.views])
         # Nothing is in a zone that is farther from every camera than the corners of the deepest zone.
         reach = max(
-            depth / _least_cosine(self.cameras[view.camera_index])
+            depth / least_cosine(self.cameras[view.camera_index])
             for view, depth in zip(self.views, self.depths.tolist(), strict=True)
         )
         rows = np.flatnonzero(cKDTree(origins).query(xyz_world, distance_upper_bound=reach)[0] < np.inf)
@@ -78,39 +79,8 @@ class NearZones:
         for view, depth in zip(self.views, self.depths.tolist(), strict=True):
             if depth <= 0:
                 continue
-            in_cam = _in_cam(near, view)
+            in_cam = points_in_cam(near, view)
             close = np.flatnonzero((in_cam[:, 2] > 0) & (in_cam[:, 2] < depth))
-            shown = _is_shown(in_cam[close], self.cameras[view.camera_index])
+            shown = is_shown(in_cam[close], self.cameras[view.camera_index])
             inside[rows[close[shown]]] = True
         return inside
-
-
-def _in_cam(xyz_world: Float64[np.ndarray, "n 3"], view: PosedView) -> Float64[np.ndarray, "n 3"]:
-    """Camera coordinates, added up column by column: the same bits on any number of threads."""
-    columns = view.rotation_cam_from_world.T
-    parts = (xyz_world[:, k, None] * columns[k] for k in range(3))
-    return np.asarray(sum(parts) + view.translation_cam_from_world)
-
-
-def _is_shown(in_cam: Float64[np.ndarray, "n 3"], camera: Camera) -> Bool[np.ndarray, " n"]:
-    """Whether points before a camera lie in its picture."""
-    shown = in_cam[:, 2] > 0
-    before = in_cam[shown]
-    if camera.is_pinhole:
-        fx, fy, cx, cy = camera.pinhole_params
-        xy = before[:, :2] / before[:, 2:] * (fx, fy) + (cx, cy)
-    else:
-        xy = camera.project(before).reshape(-1, 2) if len(before) else np.zeros((0, 2))
-        # Far outside the picture some lens models fold back into it.
-        xy[before[:, 2] < 0.98 * _least_cosine(camera) * np.linalg.norm(before, axis=1)] = np.nan
-    with np.errstate(invalid="ignore"):
-        shown[shown] = ((xy >= 0) & (xy <= (camera.width_px, camera.height_px))).all(axis=1)
-    return shown
-
-
-def _least_cosine(camera: Camera) -> float:
-    """Of the angle between the camera's axis and the rays of its corners, 0.1 at least and if unknown."""
-    width, height = float(camera.width_px), float(camera.height_px)
-    corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-    cosines = camera.directions_cam(corners)[:, 2]
-    return max(float(np.min(cosines)), 0.1) if np.isfinite(cosines).all() else 0.1

@@ -51,6 +51,8 @@ class MaterialSettings(BaseModel):
         smooth_weight: of differences of albedo between neighbouring rays.
         smooth_gloss_weight: of differences of metallic and roughness between neighbouring rays, which change
             less over a thing than its colour does.
+        only_seen: whether Gaussians that lie in no photograph are taken away; reflected rays alone see those,
+            so that they would become lamps.
         white_weight: of the environment's colours; of their logarithms.
         even_weight: of differences between neighbouring texels; of their logarithms.
         harmonics_weight: of the harmonics' distance to what was shaded, once they are no longer seen.
@@ -91,6 +93,7 @@ class MaterialSettings(BaseModel):
     smooth_normal_weight: float = Field(0.1, ge=0)
     smooth_weight: float = Field(0.01, ge=0)
     smooth_gloss_weight: float = Field(0.08, ge=0)
+    only_seen: bool = True
     white_weight: float = Field(0.01, ge=0)
     even_weight: float = Field(0.03, ge=0)
     harmonics_weight: float = Field(0.01, ge=0)
@@ -109,6 +112,11 @@ class MaterialSettings(BaseModel):
         if isinstance(given, dict) and given.get("secondary_share") == 1:
             given = {name: value for name, value in given.items() if name != "secondary_share"}
         return given
+
+    @property
+    def clears_unseen(self) -> bool:
+        """Whether Gaussians that lie in no photograph are taken away; the seed lets them be."""
+        return self.learn and self.only_seen and self.recipe != "seed"
 
     @property
     def smooth_weights(self) -> tuple[float, ...]:

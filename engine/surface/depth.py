@@ -1,4 +1,4 @@
-"""Depth maps of a scene, rendered by the tracer and kept in a temporary file."""
+"""Depth maps and colours of a scene, rendered by the tracer and kept in a temporary file."""
 
 import os
 import tempfile
@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from engine.colour import to_bytes
 from engine.render.cameras import RenderCamera
 from engine.render.renderer import RenderedImage, render_rays
+from engine.surface.fitting import Pictures
 from engine.surface.options import SurfaceOptions
 from engine.trace.protocol import Tracer
 from engine.writing import telling_of_room
@@ -44,8 +46,8 @@ def render_depth_maps(
     options: SurfaceOptions,
     folder: Path,
     progress: Progress = lambda _done, _total: None,
-) -> DepthMaps:
-    """Render the depth maps of ``cameras`` into a file in ``folder``, 8 bytes a pixel.
+) -> tuple[DepthMaps, Pictures]:
+    """Render depth maps and colours from ``cameras`` into a file in ``folder``, 12 bytes a pixel.
 
     The file has no name, so that nothing is left of it whatever happens.
 
@@ -55,23 +57,26 @@ def render_depth_maps(
     sizes = [camera.width_px * camera.height_px for camera in cameras]
     with telling_of_room(folder), tempfile.TemporaryFile(dir=folder) as handle:
         # Not a file with holes: a full disk would end the program when they are filled.
-        os.posix_fallocate(handle.fileno(), 0, max(8, 8 * sum(sizes)))
-        stored = np.memmap(handle, dtype=np.float32, mode="r+", shape=(2 * sum(sizes),))
-    distances, cosines, start = [], [], 0
+        os.posix_fallocate(handle.fileno(), 0, max(12, 12 * sum(sizes)))
+        stored = np.memmap(handle, dtype=np.float32, mode="r+", shape=(3 * sum(sizes),))
+    distances, cosines, colours, start = [], [], [], 0
     black = np.zeros(3, np.float32)
     progress(0, len(cameras))
     for number, (camera, size) in enumerate(zip(cameras, sizes, strict=True)):
         shape = (camera.height_px, camera.width_px)
         distances.append(stored[start : start + size].reshape(shape))
         cosines.append(stored[start + size : start + 2 * size].reshape(shape))
-        start += 2 * size
+        colours.append(stored[start + 2 * size : start + 3 * size].view(np.uint8).reshape(*shape, 4))
+        start += 3 * size
         rays = camera.rays()
         image = render_rays(tracer, rays, black)
         distances[-1][...] = _distances(image, options)
         # The tracer turns normals to the viewer, so the dot product is negative.
         cosines[-1][...] = np.clip(-np.sum(image.normal_world * rays.directions_world, axis=-1), 0.0, 1.0)
+        colours[-1][...] = to_bytes(np.concatenate([image.rgb_srgb, image.alpha[..., None]], axis=2))
         progress(number + 1, len(cameras))
-    return DepthMaps(tuple(cameras), tuple(distances), tuple(cosines))
+    maps = DepthMaps(tuple(cameras), tuple(distances), tuple(cosines))
+    return maps, Pictures(tuple(cameras), tuple(colours))
 
 
 def _distances(image: RenderedImage, options: SurfaceOptions) -> Float32[np.ndarray, "h w"]:

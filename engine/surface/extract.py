@@ -12,17 +12,19 @@ from engine.colour import to_bytes
 from engine.events import Listener, ignore
 from engine.render.cameras import RenderCamera
 from engine.stages import counted_stage, stopping
+from engine.surface.backdrop import with_backdrop
 from engine.surface.clean import decimate, keep_large_components
 from engine.surface.colours import COLOURS, bake
 from engine.surface.depth import render_depth_maps
+from engine.surface.fitting import Palette, Pictures, TexturePalette, VertexPalette, fitted
 from engine.surface.holes import fill_holes
 from engine.surface.marching import surface_of
 from engine.surface.materials import MATERIALS, with_materials
 from engine.surface.mesh import EdgeReport, TriangleMesh, edge_report
 from engine.surface.options import SurfaceOptions
 from engine.surface.region import Region, choose_region, focus
-from engine.surface.texture import TextureLayout, lay_out
-from engine.surface.volume import BYTES_PER_BLOCK, Volume, fuse
+from engine.surface.texture import lay_out
+from engine.surface.volume import BYTES_PER_BLOCK, Volume, fuse, solid_where_unseen
 from engine.trace.protocol import Tracer
 
 TOLERANCE_VOXELS = 2.0
@@ -91,12 +93,12 @@ def extract_levels(
         cameras: where depth and colours are rendered from.
         options: all settings; ``max_triangles`` is passed over.
         levels: at most so many triangles; None keeps all.
-        scratch: folder for a temporary file of 8 bytes for every pixel of the depth maps.
+        scratch: folder for a temporary file of 12 bytes for every pixel of the depth maps.
         light_frame: bake materials, which the tracer then has as its first features
             (:func:`engine.surface.materials.material_features`), for light with these rows right, up and
             forward in the world; None bakes colours. Needs a texture.
-        listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``unwrapping`` (with a texture) and
-            ``colouring``.
+        listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``unwrapping`` (with a texture),
+            ``colouring`` and ``fitting`` (of colours).
         should_stop: asked now and then.
 
     Raises:
@@ -107,12 +109,14 @@ def extract_levels(
     if not options.unbounded and options.bounds is None:
         focus(cameras)  # complain before the long work
     with counted_stage("depth", tell, len(cameras)) as progress:
-        maps = render_depth_maps(tracer, cameras, options, scratch, progress)
+        maps, pictures = render_depth_maps(tracer, cameras, options, scratch, progress)
     region = choose_region(maps, options)
     with counted_stage("fusing", tell, 2 * len(cameras)) as progress:
         volume: Volume | None = fuse(maps, region, options, progress)
     del maps
     assert volume is not None
+    if options.unseen == "solid":
+        solid_where_unseen(volume, options.min_weight)
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
     steps = 3 + len(levels)
     with counted_stage("meshing", tell, steps) as progress:
@@ -133,14 +137,16 @@ def extract_levels(
     result = []
     for mesh in meshes:
         edges = edge_report(mesh.faces)
-        coloured = _coloured(tracer, cameras, options, mesh, region, light_frame, tell)
+        if options.backdrop:
+            mesh = with_backdrop(mesh, np.mean([camera.centre_world for camera in cameras], axis=0))
+        coloured = _coloured(tracer, pictures, options, mesh, region, light_frame, tell)
         result.append(ExtractedSurface(coloured, region, volume_bytes, found, closed, edges))
     return tuple(result)
 
 
 def _coloured(
     tracer: Tracer,
-    cameras: Sequence[RenderCamera],
+    pictures: Pictures,
     options: SurfaceOptions,
     mesh: TriangleMesh,
     region: Region,
@@ -152,30 +158,38 @@ def _coloured(
     if options.texture_side is None:
         assert light_frame is None, "materials need a texture"
         with counted_stage("colouring", tell, 0) as progress:
-            normals = mesh.vertex_normals()
-            rgb, seen = bake(mesh.vertices_world, normals, mesh, cameras, tracer, tolerance, progress)
-            return replace(mesh, rgb_srgb=_spread(mesh.vertices_world, rgb, seen))
+            points, normals = mesh.vertices_world, mesh.vertex_normals()
+            rgb, seen = bake(points, normals, mesh, pictures.cameras, tracer, tolerance, progress)
+        rgb = _fitted(VertexPalette(mesh), _spread(points, rgb, seen), pictures, options, tell)
+        return replace(mesh, rgb_srgb=rgb)
     with counted_stage("unwrapping", tell, 0):
         layout = lay_out(mesh, options.texture_side)
     with counted_stage("colouring", tell, 0) as progress:
         points, look = layout.points_world, COLOURS if light_frame is None else MATERIALS
-        baked, seen = bake(points, layout.normals_world, mesh, cameras, tracer, tolerance, progress, look)
-        return _textured(layout, _spread(points, baked, seen), seen, light_frame)
+        normals = layout.normals_world
+        baked, seen = bake(points, normals, mesh, pictures.cameras, tracer, tolerance, progress, look)
+        baked = _spread(points, baked, seen)
+    if light_frame is not None:
+        return with_materials(layout, baked, seen, light_frame)
+    rgb = _fitted(TexturePalette(layout), baked, pictures, options, tell)
+    return replace(layout.mesh, texture_srgb=to_bytes(layout.image(rgb)))
+
+
+def _fitted(
+    points: Palette,
+    baked: Float32[np.ndarray, "n 3"],
+    pictures: Pictures,
+    options: SurfaceOptions,
+    tell: Listener,
+) -> Float32[np.ndarray, "n 3"]:
+    if not options.fit:
+        return baked
+    with counted_stage("fitting", tell, len(pictures.cameras)) as progress:
+        return fitted(points, baked, pictures, progress)
 
 
 def _large_parts(mesh: TriangleMesh, options: SurfaceOptions) -> TriangleMesh:
     return keep_large_components(mesh, keep=options.keep_components, min_share=options.min_component)
-
-
-def _textured(
-    layout: TextureLayout,
-    baked: Float32[np.ndarray, "n c"],
-    seen: Bool[np.ndarray, " n"],
-    light_frame: Float64[np.ndarray, "3 3"] | None,
-) -> TriangleMesh:
-    if light_frame is not None:
-        return with_materials(layout, baked, seen, light_frame)
-    return replace(layout.mesh, texture_srgb=to_bytes(layout.image(baked)))
 
 
 def _spread(

@@ -16,8 +16,7 @@ class SurfaceOptions(BaseModel):
             cameras stand around.
         voxel: side of a voxel, world units (at the centre where ``unbounded``); None follows ``resolution``.
         resolution: voxels along the longest side of the region; None takes 512, or fewer where a voxel would
-        be
-            smaller than one and a half pixels of the depth maps.
+            be smaller than one and a half pixels of the depth maps.
         truncation: half width of the band around the surface in which distances are kept, in voxels; None
             takes 3 % of the cameras' distance, which is about what trained depths are off by, and at least 4.
         depth_trunc: depths beyond this do not count, world units; None keeps all.
@@ -26,10 +25,14 @@ class SurfaceOptions(BaseModel):
         min_alpha: pixels that the scene covers less than this have no depth.
         min_weight: weight that a voxel must have collected to count; a view that looks straight onto the
             surface gives 1.
+        unseen: what space near the surface is that no view saw: ``open`` leaves holes at its border,
+            ``solid`` closes the mesh there.
+        backdrop: put a sphere around everything that shows what the scene shows in the mesh's gaps.
         keep_components: how many connected parts to keep, largest first; None goes by ``min_component``.
         min_component: parts with less than this share of the largest part's area are removed.
         fill_holes: holes whose rim is shorter than this many voxels are closed; None closes all, 0 none.
         max_triangles: decimate to at most this many; None keeps all.
+        fit: correct the baked colours so that the mesh looks as like the scene from the cameras as it can.
         texture_side: bake colours into a square texture of this side, px; None bakes them into the vertices.
         max_memory_gb: refuse a volume that takes more, GB.
     """
@@ -46,10 +49,13 @@ class SurfaceOptions(BaseModel):
     depth_side: int = Field(640, ge=16, le=8192)
     min_alpha: float = Field(0.5, ge=0.5, lt=1)
     min_weight: float = Field(0.5, gt=0)
+    unseen: Literal["open", "solid"] = "open"
+    backdrop: bool = False
     keep_components: int | None = Field(None, ge=1)
     min_component: float = Field(0.01, ge=0, le=1)
     fill_holes: float | None = Field(0.0, ge=0)
     max_triangles: int | None = Field(None, ge=4)
+    fit: bool = True
     texture_side: int | None = Field(None, ge=64, le=16384)
     max_memory_gb: float = Field(4.0, gt=0)
 

@@ -82,6 +82,13 @@ def fuse(
     return Volume(region, table, blocks, values, weights)
 
 
+def solid_where_unseen(volume: Volume, min_weight: float) -> None:
+    """Take voxels that collected less than ``min_weight`` for the inside of things, in place."""
+    unseen = volume.weights < min_weight
+    volume.values[unseen] = -1.0
+    volume.weights[unseen] = min_weight
+
+
 def _lenses(maps: DepthMaps) -> list[tuple[float, float, float, float, np.ndarray, np.ndarray]]:
     return [
         (c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.rotation_cam_from_world, c.centre_world) for c in maps.cameras

@@ -7,7 +7,7 @@ preset serves a coin and a street.
 import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from engine.errors import ConfigError
 from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
@@ -17,6 +17,9 @@ from engine.trace.protocol import TraceSettings
 
 MOST_PLANNED_ITERATIONS = 30_000
 """Where a time decides their number, see :mod:`engine.train.within`."""
+
+FOR_SURFACE = 0.05
+"""Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""
 
 PresetName = Literal["fast", "standard", "paper"]
 
@@ -65,6 +68,9 @@ class LossWeights(_Frozen):
     ssim: float = Field(0.0, ge=0)
     opacity: float = Field(0.0, ge=0, description="mean opacity of the Gaussians that were hit")
     scale: float = Field(0.0, ge=0, description="mean in-plane scale of those, of the extent")
+    depth_normal: float = Field(
+        0.0, ge=0, description="one minus the cosine between normals and what depths span; not with materials"
+    )
 
 
 class McmcConfig(_Frozen):
@@ -186,6 +192,16 @@ class TrainConfig(_Frozen):
         if math.isqrt(value) ** 2 != value:
             raise ValueError("must be a square number, since a window has as many rows as columns")
         return value
+
+    @model_validator(mode="after")
+    def _has_neighbouring_rays(self) -> "TrainConfig":
+        alone = self.window_rays == 1 or self.loss.ssim > 0
+        if self.loss.depth_normal > 0 and not self.materials.learn and alone:
+            raise ValueError(
+                "loss.depth_normal compares neighbouring rays of windows: set window_rays to 64 and "
+                "loss.ssim to 0"
+            )
+        return self
 
 
 def iteration_count(config: TrainConfig, training_pixels: int) -> int:

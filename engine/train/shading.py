@@ -2,6 +2,7 @@
 
 from engine.shading.deferred import Deferred
 from engine.shading.exposure import Exposures
+from engine.shading.flattening import Flattening
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import ShadingModel
 from engine.train.config import TrainConfig
@@ -10,8 +11,10 @@ from engine.train.config import TrainConfig
 def make_shading(config: TrainConfig, views: int, extent_world: float) -> ShadingModel:
     """The model, untrained, for a dataset of so many views and that extent."""
     inner: ShadingModel = PLAIN
-    if config.materials.learn:
+    if config.materials.learn:  # it holds normals and depths together itself
         inner = make_deferred(config, extent_world)
+    elif config.loss.depth_normal > 0:
+        inner = Flattening(config.loss.depth_normal, window_rays=config.window_rays)
     if config.exposure:
         return Exposures(views, rate=config.rates.exposure, decay=config.rates.decay, inner=inner)
     return inner

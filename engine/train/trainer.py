@@ -4,12 +4,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from engine.errors import Cancelled, TrainingFailure
 from engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
 from engine.scene.near import NearZones
+from engine.scene.seen import SeenSpace
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
@@ -44,6 +46,7 @@ class Trainer:
         should_stop: asked wherever a run may stop, see :class:`engine.train.schedule.Schedule`.
         scale_floor: what no scale falls below.
         near_zones: where no Gaussian stays, whatever the strategy does.
+        seen_space: outside of which none stays.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: likewise.
         onlooker: shown the iterations done and the tracer as it is then, after each; it may trace without
@@ -72,6 +75,7 @@ class Trainer:
         should_stop: Callable[[], bool] = lambda: False,
         scale_floor: ScaleFloor | None = None,
         near_zones: NearZones | None = None,
+        seen_space: SeenSpace | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
         onlooker: Callable[[int, Tracer], None] | None = None,
@@ -80,6 +84,7 @@ class Trainer:
         self._onlooker = onlooker
         self._scale_floor = scale_floor
         self._near_zones = near_zones
+        self._seen_space = seen_space
         self._config = config
         self._folder = folder
         self._fingerprint = fingerprint
@@ -153,9 +158,10 @@ class Trainer:
         """The Gaussians to export, seen once more from all views."""
         state, machinery = self.state, self._machinery
         chosen = self._judge.choose(state, machinery.tracer, machinery.shading)
-        if self._near_zones is not None and (near := self._near_zones.holds(chosen.means_world)).any():
+        near, gone = self._where_nothing_stays(chosen)
+        if gone.any():
             state.taken_near += int((near & (chosen.opacity_logits > GONE_LOGIT)).sum())
-            chosen = chosen.select(np.flatnonzero(~near))
+            chosen = chosen.select(np.flatnonzero(~gone))
         if chosen is not state.gaussians:
             machinery.tracer.build(chosen, machinery.shading.features(chosen))
         self.views = self._view_judge.conclude(machinery.tracer, machinery.shading, state.left_out)
@@ -223,20 +229,32 @@ class Trainer:
 
     def _change(self) -> bool:
         """Change the set of Gaussians where that is due; whether it was."""
-        cleared = self._clear_near()  # first, so that the strategy can use those elsewhere
+        cleared = self._clear()  # first, so that the strategy can use those elsewhere
         return self._densify() or cleared
 
-    def _clear_near(self) -> bool:
-        """Make what is too near to a camera invisible, and so dead to the strategy; whether any was."""
-        state, zones = self.state, self._near_zones
-        if zones is None or state.iteration % self._config.densify.interval:
+    def _clear(self) -> bool:
+        """Make what is where nothing stays invisible, and so dead to the strategy; whether any was."""
+        state = self.state
+        if state.iteration % self._config.densify.interval:
             return False
-        near = np.flatnonzero(zones.holds(state.gaussians.means_world))
-        near = near[state.gaussians.opacity_logits[near] > GONE_LOGIT]
-        state.gaussians.opacity_logits[near] = GONE_LOGIT
-        state.adam.reset(near)
-        state.taken_near += len(near)
-        return len(near) > 0
+        near, gone = self._where_nothing_stays(state.gaussians)
+        gone &= state.gaussians.opacity_logits > GONE_LOGIT
+        state.taken_near += int((near & gone).sum())
+        rows = np.flatnonzero(gone)
+        state.gaussians.opacity_logits[rows] = GONE_LOGIT
+        state.adam.reset(rows)
+        return len(rows) > 0
+
+    def _where_nothing_stays(
+        self, gaussians: FlatGaussians
+    ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """Which Gaussians are too near to a camera, and which are that or in no view."""
+        near = gone = np.zeros(len(gaussians), np.bool_)
+        if self._near_zones is not None:
+            near = gone = self._near_zones.holds(gaussians.means_world)
+        if self._seen_space is not None:
+            gone = gone | ~self._seen_space.holds(gaussians.means_world)
+        return near, gone.copy()
 
     def _densify(self) -> bool:
         """Let the strategy change the set of Gaussians if it is time; whether it was."""

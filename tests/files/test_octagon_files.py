@@ -8,7 +8,8 @@ import OpenImageIO as oiio
 import pytest
 
 import engine.files.mesh_obj as obj_module
-from engine.files import ExportOptions, export_scene, octagon_soup
+from engine.errors import SceneFileError
+from engine.files import ExportOptions, export_scene, octagon_soup, read_scene
 from engine.files.ply_container import read_ply
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import (
@@ -62,6 +63,36 @@ def test_mesh_ply_comes_back_to_the_same_gaussians(make_scene: Make, tmp_path: P
     assert good.all()
     np.testing.assert_allclose(means, scene.means_world[ids], atol=1e-6)
     np.testing.assert_allclose(log_scales, scene.log_scales[ids], atol=1e-3)
+
+
+def test_mesh_ply_is_a_scene_with_one_colour_each(make_scene: Make, tmp_path: Path) -> None:
+    scene = make_scene(300)
+    label = np.arange(300, dtype=np.float32)[:, None]
+    export_scene(scene.with_channels({"label": label}), tmp_path / "mesh.ply")
+    (tmp_path / "mesh.ply").rename(tmp_path / "anything.ply")  # what it holds decides, not its name
+    back, report = read_scene(tmp_path / "anything.ply")
+    shown = octagon_radii(scene.opacities) > 0
+    kept = scene.select(shown)
+    assert 0 < len(back) == len(kept) < 300 and report.flattened == 0
+    assert "one colour" in report.notes[0] and f"{300 - len(kept)} fainter" in report.notes[1]
+    np.testing.assert_array_equal(back.channels["label"], label[shown])
+    np.testing.assert_allclose(back.means_world, kept.means_world, atol=2e-6)
+    np.testing.assert_allclose(back.scales, kept.scales, rtol=1e-3)
+    np.testing.assert_allclose(back.opacities, kept.opacities, atol=0.51 / 255)
+    np.testing.assert_allclose(back.base_rgb_srgb, kept.base_rgb_srgb.clip(0, 1), atol=0.51 / 255)
+
+
+def test_mesh_ply_that_was_edited_is_refused_as_a_scene(make_scene: Make, tmp_path: Path) -> None:
+    export_scene(make_scene(40), tmp_path / "mesh.ply")
+    header, tables = read_ply(tmp_path / "mesh.ply", ["vertex", "face"])
+    data = (tmp_path / "mesh.ply").read_bytes()
+    for name, change in (("x", lambda v: v * np.float32(1.1)), ("gid", lambda v: v * 0)):
+        vertex = tables["vertex"].copy()
+        vertex[name][: 8 * 20] = change(vertex[name][: 8 * 20])
+        start, size = header.data_offset, vertex.nbytes
+        (tmp_path / "b.ply").write_bytes(data[:start] + vertex.tobytes() + data[start + size :])
+        with pytest.raises(SceneFileError, match=r"b\.ply: .*octasplat edit --mesh"):
+            read_scene(tmp_path / "b.ply")
 
 
 def test_mesh_ply_of_more_than_one_batch(make_scene: Make, tmp_path: Path) -> None:

@@ -82,7 +82,10 @@ def test_photographs_that_do_not_fit_together_fail_with_the_reason(
     rng = np.random.default_rng(3)
     for number in range(4):
         write_png(images / f"{number}.png", rng.random((96, 128, 3)).astype(np.float32))
-    done = octasplat("submit", images, "--wait", "-o", tmp_path / "no", *FEW, "--server", machine.address)
+    to = ("--server", machine.address)
+    unknown = octasplat("submit", images, "--set", "train.raze=5", *to)
+    assert unknown.returncode == 1 and "train.raze: " in unknown.stderr
+    done = octasplat("submit", images, "--wait", "-o", tmp_path / "no", *FEW, *to)
     assert done.returncode == 1 and "Traceback" not in done.stderr
     assert "do not overlap enough" in done.stderr and "send a COLMAP model" in done.stderr
     assert not (tmp_path / "no").exists()

@@ -138,7 +138,7 @@ def test_stages_are_told_and_stopping_leaves_nothing(tracer, tmp_path):
     heard = []
     extract_surface(tracer, cameras, options, scratch=tmp_path, listener=heard.append)
     finished = [event.stage for event in heard if isinstance(event, StageFinished)]
-    assert finished == ["depth", "fusing", "meshing", "colouring"]
+    assert finished == ["depth", "fusing", "meshing", "colouring", "fitting"]
     for stop_at in range(1, 40, 9):
         asked = iter(range(1000))
         with pytest.raises(Cancelled):

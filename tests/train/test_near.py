@@ -10,6 +10,7 @@ from engine.gaussians.model import FlatGaussians, concatenate
 from engine.scene.cameras import Camera
 from engine.scene.model import PosedView, SparsePoints, Viewpoints
 from engine.scene.near import NearZones, nearest_depths
+from engine.scene.seen import SeenSpace
 from engine.train.state import fresh_state
 from engine.train.trainer import Trainer
 
@@ -81,3 +82,31 @@ def test_a_cloud_before_a_camera_does_not_outlive_the_training(tmp_path: Path) -
     assert zones.holds(left.means_world).any()
     assert trainer.views is not None and without.views is not None
     assert trainer.views.psnr["3.png"] > without.views.psnr["3.png"]
+
+
+def test_what_is_in_no_picture_is_unseen_and_does_not_outlive_the_training(tmp_path: Path) -> None:
+    world = FlatWorld()
+    camera = Camera("PINHOLE", (40.0, 40.0, 20.0, 20.0), 40, 40)  # sees half as far to each side as ahead
+    space = SeenSpace(world.views, (camera,))
+    first = world.views[0]
+    seen_cam = np.array([[0.0, 0.0, 0.01], [0.49, -0.49, 1.0], [50.0, 0.0, 101.0]])
+    unseen_cam = np.array([[0.51, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    alone = SeenSpace([first], (camera,))
+    for points_cam, expected in ((seen_cam, True), (unseen_cam, False)):
+        points_world = (points_cam - first.translation_cam_from_world) @ first.rotation_cam_from_world
+        assert (alone.holds(points_world) == expected).all()
+    assert not SeenSpace([], (camera,)).holds(seen_cam).any()
+
+    lamps = world.start(20, opacity=0.9)
+    lamps.means_world += np.float32([90.0, 0.0, 0.0])
+    assert not space.holds(lamps.means_world).any()
+
+    def trained(seen_space: SeenSpace | None) -> FlatGaussians:
+        start = fresh_state(concatenate([world.start(), lamps]), 0)
+        return Trainer(
+            world, small_config(), start, folder=tmp_path, fingerprint="test", listener=lambda _event: None,
+            threads=1, seen_space=seen_space,
+        ).run()  # fmt: skip
+
+    assert space.holds(trained(space).means_world).all()
+    assert not space.holds(trained(None).means_world).all()

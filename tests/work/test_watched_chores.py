@@ -22,11 +22,17 @@ FROZEN = """
 import asyncio, os, signal, sys, uuid
 import workers.records.database as database
 database.IDLE_SECONDS = 1
+database.TRANSACTION_SECONDS = 2
 
 async def main():
     async with database.open_pool(sys.argv[1], max_size=2) as pool, pool.connection() as connection:
         async with connection.transaction():
             await connection.execute("SELECT 1 FROM datasets WHERE id = %s FOR UPDATE", [sys.argv[2]])
+            if sys.argv[3] == "between statements sent together":
+                connection.pgconn.enter_pipeline_mode()
+                connection.pgconn.send_query_params(b"SELECT 1", None)
+                connection.pgconn.send_flush_request()
+                connection.pgconn.flush()
             os.kill(os.getpid(), signal.SIGSTOP)
 
 asyncio.run(main())
@@ -92,7 +98,8 @@ def test_progress_takes_bounded_room(bench: Bench) -> None:
     assert max(later - earlier for earlier, later in pairwise(kept)) <= 5
 
 
-def test_who_freezes_within_a_transaction_keeps_nobody_waiting(conninfo: str) -> None:
+@pytest.mark.parametrize("where", ["between statements", "between statements sent together"])
+def test_who_freezes_within_a_transaction_keeps_nobody_waiting(conninfo: str, where: str) -> None:
     assert max(IDLE_SECONDS, STATEMENT_SECONDS) <= 60
 
     async def put() -> None:
@@ -106,7 +113,7 @@ def test_who_freezes_within_a_transaction_keeps_nobody_waiting(conninfo: str) ->
 
     dataset = None  # type: ignore[var-annotated]
     asyncio.run(make())
-    command = [sys.executable, "-c", FROZEN, conninfo, str(dataset.id)]
+    command = [sys.executable, "-c", FROZEN, conninfo, str(dataset.id), where]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)})
     try:
         assert os.waitpid(process.pid, os.WUNTRACED)[1] == 0x7F | signal.SIGSTOP << 8

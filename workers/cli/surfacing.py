@@ -34,6 +34,17 @@ from workers.rendering.cameras import light_up
 MATERIAL_DEFAULTS = {"texture_side": 1024, "max_triangles": 60_000}
 """With materials, where nothing else is said."""
 
+ROOM: Mapping[str, object] = {
+    "unbounded": True,
+    "unseen": "solid",
+    "backdrop": True,
+    "resolution": 900,
+    "truncation": 3.0,
+    "min_weight": 0.3,
+    "depth_side": 480,
+}
+"""What suits pictures of a room, measured on one; see docs/surface.md."""
+
 
 @dataclass(frozen=True)
 class Asked:

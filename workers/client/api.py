@@ -180,13 +180,20 @@ def _checked(response: httpx.Response) -> httpx.Response:
         detail, errors = str(problem["detail"]), tuple(problem.get("errors") or ())
     except (ValueError, KeyError, TypeError):
         detail, errors = f"The service answered {response.status_code} to {response.request.url}.", ()
-    further = [str(e.get("detail")) for e in errors if e.get("detail") and str(e["detail"]) != detail]
+    further = [_named(e) for e in errors if e.get("detail") and str(e["detail"]) != detail]
     if further:
         more = f" and {len(further) - 5} more" if len(further) > 5 else ""
         detail = f"{detail} {' '.join(further[:5])}{more}"
     if response.status_code == 401:
         detail = f"{detail.split(':')[0]}: set {TOKEN}."
     raise ServiceError(detail, response.status_code, errors)
+
+
+def _named(error: Mapping[str, Any]) -> str:
+    """What is wrong, with the option that it is about."""
+    detail = str(error["detail"])
+    option = str(error.get("pointer", "")).partition("#/options/")[2].replace("/", ".")
+    return f"{option}: {detail}" if option and option.rpartition(".")[2] not in detail else detail
 
 
 def _retry_after(response: httpx.Response) -> float:

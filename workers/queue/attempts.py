@@ -304,15 +304,20 @@ async def _show(
     """Put results into the place of earlier ones; the one place where they become visible."""
     if note is not None:
         await note.confirm(connection, {result.sha256 for result in results})
-    async with connection.cursor() as cursor:
-        await cursor.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
-        await cursor.executemany(
-            """
-            INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type)
-            VALUES (%s, %s, %s, %s, %s)
-            """,
-            [(job.id, r.name, r.sha256, r.size_bytes, r.media_type) for r in results],
-        )
+    await connection.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
+    await connection.execute(
+        """
+        INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type)
+        SELECT %s, given.* FROM unnest(%s::text[], %s::text[], %s::bigint[], %s::text[]) AS given
+        """,
+        [
+            job.id,
+            [result.name for result in results],
+            [result.sha256 for result in results],
+            [result.size_bytes for result in results],
+            [result.media_type for result in results],
+        ],
+    )
 
 
 async def end_job(connection: Connection, job: Job, state: str, error: Mapping[str, Any] | None) -> None:

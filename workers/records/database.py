@@ -20,6 +20,10 @@ STATEMENT_SECONDS = 60
 """A statement that takes longer, as it waits for a lock or the database is overwhelmed, is given up."""
 IDLE_SECONDS = 30
 """A transaction of which nothing is heard for so long is undone; its process is gone or frozen."""
+TRANSACTION_SECONDS = 300
+"""None takes longer. The limits above do not count while a process is frozen between statements that it sends
+without waiting for each one's outcome (a pipeline, as of psycopg's ``executemany``, which is not used for
+that reason); this one does, where the server knows it (PostgreSQL 17)."""
 KEEPALIVES: Mapping[str, int] = {
     "keepalives": 1,
     "keepalives_idle": 10,
@@ -86,14 +90,30 @@ async def _bound(connection: Connection) -> None:
     settings = {
         "statement_timeout": f"{STATEMENT_SECONDS}s",
         "idle_in_transaction_session_timeout": f"{IDLE_SECONDS}s",
+        "transaction_timeout": f"{TRANSACTION_SECONDS}s",
         # The server's own view of a client that vanished.
         "tcp_keepalives_idle": str(KEEPALIVES["keepalives_idle"]),
         "tcp_keepalives_interval": str(KEEPALIVES["keepalives_interval"]),
         "tcp_keepalives_count": str(KEEPALIVES["keepalives_count"]),
     }
     await connection.set_autocommit(True)
-    await connection.execute(
-        "SELECT set_config(name, value, false) FROM unnest(%s::text[], %s::text[]) AS given (name, value)",
-        [list(settings), list(settings.values())],
-    )
+    await _set(connection, settings, is_local=False)
     await connection.set_autocommit(False)
+
+
+async def allow_long(connection: Connection, seconds: float) -> None:
+    """Let the transaction under way last, and be idle, for so long."""
+    limit = f"{seconds:g}s"
+    names = ("idle_in_transaction_session_timeout", "transaction_timeout")
+    await _set(connection, dict.fromkeys(names, limit), is_local=True)
+
+
+async def _set(connection: Connection, settings: Mapping[str, str], *, is_local: bool) -> None:
+    """Set what of this the server knows."""
+    await connection.execute(
+        """
+        SELECT set_config(name, value, %s) FROM unnest(%s::text[], %s::text[]) AS given (name, value)
+        WHERE EXISTS (SELECT FROM pg_settings WHERE pg_settings.name = given.name)
+        """,
+        [is_local, list(settings), list(settings.values())],
+    )

@@ -28,11 +28,13 @@ async def add_log_lines(
     connection: Connection, job_id: uuid.UUID, attempt: int, lines: Sequence[str]
 ) -> None:
     """Add lines to the log of a job."""
-    async with connection.cursor() as cursor:
-        await cursor.executemany(
-            "INSERT INTO job_logs (job_id, attempt, text) VALUES (%s, %s, %s)",
-            [(job_id, attempt, line.replace("\0", "\N{REPLACEMENT CHARACTER}")) for line in lines],
-        )
+    await connection.execute(
+        """
+        INSERT INTO job_logs (job_id, attempt, text)
+        SELECT %s, %s, line FROM unnest(%s::text[]) WITH ORDINALITY AS given (line, number) ORDER BY number
+        """,
+        [job_id, attempt, [line.replace("\0", "\N{REPLACEMENT CHARACTER}") for line in lines]],
+    )
 
 
 async def trim_log(connection: Connection, job_id: uuid.UUID, keep: int) -> None:

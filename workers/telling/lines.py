@@ -37,6 +37,7 @@ _DONE = {
     "meshing": ("Made the mesh", ""),
     "unwrapping": ("Cut the mesh open for the texture", ""),
     "colouring": ("Coloured", "point"),
+    "fitting": ("Fitted the colours to the renders", ""),
 }
 
 

@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
 from workers.queue.storing import give_up_silent, oldest_note, removing
-from workers.records.database import Connection, Pool
+from workers.records.database import Connection, Pool, allow_long
 from workers.records.references import references
 from workers.store.collect import Collected, Unused, remove, unchanged, unnamed, unused
 from workers.store.protocol import Storage
@@ -108,7 +108,7 @@ async def _turn(pool: Pool, storage: Storage, every_seconds: float) -> AsyncIter
             yield False
             return
         # Nobody waits for this row; who finds it locked leaves the collecting to others.
-        await connection.execute(f"SET LOCAL idle_in_transaction_session_timeout = '{COLLECT_SECONDS}s'")
+        await allow_long(connection, COLLECT_SECONDS)
         yield True
         await connection.execute("UPDATE installation SET collected_at = clock_timestamp()")
 

@@ -69,6 +69,11 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
     is_flag=True,
     help="Learn materials and the environment of shiny things; environment.hdr lies beside the scene then.",
 )
+@click.option(
+    "--for-surface",
+    is_flag=True,
+    help="Hold normals and depths together, so that octasplat surface gives a smoother mesh.",
+)
 @background_option("Behind renders and photographs with alpha in the evaluation.  [default: black]")
 @exports_option
 @click.option("--seed", type=int, metavar="N", help="Seed of everything random.  [default: 0]")
@@ -106,6 +111,7 @@ def reconstruct(**options: Any) -> None:
 def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
     """The settings asked for; with ``--resume`` and none given, those of the run."""
     from engine.config import read_config, resolve_config
+    from engine.train.config import FOR_SURFACE
 
     given = any(
         value not in (None, (), False) for name, value in options.items() if name not in _NOT_SETTINGS
@@ -116,6 +122,8 @@ def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
         return config if exports is None else config.model_copy(update={"exports": exports})
     direct = ("iterations", "rays", "max_gaussians", "sh_degree", "seed")
     assignments = [f"{name}={options[name]}" for name in direct if options[name] is not None]
+    if options["for_surface"]:
+        assignments.append(f"loss.depth_normal={FOR_SURFACE}")
     return resolve_config(
         options["preset"] or "standard",
         materials=options["materials"],

@@ -86,6 +86,15 @@ def _levels(_context: click.Context, _parameter: click.Parameter, value: str | N
     help="Longer side of the depth maps.  [default: 640]",
 )
 @click.option("--min-weight", type=click.FloatRange(0, min_open=True), help="Least evidence for a voxel.")
+@click.option(
+    "--unseen", type=click.Choice(["open", "solid"]),
+    help="Space that no view saw: open leaves holes there, solid closes the mesh.  [default: open]",
+)  # fmt: skip
+@click.option("--backdrop", is_flag=True, help="A sphere around everything that shows what lies in gaps.")
+@click.option(
+    "--room", is_flag=True,
+    help="What pictures of a room need: --unbounded --unseen solid --backdrop, and finer voxels.",
+)  # fmt: skip
 @click.option("--components", "keep_components", type=click.IntRange(1), help="Keep so many parts only.")
 @click.option(
     "--min-component",
@@ -129,6 +138,7 @@ def surface(
     output: Path,
     scene: Path | None,
     materials: bool,
+    room: bool,
     up: str | None,
     threads: int,
     quiet: bool,
@@ -147,10 +157,15 @@ def surface(
         raise click.UsageError("--up goes with --materials.")
     from engine.errors import Cancelled
     from workers.cli.signals import Stopped, stop_on_signals
-    from workers.cli.surfacing import Asked, run_surface
+    from workers.cli.surfacing import ROOM, Asked, run_surface
 
     # None means "all" for the holes, and the default for everything else.
-    options = {name: value for name, value in given.items() if value is not None or name == "fill_holes"}
+    options = {
+        name: value
+        for name, value in given.items()
+        if name == "fill_holes" or (value is not None and value is not False)
+    }
+    options = (ROOM if room else {}) | options
     levels = max_triangles or {}
     if len(levels) == 1:
         options["max_triangles"], levels = next(iter(levels.values())), {}

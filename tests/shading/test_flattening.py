@@ -1,0 +1,125 @@
+"""Training for a surface: normals and depths are held together, by the gradient of the term that is named."""
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from engine.config import resolve_config
+from engine.errors import ConfigError
+from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
+from engine.shading.flattening import Flattening
+from engine.shading.plain import PLAIN
+from engine.shading.protocol import Sight
+from engine.trace.cpu.tracer import CpuTracer
+from engine.trace.protocol import TraceResult
+from engine.train.state import fresh_state
+from engine.train.trainer import Trainer
+
+sys.path.append(str(Path(__file__).parents[1] / "train"))
+
+from flat_world import FlatWorld, small_config
+
+SIDE, WINDOWS, LOOSE = 4, 3, 5
+COUNT = LOOSE + WINDOWS * SIDE**2
+
+
+def wavy() -> Sight:
+    """A few loose rays, then windows on a wavy surface with normals that do not quite fit, and a hole."""
+    rng = np.random.default_rng(3)
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, SIDE), np.linspace(-0.3, 0.3, SIDE))
+    across = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    directions = np.concatenate([rng.normal((0, 0, 1), 0.1, (LOOSE, 3)), *[across] * WINDOWS])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    depth = 2 + 0.1 * np.sin(9 * directions[:, 0]) + 0.02 * rng.random(COUNT)
+    transmittance = rng.uniform(0.0, 0.08, COUNT)
+    transmittance[LOOSE + 6] = 0.5
+    alpha = 1 - transmittance
+    normals = rng.normal(0, 0.2, (COUNT, 3)) - [0, 0, 1]
+    numbers = (np.zeros((COUNT, 3)), transmittance, alpha * depth, depth, alpha[:, None] * normals)
+    narrow = [number.astype(np.float32) for number in (*numbers, np.zeros((COUNT, 0)))]
+    seen = TraceResult(*narrow, np.ones(COUNT, np.int32))
+    rays = RayBatch(np.zeros((1, 3)), directions)
+    return Sight(rays, seen, CpuTracer(), np.zeros(COUNT, np.int64))
+
+
+def term(
+    directions: torch.Tensor, alpha: torch.Tensor, depth_sum: torch.Tensor, normals: torch.Tensor
+) -> torch.Tensor:
+    """The sum over windows as it is defined, of rays whose three points are of one opaque surface."""
+    total = torch.zeros((), dtype=torch.float64)
+    points = directions * (depth_sum / alpha)[:, None]
+    for first in range(LOOSE, COUNT, SIDE**2):
+        for row in range(SIDE - 1):
+            for column in range(SIDE - 1):
+                here = first + row * SIDE + column
+                three = [here, here + 1, here + SIDE]
+                if not all(alpha[k] > 0.9 for k in three):
+                    continue
+                spanned = torch.linalg.cross(points[three[1]] - points[here], points[three[2]] - points[here])
+                spanned = spanned / spanned.norm()
+                spanned = spanned if spanned @ directions[here] < 0 else -spanned
+                if -(spanned @ directions[here]) > 0.15:
+                    total = total + 1 - spanned @ normals[here] / normals[here].norm()
+    return total
+
+
+def test_gradients_are_those_of_the_term_and_of_the_model_inside() -> None:
+    sight, weight = wavy(), 0.3
+    seen = sight.seen
+    rng = np.random.default_rng(4)
+    by_rgb, by_transmittance = rng.normal(size=(COUNT, 3)), rng.normal(size=COUNT)
+    by_rgb, by_transmittance = by_rgb.astype(np.float32), by_transmittance.astype(np.float32)
+    model = Flattening(weight, window_rays=SIDE**2)
+    found = model.reverse(sight, model.develop(sight), by_rgb, by_transmittance).seen
+
+    wide = (seen.alpha, seen.depth_sum, seen.normal_world)
+    alpha, depth, normals = (torch.tensor(x.astype(np.float64), requires_grad=True) for x in wide)
+    value = (
+        weight
+        * term(torch.tensor(sight.rays.directions_world, dtype=torch.float64), alpha, depth, normals)
+        / COUNT
+    )
+    value.backward()
+    assert value > 0.001
+    inside = PLAIN.reverse(sight, PLAIN.develop(sight), by_rgb, by_transmittance).seen
+    assert np.array_equal(found.rgb_srgb, inside.rgb_srgb)
+    assert found.depth_sum == pytest.approx(depth.grad.numpy(), abs=1e-5)
+    assert found.normal_world == pytest.approx(normals.grad.numpy(), abs=1e-5)
+    assert found.transmittance - by_transmittance == pytest.approx(-alpha.grad.numpy(), abs=1e-5)
+
+
+def tilted(world: FlatWorld) -> FlatGaussians:
+    """Gaussians on the plane, each turned out of it."""
+    gaussians = world.start(opacity=0.9)
+    turns = np.random.default_rng(5).normal(0, 0.15, (len(gaussians), 4))
+    gaussians.quats_wxyz += turns.astype(np.float32)
+    return gaussians
+
+
+def test_tilted_gaussians_lie_down_on_the_plane(tmp_path: Path) -> None:
+    world = FlatWorld()
+
+    def off_degrees(weight: float) -> float:
+        config = small_config(loss={"depth_normal": weight}, rays=2048, window_rays=16)
+        trainer = Trainer(
+            world, config, fresh_state(tilted(world), 0), folder=tmp_path, fingerprint=str(weight),
+            listener=lambda _event: None, threads=1,
+        )  # fmt: skip
+        trained = trainer.run()
+        solid = trained.opacities > 0.5
+        return math.degrees(np.arccos(np.abs(trained.rotations[solid, 2, 0]).clip(0, 1)).mean())
+
+    held, free = off_degrees(0.1), off_degrees(0.0)
+    assert held < 0.9 * free, (held, free)
+
+
+def test_settings_that_leave_no_neighbours_are_refused() -> None:
+    for with_it in ("window_rays=1", "loss.ssim=0.2"):
+        with pytest.raises(ConfigError, match="set window_rays to 64 and loss"):
+            resolve_config("fast", assignments=["loss.depth_normal=0.05", with_it])
+    resolve_config("fast", materials=True, assignments=["loss.depth_normal=0.05", "window_rays=1"])

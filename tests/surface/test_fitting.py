@@ -1,0 +1,96 @@
+"""Colours fitted to pictures, where the right ones are known; what closes a mesh beyond what was seen."""
+
+import numpy as np
+from surface_shapes import cameras_on_sphere, sphere, volume_of
+
+from engine.colour import to_bytes
+from engine.rays import RayBatch
+from engine.surface.backdrop import with_backdrop
+from engine.surface.fitting import Pictures, TexturePalette, VertexPalette, fitted
+from engine.surface.marching import surface_of
+from engine.surface.mesh import TriangleMesh, edge_report
+from engine.surface.texture import lay_out
+from engine.surface.volume import solid_where_unseen
+from engine.trace.meshes import TriangleScene
+
+
+def painted(points_world: np.ndarray) -> np.ndarray:
+    """Colours that change smoothly over a ball."""
+    return (0.5 + 0.4 * np.sin(2 * points_world)).astype(np.float32)
+
+
+def pictures_of(mesh: TriangleMesh, count: int = 20) -> Pictures:
+    """Of the painted surface, before nothing; alpha is one where there is surface."""
+    scene, cameras, images = TriangleScene(mesh.vertices_world, mesh.faces), [], []
+    for camera in cameras_on_sphere(count, 3.0, 96):
+        rays = camera.rays()
+        hits = scene.closest(rays.rays)
+        rgba = np.zeros((len(hits.hit), 4), np.float32)
+        at = rays.origin_world + hits.distances[hits.hit, None] * rays.rays.directions_world[hits.hit]
+        rgba[hits.hit, :3], rgba[hits.hit, 3] = painted(at), 1.0
+        cameras.append(camera)
+        images.append(to_bytes(rgba).reshape(96, 96, 4))
+    return Pictures(tuple(cameras), tuple(images))
+
+
+def ball() -> TriangleMesh:
+    mesh = surface_of(volume_of(lambda points: sphere(points, 1.0), 3, 0.125), 0.5)
+    return TriangleMesh(mesh.vertices_world, mesh.faces)
+
+
+def test_wrong_colours_of_vertices_are_put_right():
+    mesh = ball()
+    wrong = np.random.default_rng(0).random((len(mesh.vertices_world), 3)).astype(np.float32)
+    right = painted(mesh.vertices_world)
+    found = fitted(VertexPalette(mesh), wrong, pictures_of(mesh))
+    assert np.abs(found - right).mean() < 0.03 < 0.2 < np.abs(wrong - right).mean()
+    np.testing.assert_allclose(fitted(VertexPalette(mesh), right, pictures_of(mesh)), right, atol=0.03)
+
+
+def test_wrong_colours_of_a_texture_are_put_right():
+    layout = lay_out(ball(), 128)
+    right = painted(layout.points_world)
+    wrong = np.full_like(right, 0.5)
+    found = fitted(TexturePalette(layout), wrong, pictures_of(layout.mesh))
+    assert np.abs(found - right).mean() < 0.03 < 0.2 < np.abs(wrong - right).mean()
+
+
+def test_what_no_picture_shows_stays_as_it_was():
+    mesh = ball()
+    start = np.full((len(mesh.vertices_world), 3), 0.25, np.float32)
+    none = Pictures((), ())
+    np.testing.assert_array_equal(fitted(VertexPalette(mesh), start, none), start)
+
+
+def test_unseen_space_is_closed_where_it_is_solid():
+    def half_seen():
+        volume = volume_of(lambda points: sphere(points, 1.0), 3, 0.125)
+        volume.weights[len(volume.weights) // 2 :] = 0.1
+        return volume
+
+    assert edge_report(surface_of(half_seen(), 0.5).faces).open_edges > 0
+    volume = half_seen()
+    solid_where_unseen(volume, 0.5)
+    inside = np.abs(surface_of(volume, 0.5).vertices_world).max(axis=1) < 1.2
+    assert inside.sum() > 100
+    whole = surface_of(volume, 0.5)
+    rim = edge_report(whole.faces).open_edges
+    # Only where the grid itself ends is it still open.
+    ends = np.abs(whole.vertices_world).max(axis=1) > 1.3
+    assert rim <= 3 * ends.sum()
+
+
+def test_a_backdrop_stops_every_ray_and_is_one_closed_thing():
+    mesh = ball()
+    both = with_backdrop(mesh, np.zeros(3))
+    np.testing.assert_array_equal(both.faces[: len(mesh.faces)], mesh.faces)
+    sphere_only = both.select_faces(np.arange(len(mesh.faces), len(both.faces)))
+    assert edge_report(sphere_only.faces).watertight
+    ways = np.random.default_rng(0).standard_normal((1000, 3))
+    hits = TriangleScene(sphere_only.vertices_world, sphere_only.faces).closest(
+        RayBatch(np.zeros((1, 3)), ways / np.linalg.norm(ways, axis=1, keepdims=True))
+    )
+    assert hits.hit.all()
+    corners = sphere_only.face_corners_world
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((across * corners.mean(axis=1)).sum(axis=1) < 0).all()  # seen from inside
