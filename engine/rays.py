@@ -6,6 +6,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+AT_INFINITY = -np.inf
+"""Viewer of rays whose colours are those in their own direction."""
+
 
 @dataclass(frozen=True, init=False, eq=False)
 class RayBatch:
@@ -17,7 +20,14 @@ class RayBatch:
     begin at the mirror (:meth:`mirrored`), and the ways between a point light and many points are rays from
     the light that end at the points (:meth:`between`). Tracers follow neighbours with one origin together.
 
-    Origins and limits have one row a ray, or a single one that stands for all.
+    ``t_viewer`` says where on each ray its viewer stands. Colours that depend on the direction are those in
+    the direction from there to a Gaussian's mean, as in programs that draw splats. A camera's viewer is the
+    origin (0). Rays that go on from a surface have none there: so close to it the direction to a mean would
+    be any. Behind a mirror or clear glass the viewer stands as far back as the way has been long (below 0),
+    so that a pane that bends nothing changes nothing; behind anything else it is infinitely far away
+    (``AT_INFINITY``), and the direction is the ray's own.
+
+    Origins, limits and viewers have one row a ray, or a single one that stands for all.
 
     >>> rays = RayBatch(np.zeros((1, 3), np.float32), np.eye(3, dtype=np.float32)[:2], t_min=0.5)
     >>> len(rays), rays.t_min.tolist(), rays.t_max.tolist()
@@ -28,6 +38,7 @@ class RayBatch:
     directions_world: Float32[np.ndarray, "r 3"]
     t_min: Float32[np.ndarray, "#r"]
     t_max: Float32[np.ndarray, "#r"]
+    t_viewer: Float32[np.ndarray, "#r"]
 
     def __init__(
         self,
@@ -35,12 +46,14 @@ class RayBatch:
         directions_world: Float[np.ndarray, "r 3"],
         t_min: Float[np.ndarray, "#r"] | float = 0.0,
         t_max: Float[np.ndarray, "#r"] | float = np.inf,
+        t_viewer: Float[np.ndarray, "#r"] | float = 0.0,
     ) -> None:
         """Rays through ``directions_world``; a ``t_min`` below 0 counts as 0."""
         object.__setattr__(self, "origins_world", _for_kernels(origins_world))
         object.__setattr__(self, "directions_world", _for_kernels(directions_world))
         object.__setattr__(self, "t_min", _for_kernels(np.maximum(np.atleast_1d(t_min), 0)))
         object.__setattr__(self, "t_max", _for_kernels(np.atleast_1d(t_max)))
+        object.__setattr__(self, "t_viewer", _for_kernels(np.atleast_1d(t_viewer)))
 
     @classmethod
     def between(
@@ -67,9 +80,15 @@ class RayBatch:
         return RayBatch(
             *(
                 rows if len(rows) == 1 and len(self) != 1 else rows[which]
-                for rows in (self.origins_world, self.directions_world, self.t_min, self.t_max)
+                for rows in (
+                    self.origins_world, self.directions_world, self.t_min, self.t_max, self.t_viewer
+                )
             )
-        )
+        )  # fmt: skip
+
+    def up_to(self, t_max: Float[np.ndarray, "#r"] | float) -> "RayBatch":
+        """These rays with another end."""
+        return RayBatch(self.origins_world, self.directions_world, self.t_min, t_max, self.t_viewer)
 
     @cached_property
     def starts_world(self) -> Float32[np.ndarray, "r 3"]:
@@ -97,7 +116,7 @@ class RayBatch:
         origins, directions = self.origins_world.astype(np.float64), self.directions_world.astype(np.float64)
         origins -= 2 * ((origins - point_world) @ normal)[:, None] * normal
         directions -= 2 * (directions @ normal)[:, None] * normal
-        return RayBatch(origins, directions, np.maximum(t_mirror, self.t_min), self.t_max)
+        return RayBatch(origins, directions, np.maximum(t_mirror, self.t_min), self.t_max, self.t_viewer)
 
 
 @dataclass(frozen=True)

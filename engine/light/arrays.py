@@ -98,6 +98,7 @@ class Paths(NamedTuple):
         albedo_linear: colour of that mesh, white where it mirrors or lets through, times the same share.
         normals_world: its shading normal times the same share.
         densities: of the last direction over solid angle; 0 for the camera, mirrors and glass.
+        viewers: where on the next ray its viewer stands, see :class:`engine.rays.RayBatch`.
         inside: material that the path is in, -1 for air.
         marks: bits of :mod:`engine.light.kernels_path`.
         alive: whether the path goes on.
@@ -117,6 +118,7 @@ class Paths(NamedTuple):
     albedo_linear: Float32[np.ndarray, "p 3"]
     normals_world: Float32[np.ndarray, "p 3"]
     densities: Float32[np.ndarray, " p"]
+    viewers: Float32[np.ndarray, " p"]
     inside: Int32[np.ndarray, " p"]
     marks: Int32[np.ndarray, " p"]
     alive: Bool[np.ndarray, " p"]
@@ -244,7 +246,7 @@ def new_paths(count: int) -> Paths:
         np.empty(count, np.uint32), np.empty(count, np.int32),
         vectors(), vectors(), vectors(), vectors(), vectors(),
         np.empty(count, np.float32), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
-        vectors(), vectors(), np.empty(count, np.float32),
+        vectors(), vectors(), np.empty(count, np.float32), np.empty(count, np.float32),
         np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.bool_),
     )  # fmt: skip
 

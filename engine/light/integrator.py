@@ -277,6 +277,7 @@ class PathTracer:
                 paths.origins_world if depth == 0 else paths.origins_world[active],
                 paths.directions_world if depth == 0 else paths.directions_world[active],
                 near if depth == 0 else 0.0,
+                t_viewer=0.0 if depth == 0 else paths.viewers[active],
             )
             hits = meshes.triangles.closest(rays)
             shadows = new_shadow_rays(len(active))

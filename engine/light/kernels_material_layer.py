@@ -119,7 +119,7 @@ def start_at_points(first, last, scratch, at, pixels, samples, rules, materials,
             paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
             shadows.lit[k, channel] = 0.0
         paths.transmittance[k], paths.coverage[k], paths.things[k] = 1.0, 1.0, 0.0
-        paths.densities[k], paths.inside[k] = 0.0, -1
+        paths.densities[k], paths.viewers[k], paths.inside[k] = 0.0, 0.0, -1
         paths.marks[k], paths.alive[k] = FRONT, True
         _draw(paths, k, FIRST_PAIR + 1, numbers)
         point, n, material = at.points_world[k], at.normals_world[k], at.materials[k]

@@ -130,7 +130,7 @@ def start_paths(first, last, scratch, view, rules, first_pixel, per_pixel, first
             paths.layer_srgb[k, channel], paths.shade[k, channel] = 0.0, 0.0
             paths.albedo_linear[k, channel], paths.normals_world[k, channel] = 0.0, 0.0
         paths.transmittance[k], paths.coverage[k], paths.things[k] = 1.0, 1.0, 0.0
-        paths.densities[k], paths.inside[k] = 0.0, -1
+        paths.densities[k], paths.viewers[k], paths.inside[k] = 0.0, 0.0, -1
         paths.marks[k], paths.alive[k] = CLEAR | STRAIGHT, True
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from engine.light.kernels_bsdf import around, opaque_sample, opaque_value, sample_cosine
 from engine.light.kernels_lights import FAR, pick_light, sample_light
 from engine.light.kernels_surface import unit
+from engine.rays import AT_INFINITY
 from engine.trace.kernels_native import lean
 
 CLEAR = 1
@@ -29,7 +30,12 @@ SHORT_OF_LIGHT = 1.0 - 1e-4
 
 @lean(forceinline=True)
 def leave(paths, p, x, y, z, d_x, d_y, d_z, density):
-    """Send a path on."""
+    """Send a path on; its viewer is left behind, and lost where the path has been scattered."""
+    o = paths.origins_world[p]
+    if density > 0.0:
+        paths.viewers[p] = AT_INFINITY
+    else:
+        paths.viewers[p] -= math.sqrt((x - o[0]) ** 2 + (y - o[1]) ** 2 + (z - o[2]) ** 2)
     paths.origins_world[p, 0], paths.origins_world[p, 1], paths.origins_world[p, 2] = x, y, z
     paths.directions_world[p, 0], paths.directions_world[p, 1], paths.directions_world[p, 2] = d_x, d_y, d_z
     paths.densities[p] = density

@@ -52,7 +52,7 @@ class GaussianLayers:
 
     def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
         """What lies on rays up to a distance each."""
-        return self.tracer.trace(RayBatch(rays.origins_world, rays.directions_world, rays.t_min, t_max))
+        return self.tracer.trace(rays.up_to(t_max))
 
 
 def stage_layers(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from engine.rays import RayBatch
+from engine.rays import AT_INFINITY, RayBatch
 from engine.shading.split_sum import Surface
 from engine.trace.protocol import TraceResult
 
@@ -87,4 +87,4 @@ def reflected_rays(
     rise = (mirrored * normals).sum(axis=1, keepdims=True)
     mirrored += np.maximum(LEAST_RISE - rise, 0.0) * normals
     mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
-    return RayBatch(points, mirrored, gap_world)
+    return RayBatch(points, mirrored, gap_world, t_viewer=AT_INFINITY)

@@ -340,7 +340,7 @@ class Deferred:
             return surface, _Reflection(mirrored.trace, mirrored, facets)
         rays = reflected_rays(sight.rays, buffer, self._gap)
         if seed:
-            rays = RayBatch(rays.origins_world, rays.directions_world, rays.t_min, SEED_REACH)
+            rays = rays.up_to(SEED_REACH)
         seen = sight.tracer.trace(rays, record=record)
         visibility = (seen.transmittance > HIDDEN if seed else seen.transmittance).astype(np.float64)
         indirect = np.zeros_like(surface.indirect_linear)

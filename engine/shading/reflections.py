@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, UInt64
 
-from engine.rays import RayBatch
+from engine.rays import AT_INFINITY, RayBatch
 from engine.shading.buffer import Buffer, gather, reflected_rays, spread_back
 from engine.shading.environment_levels import LightLevels
 from engine.shading.split_sum import Surface, shade, shade_reverse
@@ -105,6 +105,7 @@ def mirrored_pair(rays: RayBatch, buffer: Buffer, facets: Facets, *, gap_world: 
         np.concatenate([one.origins_world, other.origins_world]),
         np.concatenate([one.directions_world, other.directions_world]),
         gap_world,
+        t_viewer=AT_INFINITY,
     )
 
 

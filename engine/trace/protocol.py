@@ -182,7 +182,8 @@ class Tracer(Protocol):
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Follow rays with unit directions; ``record`` keeps what :meth:`backward` needs.
 
-        A Gaussian is seen where ``t_min < t < t_max``.
+        A Gaussian is seen where ``t_min < t < t_max``, in its colour as the ray's viewer has it (``t_viewer``
+        of :class:`engine.rays.RayBatch`).
         """
         ...
 

@@ -108,6 +108,7 @@ def trace_reference(
     d = torch.tensor(rays.directions_world, dtype=torch.float64)
     o = torch.tensor(rays.origins_world, dtype=torch.float64).expand_as(d)
     t_min, t_max = (torch.tensor(limit).expand(len(d))[:, None] for limit in (rays.t_min, rays.t_max))
+    viewers = torch.tensor(rays.t_viewer, dtype=torch.float64).expand(len(d))
     frames = rotation_matrices(p.quats_wxyz)
     r1, r2, r3 = frames.unbind(-1)
     s2, s3 = p.log_scales.exp().unbind(-1)
@@ -131,7 +132,6 @@ def trace_reference(
     t32 = t.detach().float()
     hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0)
 
-    basis = sh_basis(d, p.sh.shape[1])
     out: list[list[Tensor]] = []
     hit_ids = []
     for ray in range(len(d)):
@@ -143,7 +143,12 @@ def trace_reference(
         al = alpha[ray, ids]
         through = torch.cat([torch.ones(1, dtype=torch.float64), torch.cumprod(1 - al, 0)])
         weight = al * through[:-1]  # alpha_k T_k
-        colour = torch.clamp(0.5 + torch.einsum("k,nkc->nc", basis[ray], p.sh[ids]), min=0)
+        # The direction from the viewer to the mean, the ray's own from infinitely far away.
+        view = d[ray].expand(len(ids), 3)
+        if viewers[ray].isfinite():
+            view = to_mean[ray, ids] - viewers[ray] * view
+        basis = sh_basis(view / view.norm(dim=-1, keepdim=True), p.sh.shape[1])
+        colour = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
         facing = -torch.sign(cosine[ray, ids].detach())
         crossing = torch.nonzero((through[:-1] > 0.5) & (through[1:] <= 0.5)).squeeze(-1)
         median = t[ray, ids[crossing[0]]] if len(crossing) else torch.zeros((), dtype=torch.float64)

@@ -1,6 +1,7 @@
 """Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
 
 import math
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -215,6 +216,36 @@ class BatchSource:
         if name == "random":
             return rng.random(3, dtype=np.float32)
         return still_background(self._config)
+
+
+class DrawnAhead:
+    """Draws batches, the next one beside whatever else goes on if it is asked for early.
+
+    The generator is drawn from in the order of the batches either way, so that they are the same ones.
+
+    Args:
+        source: where batches come from.
+    """
+
+    def __init__(self, source: BatchSource) -> None:
+        self._source = source
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="batch")
+        self._next: Future[Batch] | None = None
+
+    def __enter__(self) -> "DrawnAhead":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._worker.shutdown()
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """Begin the next batch; until :meth:`draw` gives it nothing else may draw from ``rng``."""
+        self._next = self._worker.submit(self._source.draw, rng)
+
+    def draw(self, rng: np.random.Generator) -> Batch:
+        """The next batch, begun or not."""
+        begun, self._next = self._next, None
+        return self._source.draw(rng) if begun is None else begun.result()
 
 
 def still_background(config: TrainConfig) -> Float32[np.ndarray, "3"]:

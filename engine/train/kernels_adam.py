@@ -2,9 +2,19 @@
 
 import math
 
+import llvmlite.ir as ir
 import numpy as np
-from numba import njit, prange
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
+from engine.trace.kernels_native import lean
+
+LANES = 16
+GEOMETRY = 3 + 4 + 2 + 1
+"""Columns of mean, quaternion, scales and opacity."""
+CHUNK = 512
+"""Gaussians that a thread takes at a time."""
 LEAST_SHARE = 1e-3
 """Numbers between 0 and 1 stay this far from both, so that they can come back."""
 
@@ -20,72 +30,165 @@ def _update(
     return value - rate * (m * correction1) / (math.sqrt(v * correction2) + epsilon)
 
 
+@intrinsic
+def step_lanes(typingctx, values, gradients, rates, first, second, count, numbers):
+    """One step for the first ``count`` of sixteen float32 at each address, in float32.
+
+    ``numbers`` are what both moments are multiplied by, both betas, one minus each, and epsilon.
+    """
+    address, single = types.uintp, types.float32
+    signature = types.void(*(address,) * 5, types.int64, types.UniTuple(single, 7))
+
+    def codegen(context, builder, sig, args):
+        *places, count, numbers = args
+        kind = ir.VectorType(ir.FloatType(), LANES)
+        lanes = ir.VectorType(ir.IntType(32), LANES)
+        pointer = ir.IntType(8).as_pointer()
+        mask_kind = ir.VectorType(ir.IntType(1), LANES)
+        load = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(kind, [pointer, ir.IntType(32), mask_kind, kind]),
+            f"llvm.masked.load.v{LANES}f32.p0",
+        )
+        store = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(ir.VoidType(), [kind, pointer, ir.IntType(32), mask_kind]),
+            f"llvm.masked.store.v{LANES}f32.p0",
+        )
+        root = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(kind, [kind]), f"llvm.sqrt.v{LANES}f32"
+        )
+
+        def everywhere(scalar, vector):
+            one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, _word(0))
+            return builder.shuffle_vector(
+                one, ir.Constant(vector, ir.Undefined), ir.Constant(lanes, [0] * LANES)
+            )
+
+        def times(a, b):
+            return builder.fmul(a, b, flags=("contract",))
+
+        numbers = [everywhere(number, kind) for number in cgutils.unpack_tuple(builder, numbers)]
+        correction1, correction2, beta1, beta2, rest1, rest2, epsilon = numbers
+        count = everywhere(builder.trunc(count, ir.IntType(32)), lanes)
+        mask = builder.icmp_signed("<", ir.Constant(lanes, list(range(LANES))), count)
+        zero, align = ir.Constant(kind, [0.0] * LANES), _word(4)
+        places = [builder.inttoptr(place, pointer) for place in places]
+        value, gradient, rate, m, v = (builder.call(load, [at, align, mask, zero]) for at in places)
+        m = builder.fadd(times(beta1, m), times(rest1, gradient), flags=("contract",))
+        v = builder.fadd(times(beta2, v), times(times(rest2, gradient), gradient), flags=("contract",))
+        below = builder.fadd(builder.call(root, [times(v, correction2)]), epsilon)
+        step = builder.fdiv(times(rate, times(m, correction1)), below)
+        for found, at in ((builder.fsub(value, step), 0), (m, 3), (v, 4)):
+            builder.call(store, [found, places[at], align, mask])
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _word(value):
+    return ir.Constant(ir.IntType(32), value)
+
+
+@lean(fastmath={"contract"})
+def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, corrections):
+    """One step of Gaussian ``i``, row ``k`` of the gradients; see :func:`adam_step`."""
+    first, second, numbers = state
+    means, quats, log_scales, logits, sh = gaussian
+    g_means, g_quats, g_log_scales, g_logits, g_sh = gradients
+    rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps = rates
+    opacity_weight, scale_weight, min_log_scale, max_log_scale = regular
+    values, by_values, by_rates = room[0], room[1], room[2]
+    scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    rate = rate_mean
+    if mean_by_size:
+        rate *= math.sqrt(scale_0 * scale_1)
+    for axis in range(3):
+        values[axis], by_values[axis], by_rates[axis] = 0.0, g_means[k, axis], rate  # the step alone
+    for axis in range(4):
+        values[3 + axis], by_values[3 + axis], by_rates[3 + axis] = (
+            quats[i, axis], g_quats[k, axis], rate_quat,
+        )  # fmt: skip
+    for axis in range(2):
+        values[7 + axis], by_rates[7 + axis] = log_scales[i, axis], rate_log_scale
+    by_values[7] = g_log_scales[k, 0] + scale_weight * scale_0
+    by_values[8] = g_log_scales[k, 1] + scale_weight * scale_1
+    opacity = 0.0
+    if opacity_weight != 0.0:
+        opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
+    values[9], by_rates[9] = logits[i], rate_opacity
+    by_values[9] = g_logits[k] + opacity_weight * opacity * (1.0 - opacity)
+    first_at = first.ctypes.data + i * first.shape[1] * 4
+    second_at = second.ctypes.data + i * second.shape[1] * 4
+    values_at, by_values_at, by_rates_at = values.ctypes.data, by_values.ctypes.data, by_rates.ctypes.data
+    step_lanes(values_at, by_values_at, by_rates_at, first_at, second_at, GEOMETRY, numbers)
+    columns = sh.shape[1] * 3
+    for column in range(0, columns, LANES):
+        step_lanes(
+            sh.ctypes.data + (i * columns + column) * 4,
+            g_sh.ctypes.data + (k * columns + column) * 4,
+            rates_sh.ctypes.data + column * 4,
+            first_at + (GEOMETRY + column) * 4,
+            second_at + (GEOMETRY + column) * 4,
+            columns - column,
+            numbers,
+        )
+    for axis in range(3):
+        mean_steps[k, axis] = values[axis]
+        means[i, axis] += values[axis]
+    for axis in range(4):
+        quats[i, axis] = values[3 + axis]
+    for axis in range(2):
+        log_scales[i, axis] = min(max(np.float64(values[7 + axis]), min_log_scale), max_log_scale)
+    logits[i] = values[9]
+
+
+@lean(fastmath={"contract"})
+def step_chunk(begin, end, ids, steps, powers, room, state, gaussian, gradients, rates, regular, corrections):
+    """:func:`step_gaussian` for rows ``begin`` to ``end``."""
+    first, second, beta1, beta2, epsilon = state
+    for k in range(begin, end):
+        i = ids[k]
+        steps[i] += 1
+        c1, c2 = 1.0 / (1.0 - powers[0, steps[i]]), 1.0 / (1.0 - powers[1, steps[i]])
+        corrections[k, 0], corrections[k, 1] = c1, c2
+        numbers = (
+            np.float32(c1), np.float32(c2), np.float32(beta1), np.float32(beta2),
+            np.float32(1.0 - beta1), np.float32(1.0 - beta2), np.float32(epsilon),
+        )  # fmt: skip
+        step_gaussian(k, i, room, (first, second, numbers), gaussian, gradients, rates, regular, corrections)
+
+
 @njit(cache=True, parallel=True)
 def adam_step(
-    ids, steps, first, second,
+    ids, steps, powers, first, second,
     means, quats, log_scales, logits, sh,
     g_means, g_quats, g_log_scales, g_logits, g_sh,
-    rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rate_sh0, rate_sh_rest,
+    rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rates_sh,
     opacity_weight, scale_weight, min_log_scale, max_log_scale,
     beta1, beta2, epsilon, mean_steps, corrections,
 ):  # fmt: skip
     """One step for the Gaussians ``ids``; each has its own step count for the bias correction.
 
+    ``powers`` are those of ``beta1`` and ``beta2``, for as many steps as any has taken and one more.
     ``rate_mean`` is in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric
-    mean of its two scales.
+    mean of its two scales. ``rates_sh`` are those of the harmonics' coefficients, one after the other.
 
     ``opacity_weight`` and ``scale_weight`` add the gradients of their regularisers. ``mean_steps`` receives
     each mean's step, world units, and ``corrections`` what both moments are multiplied by.
     """
-    basis_count = sh.shape[1]
-    for k in prange(len(ids)):
-        i = ids[k]
-        steps[i] += 1
-        c1 = 1.0 / (1.0 - beta1 ** steps[i])
-        c2 = 1.0 / (1.0 - beta2 ** steps[i])
-        corrections[k, 0], corrections[k, 1] = c1, c2
-        column = 0
-        rate = rate_mean
-        if mean_by_size:
-            rate *= math.exp(0.5 * (np.float64(log_scales[i, 0]) + np.float64(log_scales[i, 1])))
-        for axis in range(3):
-            old = np.float64(means[i, axis])
-            new = _update(
-                old, np.float64(g_means[k, axis]),
-                first, second, i, column, rate, c1, c2, beta1, beta2, epsilon,
-            )  # fmt: skip
-            means[i, axis] = new
-            mean_steps[k, axis] = new - old
-            column += 1
-        for axis in range(4):
-            quats[i, axis] = _update(
-                np.float64(quats[i, axis]), np.float64(g_quats[k, axis]),
-                first, second, i, column, rate_quat, c1, c2, beta1, beta2, epsilon,
-            )  # fmt: skip
-            column += 1
-        for axis in range(2):
-            value = np.float64(log_scales[i, axis])
-            value = _update(
-                value, np.float64(g_log_scales[k, axis]) + scale_weight * math.exp(value),
-                first, second, i, column, rate_log_scale, c1, c2, beta1, beta2, epsilon,
-            )  # fmt: skip
-            log_scales[i, axis] = min(max(value, min_log_scale), max_log_scale)
-            column += 1
-        value = np.float64(logits[i])
-        opacity = 1.0 / (1.0 + math.exp(-value))
-        logits[i] = _update(
-            value, np.float64(g_logits[k]) + opacity_weight * opacity * (1.0 - opacity),
-            first, second, i, column, rate_opacity, c1, c2, beta1, beta2, epsilon,
+    count = len(ids)
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        room = np.zeros((3, LANES), np.float32)
+        step_chunk(
+            chunk * CHUNK, min(count, (chunk + 1) * CHUNK), ids, steps, powers, room,
+            (first, second, beta1, beta2, epsilon),
+            (means, quats, log_scales, logits, sh),
+            (g_means, g_quats, g_log_scales, g_logits, g_sh),
+            (rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps),
+            (opacity_weight, scale_weight, min_log_scale, max_log_scale),
+            corrections,
         )  # fmt: skip
-        column += 1
-        for j in range(basis_count):
-            rate = rate_sh0 if j == 0 else rate_sh_rest
-            for channel in range(3):
-                sh[i, j, channel] = _update(
-                    np.float64(sh[i, j, channel]), np.float64(g_sh[k, j, channel]),
-                    first, second, i, column, rate, c1, c2, beta1, beta2, epsilon,
-                )  # fmt: skip
-                column += 1
 
 
 @njit(cache=True, parallel=True)

@@ -8,6 +8,7 @@ from scipy.ndimage import correlate1d
 
 from engine.train.batches import Batch
 from engine.train.config import LossWeights
+from engine.train.kernels_losses import CHUNKS, pixel_terms
 
 C1, C2 = 0.01**2, 0.03**2
 WINDOW, SIGMA = 11, 1.5
@@ -115,13 +116,10 @@ def pixel_loss(
     l2: float,
 ) -> BatchLoss:
     """L1 and squared error, averaged over the rays of non-zero weight and the channels."""
-    difference = render - target
     valid = max(float(weight.sum(dtype=np.float64)), 1.0)
-    per_ray = weight[:, None]
-    absolute = np.abs(difference) * per_ray
-    squared = difference * difference * per_ray
-    mse = float(squared.sum(dtype=np.float64)) / (3 * valid)
-    value = l1 * float(absolute.sum(dtype=np.float64)) / (3 * valid) + l2 * mse
-    gradient = (np.float32(l1) * np.sign(difference) + np.float32(2 * l2) * difference) * per_ray
-    gradient /= np.float32(3 * valid)
-    return BatchLoss(value, gradient.astype(np.float32), mse)
+    gradient, sums = np.empty(render.shape, np.float32), np.empty((CHUNKS, 2))
+    pixel_terms(
+        render, target, weight, np.float32(l1 / (3 * valid)), np.float32(2 * l2 / (3 * valid)), gradient, sums
+    )
+    absolute, squared = sums.sum(axis=0) / (3 * valid)
+    return BatchLoss(float(l1 * absolute + l2 * squared), gradient, float(squared))

@@ -4,6 +4,7 @@ After "Adam: A Method for Stochastic Optimization" (https://arxiv.org/abs/1412.6
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
@@ -12,10 +13,9 @@ from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.gaussians.rows import join_rows, row_arrays, select_rows
 from engine.trace.protocol import GaussianGradients
 from engine.train.config import LearningRates, LossWeights
-from engine.train.kernels_adam import adam_shares, adam_step
+from engine.train.kernels_adam import GEOMETRY, adam_shares, adam_step
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-_GEOMETRY_COLUMNS = 3 + 4 + 2 + 1
 
 
 @dataclass
@@ -36,7 +36,7 @@ class Adam:
     @classmethod
     def fresh(cls, gaussians: FlatGaussians) -> "Adam":
         """Zero moments for ``gaussians``."""
-        count, columns = len(gaussians), _GEOMETRY_COLUMNS + 3 * gaussians.sh.shape[1]
+        count, columns = len(gaussians), GEOMETRY + 3 * gaussians.sh.shape[1]
         named = sum(gaussians.channels.widths.values())
         return cls(
             np.zeros((count, columns), np.float32),
@@ -61,7 +61,7 @@ class Adam:
 
     def widen(self, basis_count: int) -> "Adam":
         """Room for ``basis_count`` harmonics; the new ones start with zero moments."""
-        extra = _GEOMETRY_COLUMNS + 3 * basis_count - self.first.shape[1]
+        extra = GEOMETRY + 3 * basis_count - self.first.shape[1]
         pad = ((0, 0), (0, extra))
         return replace(self, first=np.pad(self.first, pad), second=np.pad(self.second, pad))
 
@@ -95,15 +95,18 @@ class Adam:
         decay = rates.decay**progress
         colour = rates.colour / SH_C0 * decay
         mean_unit = extent if rates.mean_of == "extent" else 1.0
+        rates_sh = np.full(3 * gaussians.sh.shape[1], colour * rates.sh_rest_ratio, np.float32)
+        rates_sh[:3] = colour
         adam_step(
-            gradients.ids, self.steps, self.first, self.second,
+            gradients.ids, self.steps, _powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length()),
+            self.first, self.second,
             gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales,
             gaussians.opacity_logits, gaussians.sh,
             gradients.means_world, gradients.quats_wxyz, gradients.log_scales,
             gradients.opacity_logits, gradients.sh,
             mean_unit * rates.mean * (rates.mean_final / rates.mean) ** progress, rates.mean_of == "size",
             rates.quat * decay, rates.log_scale * decay, rates.opacity * decay,
-            colour, colour * rates.sh_rest_ratio,
+            rates_sh,
             loss.opacity / hit, loss.scale / (2 * hit * extent),
             float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
             BETA1, BETA2, EPSILON, moved, corrections,
@@ -130,3 +133,9 @@ class Adam:
                     gradients.features[:, column : column + width], rate * decay, BETA1, BETA2, EPSILON,
                 )  # fmt: skip
             column += width
+
+
+@cache
+def _powers(count: int) -> Float64[np.ndarray, "2 s"]:
+    """Powers 0 to ``count`` - 1 of both betas."""
+    return np.array([[beta**k for k in range(count)] for beta in (BETA1, BETA2)])

@@ -15,7 +15,7 @@ from engine.scene.seen import SeenSpace
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
-from engine.train.batches import BatchSource, TrainingData
+from engine.train.batches import BatchSource, DrawnAhead, TrainingData
 from engine.train.checkpoint import save_checkpoint
 from engine.train.config import TrainConfig, most_gaussians
 from engine.train.densify import make_densifier
@@ -91,6 +91,7 @@ class Trainer:
         self._tell = listener
         self._should_stop = should_stop
         self._extent = dataset.extent
+        self._threads = threads
         self._batches = BatchSource(dataset, config)
         pixels = self._batches.sampler.pixel_count
         self.schedule = Schedule.of(config, pixels)
@@ -123,6 +124,10 @@ class Trainer:
             TrainingFailure: parameters became not-a-number, or nothing is left to see.
             Cancelled: stopped as asked; a checkpoint is on disk.
         """
+        with DrawnAhead(self._batches) as batches:
+            return self._run(batches)
+
+    def _run(self, batches: DrawnAhead) -> FlatGaussians:
         state, schedule, machinery = self.state, self.schedule, self._machinery
         watch, began_at = Stopwatch(state.seconds), state.iteration
         stale = True  # whether the hierarchy is of other Gaussians
@@ -137,7 +142,9 @@ class Trainer:
                 self._build()
             if schedule.ends(state.iteration):
                 return self._conclude()
-            batch = self._batches.draw(state.rng)
+            batch = batches.draw(state.rng)
+            if self._threads != 1 and not self._draws_or_stops(state.iteration + 1):
+                batches.begin(state.rng)
             progress = schedule.progress(state.iteration)
             found = iterate(state, batch, machinery, self._config, progress=progress, extent=self._extent)
             stale = schedule.may_densify(state.iteration) and self._change()
@@ -161,6 +168,12 @@ class Trainer:
         if (complaint := self.views.complaint()) is not None:
             self._tell(Warned(complaint))
         return chosen
+
+    def _draws_or_stops(self, done: int) -> bool:
+        """Whether, that far, anything but a batch draws from the generator or keeps its state."""
+        schedule = self.schedule
+        densifies = schedule.may_densify(done) and self._machinery.densifier.due(done)
+        return densifies or schedule.ends(done) or schedule.rebuilds(done, len(self.state.gaussians))
 
     def _build(self) -> None:
         gaussians, machinery = self.state.gaussians, self._machinery

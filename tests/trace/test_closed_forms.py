@@ -6,7 +6,7 @@ from trace_scenes import f32, facing_z, make_tracer
 
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.octagon import octagon_corners_world, octagon_radii
-from engine.rays import RayBatch
+from engine.rays import AT_INFINITY, RayBatch
 from engine.trace.protocol import TraceGradients, TraceResult
 
 pytestmark = pytest.mark.usefixtures("both_ways")
@@ -135,14 +135,33 @@ def test_colour_is_clamped_at_zero_without_gradient() -> None:
     np.testing.assert_allclose(gradients.sh[0, 0], np.array([0, 0.5, 0.5]) * 0.28209479, rtol=1e-5)
 
 
-def test_harmonics_depend_on_the_direction_of_the_ray() -> None:
+def test_harmonics_are_those_of_the_direction_to_the_mean() -> None:
     lobe = facing_z([0, 0, 0], opacities=0.5, rgb_srgb=0.5)
     lobe.sh = np.concatenate([lobe.sh, np.zeros((1, 3, 3), np.float32)], axis=1)
     lobe.sh[0, 2] = [0.5, 0.0, -0.5]  # the z lobe
-    both = make_tracer(lobe).trace(RayBatch(f32([[0, 0, -2], [0, 0, 2]]), f32([[0, 0, 1], [0, 0, -1]])))
     swing = 0.4886025119029199 * 0.5
-    expected = 0.5 * np.array([[0.5 + swing, 0.5, 0.5 - swing], [0.5 - swing, 0.5, 0.5 + swing]])
-    np.testing.assert_allclose(both.rgb_srgb, expected, atol=1e-6)
+    front, back = [0.5 + swing, 0.5, 0.5 - swing], [0.5 - swing, 0.5, 0.5 + swing]
+    # Two rays from each side: through the centre, and past it at an angle, which shows the same colour.
+    directions = np.array([[0, 0, 1], [0.6, 0, 2], [0, 0, -1], [0.6, 0, -2]])
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    rays = RayBatch(f32([[0, 0, -2], [0, 0, -2], [0, 0, 2], [0, 0, 2]]), f32(directions))
+    seen = make_tracer(lobe).trace(rays)
+    np.testing.assert_allclose(seen.alpha[[0, 2]], 0.5, rtol=1e-6)
+    assert (seen.alpha[[1, 3]] < 0.49).all()
+    np.testing.assert_allclose(seen.rgb_srgb / seen.alpha[:, None], [front, front, back, back], atol=1e-6)
+
+
+def test_a_viewer_at_infinity_sees_along_the_ray() -> None:
+    lobe = facing_z([0, 0, 0], opacities=0.5, rgb_srgb=0.5)
+    lobe.sh = np.concatenate([lobe.sh, np.zeros((1, 3, 3), np.float32)], axis=1)
+    lobe.sh[0, 2] = [0.5, 0.0, -0.5]  # the z lobe
+    direction = np.array([0.6, 0.0, 0.8])
+    for viewer, z in ((AT_INFINITY, 0.8), (0.0, 1.0), (-5.0, 5 / np.hypot(3, 5))):
+        # From (0, 0, -1): the way from the viewer at t < 0 to the mean is (0, 0, 1) - t direction.
+        seen = make_tracer(lobe).trace(RayBatch(f32([[0, 0, -1]]), f32([direction]), t_viewer=viewer))
+        swing = 0.4886025119029199 * 0.5 * z
+        expected = [0.5 + swing, 0.5, 0.5 - swing]
+        np.testing.assert_allclose(seen.rgb_srgb[0] / seen.alpha[0], expected, atol=1e-6)
 
 
 def test_stop_behind_the_gaussian_that_passes_the_threshold() -> None:

@@ -18,7 +18,8 @@ def test_nothing_is_copied_and_single_limits_stay_single(rng: np.random.Generato
 @pytest.mark.parametrize("which", [slice(1, 3), np.array([3, 0]), np.array([True, False, False, True])])
 def test_a_part_of_a_batch(rng: np.random.Generator, which: slice | np.ndarray) -> None:
     directions, t_max = f32(rng.normal(size=(4, 3))), f32([1, 2, 3, 4])
-    part = RayBatch(np.ones((1, 3)), directions, 0.5, t_max)[which]
+    part = RayBatch(np.ones((1, 3)), directions, 0.5, t_max, -t_max)[which].up_to(t_max[which])
+    np.testing.assert_array_equal(part.t_viewer, -t_max[which])
     np.testing.assert_array_equal(part.directions_world, directions[which])
     np.testing.assert_array_equal(part.t_max, t_max[which])
     assert part.origins_world.tolist() == [[1, 1, 1]] and part.t_min.tolist() == [0.5]
@@ -39,12 +40,13 @@ def test_mirrored_rays_of_one_origin_have_one_origin(rng: np.random.Generator) -
     normal, point = unit(rng.normal(size=3)), rng.normal(size=3)
     origin = point + 2.0 * normal
     directions = unit(-normal + 0.3 * rng.normal(size=(20, 3)))
-    camera = RayBatch(np.tile(origin, (20, 1)), directions, 0.1)
+    camera = RayBatch(np.tile(origin, (20, 1)), directions, 0.1, t_viewer=-0.5)
     t_mirror = -2.0 / (directions @ normal)
     mirrored = camera.mirrored(point, -3.0 * normal, t_mirror)
     np.testing.assert_allclose(mirrored.origins_world, np.tile(point - 2.0 * normal, (20, 1)), atol=1e-6)
     assert (mirrored.origins_world == mirrored.origins_world[0]).all()
     meeting = origin + t_mirror[:, None] * directions
+    assert mirrored.t_viewer.tolist() == [-0.5]
     np.testing.assert_allclose(mirrored.starts_world, meeting, atol=1e-5)
     np.testing.assert_allclose(mirrored.directions_world @ normal, -(directions @ normal), atol=1e-6)
 

@@ -21,7 +21,7 @@ from trace_scenes import (
 )
 
 from engine.gaussians.model import FlatGaussians, concatenate
-from engine.rays import RayBatch
+from engine.rays import AT_INFINITY, RayBatch
 from engine.trace.cpu.kernels_hit import K
 from engine.trace.cpu.recording import CpuRecording
 from engine.trace.protocol import TraceGradients
@@ -37,6 +37,15 @@ def test_cloud_with_harmonics_and_features(rng: np.random.Generator, degree: int
     assert ours.hit_counts.mean() > 10
     assert (ours.rgb_srgb.max(axis=0) > 0.5).all()
     assert np.abs(found["sh"]).max() > 0
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_viewers_that_stand_anywhere(rng: np.random.Generator, degree: int) -> None:
+    # Within the cloud, where it matters: some at the origin, some behind it, some infinitely far away.
+    inwards = rays_inwards(rng, 120, distance=0.5)
+    viewers = rng.choice([0.0, -0.4, -3.0, AT_INFINITY], 120)
+    rays = RayBatch(inwards.origins_world, inwards.directions_world, t_viewer=viewers)
+    assert_like_twin(make_cloud(rng, 1000, degree=degree), rays)
 
 
 def test_quaternions_of_any_length(rng: np.random.Generator) -> None:
@@ -115,7 +124,7 @@ def test_coincident_planes_and_stacks_are_ordered_by_id(rng: np.random.Generator
     ties = 0
     for ray in range(250):
         rows = ours.hits.place(ray)
-        ids, distances = ours.hits.hits.ids[rows], ours.hits.hits.distances[rows]
+        ids, distances = ours.hits.of_ray(ray), ours.hits.hits.distances[rows]
         equal = np.diff(distances) == 0
         assert (np.diff(distances) >= 0).all()
         assert (np.diff(ids)[equal] > 0).all()

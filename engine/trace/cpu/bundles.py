@@ -19,17 +19,18 @@ from engine.trace.protocol import TraceSettings
 
 
 class Rays(NamedTuple):
-    """A :class:`engine.rays.RayBatch`; a single origin or limit stands for all."""
+    """A :class:`engine.rays.RayBatch`; a single origin, limit or viewer stands for all."""
 
     origins: Float32[np.ndarray, "#r 3"]
     directions: Float32[np.ndarray, "r 3"]
     t_min: Float32[np.ndarray, "#r"]
     t_max: Float32[np.ndarray, "#r"]
+    t_viewer: Float32[np.ndarray, "#r"]
 
     @classmethod
     def of(cls, rays: RayBatch) -> "Rays":
         """The arrays of ``rays``, not copied."""
-        return cls(rays.origins_world, rays.directions_world, rays.t_min, rays.t_max)
+        return cls(rays.origins_world, rays.directions_world, rays.t_min, rays.t_max, rays.t_viewer)
 
 
 class Scene(NamedTuple):
@@ -86,7 +87,10 @@ class Outputs(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """Hits in order along each ray: those of ray r from ``starts[r]`` on."""
+    """Hits in order along each ray: those of ray r from ``starts[r]`` on.
+
+    ``ids`` and ``rgb`` are for rays that go alone; packets keep them once for a Gaussian.
+    """
 
     starts: Int64[np.ndarray, " r"]
     ids: Int32[np.ndarray, " h"]
@@ -100,13 +104,15 @@ class PacketHits(NamedTuple):
 
     ``us`` and ``vs`` are the hits in standard deviations. ``slots`` numbers the Gaussians of each packet in
     the order in which it met them: the Gaussian in slot s of the packet that begins with ray f is
-    ``slot_ids[f * max_hits + s]``, and packet p has ``slot_counts[p]`` of them.
+    ``slot_ids[first_place(f) + s]``, its colour is in ``slot_rgb``, and packet p has ``slot_counts[p]`` of
+    them.
     """
 
     us: Float32[np.ndarray, " h"]
     vs: Float32[np.ndarray, " h"]
     slots: Int32[np.ndarray, " h"]
     slot_ids: Int32[np.ndarray, " h"]
+    slot_rgb: Float32[np.ndarray, "h 3"]
     slot_counts: Int32[np.ndarray, " p"]
 
 

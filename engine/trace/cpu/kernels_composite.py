@@ -1,10 +1,12 @@
-"""What a hit does to its ray: the one place where both forward passes add colour, depth and normal."""
+"""What a hit does to a ray that is followed alone."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from engine.trace.cpu.kernels_sh import colour
+from engine.trace.cpu.kernels_hit import MEAN
+from engine.trace.cpu.kernels_rays import ray_viewer
+from engine.trace.cpu.kernels_sh import colour, write_ray_view
 from engine.trace.kernels_native import lean
 
 
@@ -52,12 +54,15 @@ def begin(forward, r, place):
 
 
 @lean(forceinline=True, fastmath={"contract"})
-def composite(front, hit, forward, r, direction, basis):
+def composite(front, hit, forward, r, origin, direction, basis):
     """The ray ``r`` behind ``hit``, and whether it ends there.
 
-    The hit is stored if the pass is recording. ``basis`` are the harmonics at the ray's direction.
+    The hit is stored if the pass is recording. ``basis`` is room for harmonics.
     """
     i, t, alpha = hit.gaussian, hit.t, hit.alpha
+    record = forward.scene.records[i]
+    to_mean = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
+    write_ray_view(basis, forward.scene.sh.shape[1], to_mean, direction, ray_viewer(forward.rays, r))
     weight = alpha * front.t1
     red, green, blue = colour(forward.scene.sh, i, basis)
     along = direction[0] * hit.normal_x + direction[1] * hit.normal_y + direction[2] * hit.normal_z

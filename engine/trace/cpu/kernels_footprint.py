@@ -67,14 +67,16 @@ def footprints(typingctx, block, frame, ox, oy, oz, bins, distances):
         middle, u_axis, v_axis = dot(m, f[0:3]), dot(u, f[0:3]), dot(v, f[0:3])
         depth2, reach2 = middle * middle, u_axis * u_axis + v_axis * v_axis
         in_front = (depth2 > reach2 * 1.1) & (middle > 0.0)
-        room = (dot(u, u) + dot(v, v)).root() / middle * _GRAZING + 1e-9
+        per_middle = _one(builder) / middle
+        size = abs(u[0]) + abs(u[1]) + abs(u[2]) + abs(v[0]) + abs(v[1]) + abs(v[2])
+        room = size * per_middle * _GRAZING + 1e-9
         inverse = _one(builder) / (depth2 - reach2)
         out = Lanes(builder, bins, ir.VectorType(ir.IntType(32), LANES))
         for axis in range(2):
             e = f[3 + 3 * axis : 6 + 3 * axis]
             # The outline touches slope s + d, s that of the centre, where
             # (u' - d u)^2 + (v' - d v)^2 = (d middle)^2 with u' = u.e - s u.
-            centre = dot(m, e) / middle
+            centre = dot(m, e) * per_middle
             u_e, v_e = dot(u, e) - centre * u_axis, dot(v, e) - centre * v_axis
             b = u_e * u_axis + v_e * v_axis
             root = (b * b + (depth2 - reach2) * (u_e * u_e + v_e * v_e)).root()

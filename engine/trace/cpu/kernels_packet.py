@@ -20,7 +20,8 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
 3. Candidates are sorted by their likely distance and cut into chunks of 128. Within a chunk those that the
    same rays may meet come together, so that a block of eight has few bits.
 4. Each ray tests the blocks that have its bit, eight octagons at once, sorts what it has met, and composites
-   the hits before "safe". It ends where its transmittance says so; what lies behind is never tested.
+   the hits before "safe", eight at once. It ends where its transmittance says so; what lies behind is never
+   tested. A Gaussian has one colour for all rays of the packet, found when the first of them meets it.
 5. Backwards, the rays of a packet sum their shares of a Gaussian in one row of moments, which is enough as
    all share o (:mod:`engine.trace.cpu.kernels_packet_backward`). Rows are sorted and summed by Gaussian.
 
@@ -35,26 +36,23 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 from numba import njit
 
+from engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X, ROWS
 from engine.trace.cpu.kernels_footprint import BINS, FRAME_WORDS, footprints, rays_between, write_bins
 from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
-from engine.trace.cpu.kernels_rays import ray_origin
+from engine.trace.cpu.kernels_rays import ray_origin, record_vector
 from engine.trace.cpu.kernels_simd import (
     boxes_in_pyramid,
     ellipses_in_pyramid,
     float32_bits,
-    float64_from_bits,
     lowest_bit,
-    meet_block,
     prefetch,
 )
 from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
+from engine.trace.cpu.memory import LINE
 from engine.trace.kernels_native import lean
 
 STACK = 1024
 """Words for the nodes that wait, two each; a walk goes down at once, so that seven wait on each level."""
-# --- rows of a block of eight candidates, float64; u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0 ---
-N_X, A_X, B_X, N_0, INNER, ALPHA_0, T_ROW, U_ROW, V_ROW = 0, 3, 6, 9, 10, 11, 12, 13, 14
-ROWS = 15
 ROW_BYTES, NODE_BYTES, BLOCK_BYTES = ROWS * WIDTH * 8, BOX_ROWS * WIDTH * 4, LEAF_ROWS * WIDTH * 4
 AHEAD = 8
 """Candidates between asking for a record and reading it: about as long as memory takes to answer."""
@@ -63,8 +61,12 @@ CHUNK = 128
 """Candidates that a ray tests before it composites what lies safely in front of the rest.
 
 Small enough that rays which end early leave most candidates untested, large enough that the sorting of a
-ray's hits, once a chunk, does not show; a chunk's rows (15 kB) stay in the first cache.
+ray's hits, once a chunk, does not show; a chunk's rows (12 kB) stay in the first cache.
 """
+WORD = 64
+"""Blocks whose bits make one word of a ray's."""
+SHOWN = 8
+"""What a Gaussian shows to a packet: its colour, 0, the normal turned towards the origin, 0."""
 SIDES = 5
 """Planes of a pyramid: four through its sides, one through its apex across the axis."""
 SLOPE_ROOM = 1e-9
@@ -110,8 +112,13 @@ class Candidates(NamedTuple):
     As they are found: ``found``, the place on the curve; ``keys``, the likely distance in the upper half and
     the number in the lower; ``bounds``, the least distance; ``cells``, where in the cross section; ``masks``,
     the bits of the rays. In order: ``ids``; ``near``, where a chunk begins, the least distance of what
-    follows; ``block_rays``, the bits of the rays that may meet any of a block's eight; ``rows``, what is
-    tested; ``slot_of``, the number under which the packet met it, or -1. Of one ray: ``met``, ``pending``.
+    follows; ``block_rays``, the bits of the rays that may meet any of a block's eight, and the same by ray,
+    ``ray_blocks``; ``rows``, what is tested; ``slot_of``, the number under which the packet met it, or -1;
+    ``shown``, what it shows, by that number.
+
+    What one ray has met, in the order in which it was tested: ``pending``, the distance in the upper half
+    and the place in this order in the lower, which are then sorted; ``alphas``, ``opacities``, ``us`` and
+    ``vs``; and ``numbers``, which candidates they are.
     """
 
     found: Int32[np.ndarray, " c"]
@@ -122,10 +129,16 @@ class Candidates(NamedTuple):
     ids: Int32[np.ndarray, " c"]
     near: Float32[np.ndarray, " c1"]
     block_rays: UInt64[np.ndarray, " b"]
-    rows: Float64[np.ndarray, "b 15 8"]
+    ray_blocks: UInt64[np.ndarray, "w 64"]
+    rows: Float64[np.ndarray, "b 12 8"]
     slot_of: Int32[np.ndarray, " c"]
-    met: Int32[np.ndarray, " c8"]
+    shown: Float64[np.ndarray, "c 8"]
     pending: UInt64[np.ndarray, " c8"]
+    alphas: Float64[np.ndarray, " c8"]
+    opacities: Float32[np.ndarray, " c8"]
+    us: Float32[np.ndarray, " c8"]
+    vs: Float32[np.ndarray, " c8"]
+    numbers: Int32[np.ndarray, " c8"]
 
 
 @njit(error_model="numpy")
@@ -150,6 +163,14 @@ def new_walk():
 
 
 @njit(error_model="numpy")
+def aligned_doubles(count):
+    """Room for doubles from a line on, else each vector of eight would lie in two."""
+    raw = np.empty(count + LINE // 8, np.float64)
+    first = (LINE - raw.ctypes.data % LINE) % LINE // 8
+    return raw[first : first + count]
+
+
+@njit(error_model="numpy")
 def new_candidates(room):
     """Room for so many candidates, a multiple of eight."""
     return Candidates(
@@ -161,10 +182,16 @@ def new_candidates(room):
         np.empty(room, np.int32),
         np.empty(room + 1, np.float32),
         np.empty(room // WIDTH, np.uint64),
-        np.empty((room // WIDTH, ROWS, WIDTH), np.float64),
+        np.empty((room // (WIDTH * WORD) + 1, WORD), np.uint64),
+        aligned_doubles(room * ROWS).reshape((room // WIDTH, ROWS, WIDTH)),
         np.empty(room, np.int32),
-        np.empty(room + WIDTH, np.int32),
+        aligned_doubles(room * SHOWN).reshape((room, SHOWN)),
         np.empty(room + WIDTH, np.uint64),
+        np.empty(room + WIDTH, np.float64),
+        np.empty(room + WIDTH, np.float32),
+        np.empty(room + WIDTH, np.float32),
+        np.empty(room + WIDTH, np.float32),
+        np.empty(room + WIDTH, np.int32),
     )
 
 
@@ -267,6 +294,16 @@ def gather_candidates(tree, pyramid, origin, farthest, walk, candidates):
         level = stack[2 * depth + 1]
         mask = boxes_in_pyramid(nodes_at + node * NODE_BYTES, planes_at, ox, oy, oz)
         first_child = (node - level_starts[level]) * WIDTH
+        waiting = mask
+        while waiting != 0:
+            child = first_child + lowest_bit(waiting)
+            waiting &= waiting - 1
+            if level > 0:
+                at, lines = nodes_at + (level_starts[level - 1] + child) * NODE_BYTES, NODE_BYTES // LINE
+            else:
+                at, lines = blocks_at + child * BLOCK_BYTES, (BLOCK_BYTES + LINE - 1) // LINE
+            for line in range(lines):
+                prefetch(at + line * LINE)
         while mask != 0:
             child = first_child + lowest_bit(mask)
             mask &= mask - 1
@@ -340,21 +377,9 @@ def write_rows(candidates, count, scene, origin, coloured):
             continue
         record = records[ids[k]]
         x, y, z = record[MEAN] - ox, record[MEAN + 1] - oy, record[MEAN + 2] - oz
-        n0, n1, n2 = (
-            np.float64(record[NORMAL]),
-            np.float64(record[NORMAL + 1]),
-            np.float64(record[NORMAL + 2]),
-        )
-        a0, a1, a2 = (
-            np.float64(record[AXIS_U]),
-            np.float64(record[AXIS_U + 1]),
-            np.float64(record[AXIS_U + 2]),
-        )
-        b0, b1, b2 = (
-            np.float64(record[AXIS_V]),
-            np.float64(record[AXIS_V + 1]),
-            np.float64(record[AXIS_V + 2]),
-        )
+        n0, n1, n2 = record_vector(record, NORMAL)
+        a0, a1, a2 = record_vector(record, AXIS_U)
+        b0, b1, b2 = record_vector(record, AXIS_V)
         height = x * n0 + y * n1 + z * n2
         xa = x * a0 + y * a1 + z * a2
         xb = x * b0 + y * b1 + z * b2
@@ -368,40 +393,3 @@ def write_rows(candidates, count, scene, origin, coloured):
         block[N_0, lane] = height
         block[INNER, lane] = record[INNER_RADIUS]
         block[ALPHA_0, lane] = record[OPACITY]
-
-
-@lean(forceinline=True, fastmath={"contract"})
-def meet_blocks(candidates, ray, first, last, direction):
-    """Candidates of blocks ``first`` to ``last`` whose octagon the packet's ray ``ray`` meets; how many.
-
-    Leaves t, u and v of each in the rows.
-    """
-    count = 0
-    dx, dy, dz = direction
-    met, block_rays = candidates.met, candidates.block_rays
-    rows_at = candidates.rows.ctypes.data
-    for b in range(first, last):
-        if (block_rays[b] >> np.uint64(ray)) & np.uint64(1) == 0:
-            continue
-        mask = meet_block(rows_at + b * ROW_BYTES, dx, dy, dz)
-        while mask != 0:
-            met[count] = b * WIDTH + lowest_bit(mask)
-            mask &= mask - 1
-            count += 1
-    return count
-
-
-@njit(fastmath={"contract"}, error_model="numpy")
-def exponential(x):
-    """exp(x) for |x| < 700 to a relative 1e-8."""
-    n = math.floor(x * 1.4426950408889634 + 0.5)
-    r = x - n * 0.6931471805599453
-    p = 1.0 / 5040.0 + r * (1.0 / 40320.0)
-    p = 1.0 / 720.0 + r * p
-    p = 1.0 / 120.0 + r * p
-    p = 1.0 / 24.0 + r * p
-    p = 1.0 / 6.0 + r * p
-    p = 0.5 + r * p
-    p = 1.0 + r * p
-    p = 1.0 + r * p
-    return p * float64_from_bits((np.int64(n) + 1023) << 52)

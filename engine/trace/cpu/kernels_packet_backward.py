@@ -10,29 +10,30 @@ and the sums of tau, tau u and tau v over the rays follow from the moments of h 
 degree 3.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 from numba import njit, prange
 
-from engine.trace.cpu.kernels_packet import AHEAD, exponential
-from engine.trace.cpu.kernels_rays import ray_direction, ray_origin
+from engine.trace.cpu.kernels_eight_backward import add_row, replay_hits, walk_through
+from engine.trace.cpu.kernels_packet import AHEAD
+from engine.trace.cpu.kernels_rays import first_place, ray_origin
 from engine.trace.cpu.kernels_records import rotation_columns
-from engine.trace.cpu.kernels_sh import write_basis
+from engine.trace.cpu.kernels_sh import slope_by_mean, write_view
 from engine.trace.cpu.kernels_simd import prefetch
 from engine.trace.cpu.kernels_single_backward import Moments, write_gradients
+from engine.trace.cpu.kernels_tree import WIDTH
 from engine.trace.kernels_native import lean, next_from_counter
 
-# --- sums of a packet's rays for one of its Gaussians, float64 scratch ---
-H, HU, HV, HUU, HUV, HVV = range(6)
-HUUU, HUUV, HUVV, HVVV = range(6, 10)
-W, ERROR, COUNT, N_0, N_1, N_2 = range(10, 16)
-GT, GTU, GTV = range(16, 19)
-MOMENTS = 19
-# --- row that a packet hands on, float32, one cache line: tau takes the third moments' place ---
-TAU, TAU_U, TAU_V = range(6, 9)
+# --- row of sums of a packet's rays for one of its Gaussians, float32, one cache line ---
+H, HU, HV, HUU, HUV, HVV, HUUU, HVVV = range(8)  # the last two: h u (u^2 + v^2), h v (u^2 + v^2)
+W, COUNT, ERROR, RED, GREEN, BLUE, PACKET = range(8, 15)  # the last is an int32
 ROW_WORDS = 16
+GT, GTU, GTV, N_0, N_1, N_2 = range(6)
+GEOMETRY_WORDS = 6
+"""A row's further sums where depths or normals have a gradient: g_t t and the turned normals' gradient."""
 START_SLOTS = 256
 """Gaussians of a packet that a thread has room for at first."""
 
@@ -43,177 +44,159 @@ class Rows(NamedTuple):
     firsts: Int64[np.ndarray, " p1"]
     ids: Int32[np.ndarray, " e"]
     sums: Float32[np.ndarray, "e 16"]
-    sh: Float32[np.ndarray, "e k 3"]
+    geometry: Float32[np.ndarray, "e _"]
     features: Float32[np.ndarray, "e f"]
 
 
+class Replay(NamedTuple):
+    """Memory of a thread: the transmittance before each hit, turned normals of a packet, and eight hits."""
+
+    through: Float64[np.ndarray, " h"]
+    normals: Float64[np.ndarray, "s 3"]
+    values: Float64[np.ndarray, "8"]
+    weights: Float32[np.ndarray, "8"]
+    shares: Float32[np.ndarray, "8"]
+    by_ray: Float32[np.ndarray, "8"]
+
+
+@njit(error_model="numpy")
+def new_replay(most_hits, slots):
+    """Memory for packets, one after another."""
+    return Replay(
+        np.empty(most_hits + WIDTH, np.float64),
+        np.empty((slots, 3), np.float64),
+        np.zeros(WIDTH, np.float64),
+        np.empty(WIDTH, np.float32),
+        np.empty(WIDTH, np.float32),
+        np.zeros(WIDTH, np.float32),
+    )
+
+
 @lean(fastmath={"contract"})
-def replay_packet(packet, memory, rays, packets, hits, kept, counts, parameters, features, limits, g, rows):
-    """Write the rows of one packet, the rays ``packets[packet, 0]`` to ``packets[packet, 1]``.
+def begin_rows(packet, memory, rays, packets, kept, parameters, limits, g, rows):
+    """Rows of zeros for the Gaussians of a packet, and their normals where those have a gradient."""
+    first, slots = packets[packet, 0], kept.slot_counts[packet]
+    slot_base, base = first_place(first, limits), rows.firsts[packet]
+    means, quats = parameters.means, parameters.quats
+    ox, oy, oz = ray_origin(rays, first)
+    for slot in range(slots):
+        i, row = kept.slot_ids[slot_base + slot], base + slot
+        rows.ids[row] = i
+        rows.sums[row, :] = np.float32(0.0)
+        for f in range(rows.features.shape[1]):
+            rows.features[row, f] = np.float32(0.0)
+        if g.with_geometry:
+            for column in range(GEOMETRY_WORDS):
+                rows.geometry[row, column] = np.float32(0.0)
+            r1, _r2, _r3 = rotation_columns(
+                np.float64(quats[i, 0]), np.float64(quats[i, 1]),
+                np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+            )  # fmt: skip
+            x, y, z = means[i, 0] - ox, means[i, 1] - oy, means[i, 2] - oz
+            # turned towards the origin
+            side = -1.0 if x * r1[0] + y * r1[1] + z * r1[2] > 0.0 else 1.0
+            for axis in range(3):
+                memory.normals[slot, axis] = side * r1[axis]
+
+
+@lean(fastmath={"contract"})
+def replay_ray(r, slot_base, base, memory, hits, kept, counts, features, limits, g, rows):
+    """Add the hits of ray ``r`` to the rows of its packet, which begin at ``base``.
 
     dL/dalpha_k = <g, T_k c_k - (C - prefix_k)/(1 - alpha_k)> for every channel, the part behind summed from
     the back in float64: as a difference of sums it would drown behind opaque surfaces.
     """
-    basis, g_basis, through, sums = memory
-    first, last, slots = packets[packet, 0], packets[packet, 1], kept.slot_counts[packet]
-    basis_count = rows.sh.shape[1]
+    through, normals, values = memory.through, memory.normals, memory.values
+    weights, shares, by_ray = memory.weights, memory.shares, memory.by_ray
     feature_count = features.shape[1]
-    max_hits, alpha_limit = limits.max_hits, np.float32(limits.alpha_max)
-    means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
-    means_at, quats_at, log_scales_at = means.ctypes.data, quats.ctypes.data, log_scales.ctypes.data
-    base = rows.firsts[packet]
-    for slot in range(slots):
-        for column in range(MOMENTS):
-            sums[slot, column] = 0.0
-        for j in range(basis_count):
-            for channel in range(3):
-                rows.sh[base + slot, j, channel] = np.float32(0.0)
-        for f in range(feature_count):
-            rows.features[base + slot, f] = np.float32(0.0)
-    for r in range(first, last):
-        count = counts[r]
-        start = hits.starts[r]
-        t = 1.0
-        median = -1
-        for k in range(count):
-            through[k] = t
-            left = t * (1.0 - np.float64(hits.alphas[start + k]))
-            if t > 0.5 and left <= 0.5:
-                median = k
-            t = left
-        g0, g1, g2 = np.float64(g.rgb[r, 0]), np.float64(g.rgb[r, 1]), np.float64(g.rgb[r, 2])
-        gn0 = gn1 = gn2 = gd = gm = 0.0
-        d0, d1, d2 = ray_direction(rays, r)
-        if g.with_geometry:
-            gd, gm = np.float64(g.depth_sum[r]), np.float64(g.depth_median[r])
-            gn0, gn1, gn2 = (
-                np.float64(g.normal[r, 0]),
-                np.float64(g.normal[r, 1]),
-                np.float64(g.normal[r, 2]),
-            )
-        error = np.float64(g.ray_errors[r])
-        write_basis(basis, basis_count, d0, d1, d2)
-        for j in range(basis_count):
-            b = np.float32(basis[j])
-            g_basis[j, 0], g_basis[j, 1], g_basis[j, 2] = (
-                b * g.rgb[r, 0],
-                b * g.rgb[r, 1],
-                b * g.rgb[r, 2],
-            )
-        behind = np.float64(g.transmittance[r]) * t
-        for k in range(count - 1, -1, -1):
-            e = start + k
-            slot = kept.slots[e]
-            row = base + slot
-            alpha = np.float64(hits.alphas[e])
-            weight = alpha * through[k]
-            value = g0 * hits.rgb[e, 0] + g1 * hits.rgb[e, 1] + g2 * hits.rgb[e, 2]
-            u, v = np.float64(kept.us[e]), np.float64(kept.vs[e])
-            if g.with_geometry:
-                i = kept.slot_ids[first * max_hits + slot]
-                value += gd * hits.distances[e]
-                r1, _r2, _r3 = rotation_columns(
-                    np.float64(quats[i, 0]), np.float64(quats[i, 1]),
-                    np.float64(quats[i, 2]), np.float64(quats[i, 3]),
-                )  # fmt: skip
-                along = gn0 * r1[0] + gn1 * r1[1] + gn2 * r1[2]
-                # the normal is turned towards the viewer
-                side = -1.0 if d0 * r1[0] + d1 * r1[1] + d2 * r1[2] > 0.0 else 1.0
-                facing = side * weight
-                value += side * along
-                gt = (gd * weight + (gm if k == median else 0.0)) * hits.distances[e]
-                sums[slot, GT] += gt
-                sums[slot, GTU] += gt * u
-                sums[slot, GTV] += gt * v
-                sums[slot, N_0] += facing * gn0
-                sums[slot, N_1] += facing * gn1
-                sums[slot, N_2] += facing * gn2
-            for f in range(feature_count):
-                i = kept.slot_ids[first * max_hits + slot]
-                value += np.float64(g.features[r, f]) * features[i, f]
-                rows.features[row, f] += np.float32(weight * g.features[r, f])
-            g_alpha = through[k] * value - behind / (1.0 - alpha)
-            behind += weight * value
-            h = 0.0 if hits.alphas[e] >= alpha_limit else g_alpha * alpha
-            hu, hv = h * u, h * v
-            sums[slot, H] += h
-            sums[slot, HU] += hu
-            sums[slot, HV] += hv
-            huu, huv, hvv = hu * u, hu * v, hv * v
-            sums[slot, HUU] += huu
-            sums[slot, HUV] += huv
-            sums[slot, HVV] += hvv
-            sums[slot, HUUU] += huu * u
-            sums[slot, HUUV] += huu * v
-            sums[slot, HUVV] += hvv * u
-            sums[slot, HVVV] += hvv * v
-            sums[slot, W] += weight
-            sums[slot, ERROR] += weight * error
-            sums[slot, COUNT] += 1.0
-            # a colour clamped at zero gets no gradient
-            w = np.float32(weight)
-            wr = w if hits.rgb[e, 0] > 0.0 else np.float32(0.0)
-            wg = w if hits.rgb[e, 1] > 0.0 else np.float32(0.0)
-            wb = w if hits.rgb[e, 2] > 0.0 else np.float32(0.0)
-            for j in range(basis_count):
-                rows.sh[row, j, 0] += wr * g_basis[j, 0]
-                rows.sh[row, j, 1] += wg * g_basis[j, 1]
-                rows.sh[row, j, 2] += wb * g_basis[j, 2]
-    ox, oy, oz = ray_origin(rays, first)
-    for slot in range(slots):
-        if slot + AHEAD < slots:
-            ahead = kept.slot_ids[first * max_hits + slot + AHEAD]
-            prefetch(means_at + ahead * 12)
-            prefetch(quats_at + ahead * 16)
-            prefetch(log_scales_at + ahead * 8)
-        i = kept.slot_ids[first * max_hits + slot]
-        row = base + slot
-        rows.ids[row] = i
-        # The frame in float64 from the raw parameters: float32 axes would cost needles digits.
-        r1, r2, r3 = rotation_columns(
-            np.float64(quats[i, 0]), np.float64(quats[i, 1]),
-            np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+    count, start = counts[r], hits.starts[r]
+    t, median = 1.0, -1
+    for begin in range(0, count, WIDTH):
+        t = walk_through(
+            hits.alphas.ctypes.data + (start + begin) * 4, min(WIDTH, count - begin), t,
+            through.ctypes.data + begin * 8,
         )  # fmt: skip
-        x, y, z = (
-            np.float64(means[i, 0]) - ox,
-            np.float64(means[i, 1]) - oy,
-            np.float64(means[i, 2]) - oz,
-        )
-        inverse = 1.0 / (x * r1[0] + y * r1[1] + z * r1[2])
-        xa = (x * r2[0] + y * r2[1] + z * r2[2]) * exponential(-np.float64(log_scales[i, 0]))
-        xb = (x * r3[0] + y * r3[1] + z * r3[2]) * exponential(-np.float64(log_scales[i, 1]))
-        hu, hv = sums[slot, HU], sums[slot, HV]
-        huu, huv, hvv = sums[slot, HUU], sums[slot, HUV], sums[slot, HVV]
-        tau = sums[slot, GT] - huu - xa * hu - hvv - xb * hv
-        tau_u = sums[slot, GTU] - sums[slot, HUUU] - xa * huu - sums[slot, HUVV] - xb * huv
-        tau_v = sums[slot, GTV] - sums[slot, HUUV] - xa * huv - sums[slot, HVVV] - xb * hvv
-        for column in range(ROW_WORDS):
-            rows.sums[row, column] = sums[slot, column]
-        rows.sums[row, TAU], rows.sums[row, TAU_U] = tau * inverse, tau_u * inverse
-        rows.sums[row, TAU_V] = tau_v * inverse
+    through[count] = t
+    gn0 = gn1 = gn2 = gd = gm = 0.0
+    if g.with_geometry:
+        gd, gm = np.float64(g.depth_sum[r]), np.float64(g.depth_median[r])
+        gn0, gn1, gn2 = np.float64(g.normal[r, 0]), np.float64(g.normal[r, 1]), np.float64(g.normal[r, 2])
+        for k in range(count):
+            if through[k] > 0.5 and through[k + 1] <= 0.5:
+                median = k
+    by_ray[W - 8], by_ray[ERROR - 8] = np.float32(1.0), g.ray_errors[r]
+    by_ray[RED - 8], by_ray[GREEN - 8], by_ray[BLUE - 8] = g.rgb[r, 0], g.rgb[r, 1], g.rgb[r, 2]
+    behind = np.float64(g.transmittance[r]) * t
+    for begin in range((count - 1) // WIDTH * WIDTH, -1, -WIDTH):
+        n, e = min(WIDTH, count - begin), start + begin
+        if g.with_geometry or feature_count > 0:
+            for k in range(n):
+                slot = kept.slots[e + k]
+                value = 0.0
+                if g.with_geometry:
+                    value += gd * hits.distances[e + k]
+                    value += gn0 * normals[slot, 0] + gn1 * normals[slot, 1] + gn2 * normals[slot, 2]
+                for f in range(feature_count):
+                    value += np.float64(g.features[r, f]) * features[kept.slot_ids[slot_base + slot], f]
+                values[k] = value
+        behind = replay_hits(
+            hits.alphas.ctypes.data + e * 4, through.ctypes.data + begin * 8, values.ctypes.data,
+            kept.slots.ctypes.data + e * 4, kept.us.ctypes.data + e * 4, kept.vs.ctypes.data + e * 4,
+            kept.slot_rgb.ctypes.data + slot_base * 12, n, behind, np.float32(limits.alpha_max),
+            by_ray.ctypes.data, rows.sums.ctypes.data + base * (ROW_WORDS * 4), weights.ctypes.data,
+            shares.ctypes.data,
+        )  # fmt: skip
+        if not (g.with_geometry or feature_count > 0):
+            continue
+        for k in range(n):
+            row = base + kept.slots[e + k]
+            if g.with_geometry:
+                u, v, weight = kept.us[e + k], kept.vs[e + k], np.float64(weights[k])
+                gt = (gd * weight + (gm if begin + k == median else 0.0)) * hits.distances[e + k]
+                rows.geometry[row, GT] += gt
+                rows.geometry[row, GTU] += gt * u
+                rows.geometry[row, GTV] += gt * v
+                rows.geometry[row, N_0] += weight * gn0
+                rows.geometry[row, N_1] += weight * gn1
+                rows.geometry[row, N_2] += weight * gn2
+            for f in range(feature_count):
+                rows.features[row, f] += weights[k] * g.features[r, f]
+
+
+@lean(fastmath={"contract"})
+def replay_packet(packet, memory, rays, packets, hits, kept, counts, parameters, features, limits, g, rows):
+    """Write the rows of one packet, the rays ``packets[packet, 0]`` to ``packets[packet, 1]``."""
+    first, last, slots = packets[packet, 0], packets[packet, 1], kept.slot_counts[packet]
+    slot_base, base = first_place(first, limits), rows.firsts[packet]
+    words = rows.sums.view(np.int32)
+    begin_rows(packet, memory, rays, packets, kept, parameters, limits, g, rows)
+    for r in range(first, last):
+        if counts[r] > 0:
+            replay_ray(r, slot_base, base, memory, hits, kept, counts, features, limits, g, rows)
+    for slot in range(slots):
+        words[base + slot, PACKET] = packet
+        for channel in range(3):  # a colour clamped at zero gets no gradient
+            if kept.slot_rgb[slot_base + slot, channel] <= 0.0:
+                rows.sums[base + slot, RED + channel] = np.float32(0.0)
 
 
 @njit(error_model="numpy")
 def replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows):
     """Replay packets until the ``counter`` has passed the last."""
-    basis = np.empty(16, np.float64)
-    g_basis = np.empty((16, 3), np.float32)
-    through = np.empty(limits.max_hits, np.float64)
-    sums = np.empty((START_SLOTS, MOMENTS), np.float64)
+    memory = new_replay(limits.max_hits, START_SLOTS)
     while True:
         packet = next_from_counter(counter.ctypes.data)
         if packet >= len(packets):
             break
         slots = kept.slot_counts[packet]
-        if slots > len(sums):
-            sums = np.empty((slots * 5 // 4, MOMENTS), np.float64)
-        memory = basis, g_basis, through, sums
+        if slots > len(memory.normals):
+            memory = new_replay(limits.max_hits, slots * 5 // 4)
         replay_packet(
             packet, memory, rays, packets, hits, kept, counts, parameters, features, limits, g, rows
         )
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def replay_packets(
     rays, packets, hits, kept, counts, parameters, features, limits, g, workers, counter, rows
 ):
@@ -223,50 +206,83 @@ def replay_packets(
 
 
 @lean(fastmath={"contract"})
-def sum_chunk(first, last, parameters, records, by_gaussian, rows, out, sums):
+def sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, out, sums, basis):
     """Sum the rows of the Gaussians ``first`` to ``last`` in packet order; the sums become gradients.
 
-    ``sums`` is room for one row.
+    ``sums`` is room for one row, ``basis`` for harmonics. The frame is taken in float64 from the raw
+    parameters: float32 axes would cost needles digits.
     """
     order, starts = by_gaussian.order, by_gaussian.starts
-    basis_count = out.sh.shape[1]
-    feature_count = out.features.shape[1]
+    means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
+    basis_count, feature_count = out.sh.shape[1], out.features.shape[1]
+    words = rows.sums.view(np.int32)
+    with_geometry = rows.geometry.shape[1] > 0
     for segment in range(first, last):
         i = by_gaussian.ids[starts[segment]]
-        for column in range(ROW_WORDS):
-            sums[column] = 0.0
-        for j in range(basis_count):
-            for channel in range(3):
-                out.sh[segment, j, channel] = np.float32(0.0)
+        sums[:] = 0.0
+        out.sh[segment, :, :] = np.float32(0.0)
         for f in range(feature_count):
             out.features[segment, f] = np.float32(0.0)
+        r1, r2, r3 = rotation_columns(
+            np.float64(quats[i, 0]), np.float64(quats[i, 1]),
+            np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+        )  # fmt: skip
+        s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+        per_s2, per_s3 = 1.0 / s2, 1.0 / s3
+        tau = tau_u = tau_v = n0 = n1 = n2 = m0 = m1 = m2 = 0.0
         for k in range(starts[segment], starts[segment + 1]):
             if k + AHEAD < len(order):
                 prefetch(rows.sums.ctypes.data + order[k + AHEAD] * (ROW_WORDS * 4))
             row = order[k]
-            for column in range(ROW_WORDS):
-                sums[column] += rows.sums[row, column]
+            here = rows.sums[row]
+            add_row(sums.ctypes.data, here.ctypes.data)
+            ox, oy, oz = ray_origin(rays, packets[words[row, PACKET], 0])
+            x, y, z = means[i, 0] - ox, means[i, 1] - oy, means[i, 2] - oz
+            inverse = 1.0 / (x * r1[0] + y * r1[1] + z * r1[2])
+            xa = (x * r2[0] + y * r2[1] + z * r2[2]) * per_s2
+            xb = (x * r3[0] + y * r3[1] + z * r3[2]) * per_s3
+            gt = gtu = gtv = 0.0
+            if with_geometry:
+                by_t = rows.geometry[row]
+                gt, gtu, gtv = np.float64(by_t[GT]), np.float64(by_t[GTU]), np.float64(by_t[GTV])
+                # the gradient of the turned normal, turned back
+                side = -1.0 if inverse > 0.0 else 1.0
+                n0 += side * by_t[N_0]
+                n1 += side * by_t[N_1]
+                n2 += side * by_t[N_2]
+            hu, hv = np.float64(here[HU]), np.float64(here[HV])
+            huu, huv, hvv = np.float64(here[HUU]), np.float64(here[HUV]), np.float64(here[HVV])
+            tau += (gt - huu - xa * hu - hvv - xb * hv) * inverse
+            tau_u += (gtu - here[HUUU] - xa * huu - xb * huv) * inverse
+            tau_v += (gtv - here[HVVV] - xa * huv - xb * hvv) * inverse
+            by_colour = np.float64(here[RED]), np.float64(here[GREEN]), np.float64(here[BLUE])
+            view = write_view(basis, basis_count, x, y, z)
             for j in range(basis_count):
                 for channel in range(3):
-                    out.sh[segment, j, channel] += rows.sh[row, j, channel]
+                    out.sh[segment, j, channel] += basis[j] * by_colour[channel]
+            if basis_count > 1:
+                by_x, by_y, by_z = slope_by_mean(scene.sh, i, basis_count, view, by_colour)
+                m0, m1, m2 = m0 + by_x, m1 + by_y, m2 + by_z
             for f in range(feature_count):
                 out.features[segment, f] += rows.features[row, f]
         out.ids[segment] = i
         moments = Moments(
             sums[H], sums[HU], sums[HV], sums[HUU], sums[HUV], sums[HVV],
-            sums[TAU], sums[TAU_U], sums[TAU_V], sums[N_0], sums[N_1], sums[N_2],
+            tau, tau_u, tau_v, n0, n1, n2, m0, m1, m2,
         )  # fmt: skip
-        write_gradients(segment, i, parameters, records, moments, out)
+        frame = r1, r2, r3, s2, s3
+        write_gradients(segment, i, frame, parameters.quats, scene.records, moments, out)
         out.weights[segment] = sums[W]
         out.errors[segment] = sums[ERROR]
         out.counts[segment] = np.int32(sums[COUNT])
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def sum_packets(parameters, records, by_gaussian, rows, chunks, out):
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def sum_packets(rays, packets, parameters, scene, by_gaussian, rows, chunks, out):
     """:func:`sum_chunk` on all Gaussians that were hit."""
     segments = len(by_gaussian.starts) - 1
     per_chunk = (segments + chunks - 1) // chunks
     for chunk in prange(chunks):
         first, last = chunk * per_chunk, min(segments, (chunk + 1) * per_chunk)
-        sum_chunk(first, last, parameters, records, by_gaussian, rows, out, np.empty(ROW_WORDS, np.float64))
+        sums, basis = np.empty(ROW_WORDS, np.float64), np.empty(16, np.float64)
+        sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, out, sums, basis)

@@ -1,30 +1,38 @@
 """Forward passes for packets: candidates once a packet, then each ray sorts and composites its own hits."""
 
+from typing import NamedTuple
+
 import numpy as np
+from jaxtyping import Float64, Int64, UInt64
 from numba import njit, prange
 
 from engine.trace.cpu.bundles import Forward
-from engine.trace.cpu.kernels_composite import Hit, begin, composite, finish
+from engine.trace.cpu.kernels_eight import (
+    add_shown,
+    keep_hits,
+    know_slots,
+    meet_block,
+    sort_few,
+    weigh_next,
+    write_alphas,
+)
+from engine.trace.cpu.kernels_hit import MEAN, NORMAL
 from engine.trace.cpu.kernels_packet import (
-    ALPHA_0,
     CHUNK,
-    N_X,
+    ROW_BYTES,
+    SHOWN,
     START_ROOM,
-    T_ROW,
-    U_ROW,
-    V_ROW,
-    exponential,
+    WORD,
     find_candidates,
-    meet_blocks,
     new_candidates,
     new_pyramid,
     new_walk,
     write_rows,
 )
 from engine.trace.cpu.kernels_packet_order import keep_candidates, sort_candidates
-from engine.trace.cpu.kernels_rays import ray_direction, ray_limits, ray_origin
-from engine.trace.cpu.kernels_sh import write_basis
-from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, write_ranks
+from engine.trace.cpu.kernels_rays import first_place, ray_direction, ray_limits, ray_origin, record_vector
+from engine.trace.cpu.kernels_sh import colour, write_view
+from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit
 from engine.trace.cpu.kernels_tree import WIDTH
 from engine.trace.kernels_native import lean, next_from_counter
 
@@ -33,134 +41,239 @@ RANKED = 96
 branch that the processor could guess wrongly. The few longer lists take an insertion sort.
 """
 STRIDE = CHUNK // WIDTH
+STRIDE_BITS = np.uint64((1 << STRIDE) - 1)
+LOWER = np.uint64(0xFFFFFFFF)
+UPPER = np.uint64(32)
+
+
+class Scratch(NamedTuple):
+    """Memory of a thread: harmonics, keys that are sorted, sums of a ray, and eight hits."""
+
+    basis: Float64[np.ndarray, "16"]
+    ranked: UInt64[np.ndarray, "104"]
+    sums: Float64[np.ndarray, "8"]
+    alphas: Float64[np.ndarray, "8"]
+    weights: Float64[np.ndarray, "8"]
+    after: Float64[np.ndarray, "8"]
+    depths: Float64[np.ndarray, "8"]
+    numbers: Int64[np.ndarray, "8"]
+    slots: Int64[np.ndarray, "8"]
+
+
+@njit(error_model="numpy")
+def new_scratch():
+    """Memory for rays, one after another."""
+    return Scratch(
+        np.empty(16, np.float64),
+        np.empty(RANKED + WIDTH, np.uint64),
+        np.empty(SHOWN, np.float64),
+        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.int64),
+        np.empty(WIDTH, np.int64),
+    )
 
 
 @lean()
-def sort_pending(pending, ranked, ranks, first, last):
-    """Sort keys ``first`` to ``last``, all different; a few by counting the smaller ones."""
-    count = last - first
-    if count > RANKED:
-        for i in range(first + 1, last):
-            key = pending[i]
-            j = i
-            while j > first and pending[j - 1] > key:
-                pending[j] = pending[j - 1]
-                j -= 1
-            pending[j] = key
-        return
-    base = pending.ctypes.data + first * 8
-    for i in range(0, count, WIDTH):
-        write_ranks(base, i, count, ranks.ctypes.data)
-    for i in range(count):
-        ranked[ranks[i]] = pending[first + i]
-    for i in range(count):
-        pending[first + i] = ranked[i]
-
-
-@lean()
-def order_ties(pending, head, tail, ids):
-    """Order the hits that share the distance of the one at ``head`` by id."""
-    distance = pending[head] >> np.uint64(32)
+def order_ties(candidates, head, tail):
+    """Order the hits ``head`` to ``tail``, which are sorted by distance, by id where they share one."""
+    pending, numbers, ids = candidates.pending, candidates.numbers, candidates.ids
     for i in range(head + 1, tail):
         key = pending[i]
-        if key >> np.uint64(32) != distance:
-            break
+        if key >> UPPER != pending[i - 1] >> UPPER:
+            continue
+        mine = ids[numbers[np.int64(key & LOWER)]]
         j = i
         while (
             j > head
-            and ids[np.int64(pending[j - 1] & np.uint64(0xFFFFFFFF))]
-            > ids[np.int64(key & np.uint64(0xFFFFFFFF))]
+            and pending[j - 1] >> UPPER == key >> UPPER
+            and ids[numbers[np.int64(pending[j - 1] & LOWER)]] > mine
         ):
             pending[j] = pending[j - 1]
             j -= 1
         pending[j] = key
 
 
-@lean(forceinline=True, fastmath={"contract"})
-def alpha_of(rows, block, lane, alpha_max):
-    """Alpha of a candidate where the ray last tested meets it, rounded to float32."""
-    u, v = rows[block, U_ROW, lane], rows[block, V_ROW, lane]
-    power = -0.5 * (u * u + v * v)
-    return np.float64(np.float32(min(rows[block, ALPHA_0, lane] * exponential(power), alpha_max)))
+@lean()
+def sort_pending(candidates, ranked, head, tail):
+    """Sort the hits ``head`` to ``tail`` of a ray by distance, and by id where they share one."""
+    if tail - head <= RANKED:
+        if sort_few(candidates.pending.ctypes.data + head * 8, tail - head, ranked.ctypes.data):
+            order_ties(candidates, head, tail)
+        return
+    pending = candidates.pending
+    for i in range(head + 1, tail):
+        key = pending[i]
+        j = i
+        while j > head and pending[j - 1] > key:
+            pending[j] = pending[j - 1]
+            j -= 1
+        pending[j] = key
+    order_ties(candidates, head, tail)
 
 
-@lean(forceinline=True, fastmath={"contract"})
-def trace_ray(r, bit, place, slots, forward, candidates, count, kept, memory):
+@lean(forceinline=True)
+def meet_blocks(candidates, bit, first, direction, limits, tail):
+    """Test the ``STRIDE`` blocks from ``first`` on that the packet's ray ``bit`` may meet.
+
+    Returns how many hits there are then; ``tail`` are known already. The blocks' bits lie in one word.
+    """
+    dx, dy, dz = direction
+    t_min, t_max = limits
+    c = candidates
+    rows_at = c.rows.ctypes.data
+    bits = (c.ray_blocks[first // WORD, bit] >> np.uint64(first % WORD)) & STRIDE_BITS
+    bits = np.int64(bits)
+    while bits != 0:
+        block = first + lowest_bit(bits)
+        bits &= bits - 1
+        tail += meet_block(
+            rows_at + block * ROW_BYTES, dx, dy, dz, t_min, t_max, block * WIDTH, tail,
+            c.pending.ctypes.data, c.alphas.ctypes.data, c.opacities.ctypes.data, c.us.ctypes.data,
+            c.vs.ctypes.data, c.numbers.ctypes.data,
+        )  # fmt: skip
+    return tail
+
+
+@lean(forceinline=True)
+def know_alphas(candidates, first, last, alpha_max):
+    """Alphas of the hits ``first`` to ``last`` of a ray."""
+    for place in range(first, last, WIDTH):
+        write_alphas(candidates.alphas.ctypes.data, candidates.opacities.ctypes.data, place, alpha_max)
+
+
+@lean(fastmath={"contract"})
+def show(shown, i, scene, origin, basis):
+    """What Gaussian ``i`` shows to rays from ``origin``.
+
+    A ray that meets it in front of the origin does so from the side on which the origin lies.
+    """
+    record = scene.records[i]
+    x, y, z = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
+    n0, n1, n2 = record_vector(record, NORMAL)
+    write_view(basis, scene.sh.shape[1], x, y, z)
+    shown[0], shown[1], shown[2] = colour(scene.sh, i, basis)
+    shown[3] = shown[7] = 0.0
+    side = -1.0 if x * n0 + y * n1 + z * n2 > 0.0 else 1.0
+    shown[4], shown[5], shown[6] = side * n0, side * n1, side * n2
+
+
+@lean(fastmath={"contract"})
+def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, count, kept, scratch):
     """Follow ray ``r``, which is ray ``bit`` of its packet; its hits are stored from ``place`` on.
 
     Returns the place behind its last hit, and the number of Gaussians that the packet has met, so far
-    ``slots``, which ``kept`` lists from the place of the packet's first hit on.
+    ``slots``, which ``kept`` lists from ``slot_base`` on.
     """
-    basis, ranked, ranks, slot_base = memory
-    rays, limits = forward.rays, forward.limits
-    rows, ids, pending, slot_of = candidates.rows, candidates.ids, candidates.pending, candidates.slot_of
-    direction = ray_direction(rays, r)
-    t_min, t_max = ray_limits(rays, r)
-    write_basis(basis, forward.scene.sh.shape[1], direction[0], direction[1], direction[2])
-    front = begin(forward, r, place)
+    limits, hits, out, features = forward.limits, forward.hits, forward.out, forward.scene.features
+    pending, ids = candidates.pending, candidates.ids
+    slot_of, shown = candidates.slot_of, candidates.shown
+    feature_count, recording = features.shape[1], forward.recording
+    direction, span = ray_direction(forward.rays, r), ray_limits(forward.rays, r)
+    if recording:
+        hits.starts[r] = place
+    scratch.sums[:] = 0.0
+    scratch.depths[:] = 0.0
+    for f in range(feature_count):
+        out.features[r, f] = np.float32(0.0)
+    # The second phase begins where too little is left, and ends where its own part of it is (Algorithm 1).
+    t, stop_below, last_phase = 1.0, limits.eps1, limits.eps2 > 1.0
+    median = np.float32(0.0)
+    found = head = tail = b0 = 0
     block_count = (count + WIDTH - 1) // WIDTH
-    head = tail = b0 = 0
     stop = False
     while b0 < block_count and not stop:
         b1 = min(b0 + STRIDE, block_count)
-        n_met = meet_blocks(candidates, bit, b0, b1, direction)
-        for m in range(n_met):
-            k = candidates.met[m]
-            t = np.float32(rows[k // WIDTH, T_ROW, k % WIDTH])
-            if t <= t_min or t >= t_max:
-                continue
-            # distances are positive: their bits sort like their values
-            pending[tail] = (np.uint64(float32_bits(t)) << np.uint64(32)) | np.uint64(k)
-            tail += 1
-        sort_pending(pending, ranked, ranks, head, tail)
+        known = tail
+        tail = meet_blocks(candidates, bit, b0, direction, span, tail)
+        if tail > known:
+            know_alphas(candidates, known, tail, limits.alpha_max)
+            sort_pending(candidates, scratch.ranked, head, tail)
         # What follows lies no nearer than this.
         nearest = candidates.near[min(b1 * WIDTH, count)]
-        safe = np.uint64(float32_bits(nearest)) << np.uint64(32)
-        while head < tail and pending[head] < safe:
-            key = pending[head]
-            if head + 1 < tail and pending[head + 1] >> np.uint64(32) == key >> np.uint64(32):
-                order_ties(pending, head, tail, ids)
-                key = pending[head]
-            head += 1
-            k = np.int64(key & np.uint64(0xFFFFFFFF))
-            t = float32_from_bits(np.uint32(key >> np.uint64(32)))
-            block, lane = k // WIDTH, k % WIDTH
-            if forward.recording:
-                if slot_of[k] < 0:
-                    slot_of[k] = slots
-                    kept.slot_ids[slot_base + slots] = ids[k]
-                    slots += 1
-                kept.slots[front.place] = slot_of[k]
-                kept.us[front.place] = rows[block, U_ROW, lane]
-                kept.vs[front.place] = rows[block, V_ROW, lane]
-            hit = Hit(
-                ids[k],
-                t,
-                alpha_of(rows, block, lane, limits.alpha_max),
-                rows[block, N_X, lane],
-                rows[block, N_X + 1, lane],
-                rows[block, N_X + 2, lane],
-            )
-            front, stop = composite(front, hit, forward, r, direction, basis)
-            if stop:
-                break
+        safe = np.uint64(float32_bits(nearest)) << UPPER
+        while not stop and head < tail and pending[head] < safe:
+            keys_at = pending.ctypes.data + head * 8
+            bits = weigh_next(
+                keys_at, min(tail - head, limits.max_hits - found), safe, candidates.alphas.ctypes.data, t,
+                stop_below, scratch.alphas.ctypes.data, scratch.weights.ctypes.data,
+                scratch.after.ctypes.data,
+            )  # fmt: skip
+            taken = n = bits >> (2 * WIDTH)
+            if bits & ((1 << n) - 1) != 0:
+                last = lowest_bit(bits)
+                if not last_phase:
+                    last_phase = True
+                    stop_below = scratch.after[last] * limits.eps2
+                    last += 1
+                    while last < n and scratch.after[last] >= stop_below:
+                        last += 1
+                if last < n:
+                    taken, stop = last + 1, True
+            if t > 0.5:
+                halves = (bits >> WIDTH) & ((1 << taken) - 1)
+                if halves != 0:
+                    median = float32_from_bits(np.uint32(pending[head + lowest_bit(halves)] >> UPPER))
+            new = know_slots(
+                keys_at, taken, candidates.numbers.ctypes.data, slot_of.ctypes.data,
+                scratch.weights.ctypes.data, scratch.numbers.ctypes.data, scratch.slots.ctypes.data,
+                scratch.depths.ctypes.data,
+            )  # fmt: skip
+            while new != 0:
+                k = lowest_bit(new)
+                new &= new - 1
+                number = scratch.numbers[k]
+                scratch.slots[k] = slot_of[number] = slots
+                show(shown[slots], ids[number], forward.scene, origin, scratch.basis)
+                if recording:
+                    kept.slot_ids[slot_base + slots] = ids[number]
+                    for channel in range(3):
+                        kept.slot_rgb[slot_base + slots, channel] = shown[slots, channel]
+                slots += 1
+            for f in range(feature_count):
+                for k in range(taken):
+                    out.features[r, f] += np.float32(
+                        scratch.weights[k] * features[ids[scratch.numbers[k]], f]
+                    )
+            add_shown(
+                scratch.sums.ctypes.data, shown.ctypes.data, scratch.slots.ctypes.data,
+                scratch.weights.ctypes.data, taken,
+            )  # fmt: skip
+            if recording:
+                keep_hits(
+                    keys_at, taken, scratch.alphas.ctypes.data, scratch.slots.ctypes.data,
+                    candidates.us.ctypes.data, candidates.vs.ctypes.data, place, hits.alphas.ctypes.data,
+                    hits.distances.ctypes.data, kept.us.ctypes.data, kept.vs.ctypes.data,
+                    kept.slots.ctypes.data,
+                )  # fmt: skip
+            t = scratch.after[taken - 1]
+            head, place, found = head + taken, place + taken, found + taken
+            stop = stop or found >= limits.max_hits
         b0 = b1
-        stop = stop or nearest >= t_max
-    finish(front, forward, r)
-    return front.place, slots
+        stop = stop or nearest >= span[1]
+    out.counts[r] = found
+    out.transmittance[r] = t
+    depth = 0.0
+    for k in range(WIDTH):
+        depth += scratch.depths[k]
+    out.depth_sum[r] = depth
+    out.depth_median[r] = median
+    for axis in range(3):
+        out.rgb[r, axis] = scratch.sums[axis]
+        out.normal[r, axis] = scratch.sums[4 + axis]
+    return place, slots
 
 
 @njit(error_model="numpy")
 def trace_from_counter(forward, packets, tree, kept, counter):
     """Trace packets of rays ``packets[p, 0]`` to ``packets[p, 1]`` until the ``counter`` has passed the last.
 
-    Packet p's hits are stored from ``packets[p, 0] * max_hits`` on, and ``kept`` beside them. A ray's result
-    depends on its packet alone, so it is the same for every number of threads.
+    Packet p's hits are stored from the first place of its first ray on, and ``kept`` beside them. A ray's
+    result depends on its packet alone, so it is the same for every number of threads.
     """
-    pyramid, walk = new_pyramid(), new_walk()
-    basis = np.empty(16, np.float64)
-    ranked = np.empty(RANKED, np.uint64)
-    ranks = np.empty(RANKED + WIDTH, np.int64)
+    pyramid, walk, scratch = new_pyramid(), new_walk(), new_scratch()
     candidates = new_candidates(START_ROOM)
     while True:
         packet = next_from_counter(counter.ctypes.data)
@@ -169,18 +282,20 @@ def trace_from_counter(forward, packets, tree, kept, counter):
         first, last = packets[packet, 0], packets[packet, 1]
         candidates, count = find_candidates(forward.rays, first, last, tree, pyramid, walk, candidates)
         sort_candidates(candidates, count, tree.order, walk.histogram)
-        write_rows(candidates, count, forward.scene, ray_origin(forward.rays, first), True)
+        origin = ray_origin(forward.rays, first)
+        write_rows(candidates, count, forward.scene, origin, True)
         candidates.slot_of[:count] = -1
         slots = 0
-        place = first * forward.limits.max_hits
-        memory = basis, ranked, ranks, place
+        place = slot_base = first_place(first, forward.limits)
         for r in range(first, last):
-            place, slots = trace_ray(r, r - first, place, slots, forward, candidates, count, kept, memory)
+            place, slots = trace_ray(
+                r, r - first, place, slots, slot_base, origin, forward, candidates, count, kept, scratch
+            )
         if forward.recording:
             kept.slot_counts[packet] = slots
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def trace_packets(rays, scene, limits, out, hits, recording, packets, tree, kept, workers, counter):
     """:func:`trace_from_counter` on ``workers`` threads; ``counter`` holds one zero.
 
@@ -194,20 +309,14 @@ def trace_packets(rays, scene, limits, out, hits, recording, packets, tree, kept
 @lean(fastmath={"contract"})
 def absorb_ray(r, bit, rays, candidates, count, limits):
     """What the candidates leave of ray ``r``, ray ``bit`` of its packet; 0 where that is below eps1."""
-    rows = candidates.rows
-    direction = ray_direction(rays, r)
-    t_min, t_max = ray_limits(rays, r)
+    direction, span = ray_direction(rays, r), ray_limits(rays, r)
     block_count = (count + WIDTH - 1) // WIDTH
     left = 1.0
     for b0 in range(0, block_count, STRIDE):
-        b1 = min(b0 + STRIDE, block_count)
-        for m in range(meet_blocks(candidates, bit, b0, b1, direction)):
-            k = candidates.met[m]
-            block, lane = k // WIDTH, k % WIDTH
-            t = np.float32(rows[block, T_ROW, lane])
-            if t <= t_min or t >= t_max:
-                continue
-            left *= 1.0 - alpha_of(rows, block, lane, limits.alpha_max)
+        tail = meet_blocks(candidates, bit, b0, direction, span, 0)
+        know_alphas(candidates, 0, tail, limits.alpha_max)
+        for m in range(tail):
+            left *= 1.0 - candidates.alphas[m]
             if left < limits.eps1:
                 return 0.0
     return left

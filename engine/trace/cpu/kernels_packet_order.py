@@ -3,7 +3,7 @@
 import numpy as np
 
 from engine.trace.cpu.kernels_footprint import CELLS
-from engine.trace.cpu.kernels_packet import CHUNK
+from engine.trace.cpu.kernels_packet import CHUNK, WORD
 from engine.trace.cpu.kernels_tree import WIDTH
 from engine.trace.kernels_native import lean
 
@@ -41,6 +41,7 @@ def sort_candidates(candidates, count, order, histogram):
             histogram[cell] += 1
             candidates.ids[place] = order[candidates.found[which]]
             block_rays[place // WIDTH] |= candidates.masks[which]
+    turn_bits(candidates, count)
 
 
 @lean()
@@ -51,6 +52,31 @@ def keep_candidates(candidates, count, order):
     for k in range(count):
         candidates.ids[k] = order[candidates.found[k]]
         candidates.block_rays[k // WIDTH] |= candidates.masks[k]
+    turn_bits(candidates, count)
+
+
+@lean()
+def turn_bits(candidates, count):
+    """The blocks of each ray from the rays of each block: squares of 64 bits are turned over.
+
+    Halves of a square change places, then quarters within the halves, down to single bits.
+    """
+    blocks = (count + WIDTH - 1) // WIDTH
+    for w in range((blocks + WORD - 1) // WORD):
+        bits = candidates.ray_blocks[w]
+        for k in range(WORD):
+            block = w * WORD + k
+            bits[k] = candidates.block_rays[block] if block < blocks else np.uint64(0)
+        step, mask = np.uint64(32), np.uint64(0xFFFFFFFF)
+        while step > 0:
+            for half in range(0, WORD, 2 * step):
+                for k in range(half, half + np.int64(step)):
+                    other = k + np.int64(step)
+                    change = ((bits[k] >> step) ^ bits[other]) & mask
+                    bits[k] ^= change << step
+                    bits[other] ^= change
+            step >>= np.uint64(1)
+            mask ^= mask << step
 
 
 @lean()

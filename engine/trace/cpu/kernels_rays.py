@@ -1,8 +1,11 @@
-"""Single rays out of a bundle, where one origin or limit may stand for all."""
+"""Single rays and vectors out of bundles, where one origin, limit or viewer may stand for all."""
 
 import numpy as np
 
 from engine.trace.kernels_native import lean
+
+SPARE = 8
+"""Places for hits beyond the most that a ray can have, as they are written eight at a time."""
 
 
 @lean(forceinline=True)
@@ -23,6 +26,24 @@ def ray_direction(rays, r):
 
 
 @lean(forceinline=True)
+def record_vector(record, at):
+    """Three numbers of a record in float64."""
+    return np.float64(record[at]), np.float64(record[at + 1]), np.float64(record[at + 2])
+
+
+@lean(forceinline=True)
 def ray_limits(rays, r):
     """Between which distances ray ``r`` sees; a single limit stands for all rays."""
     return rays.t_min[r if len(rays.t_min) > 1 else 0], rays.t_max[r if len(rays.t_max) > 1 else 0]
+
+
+@lean(forceinline=True)
+def ray_viewer(rays, r):
+    """Where on ray ``r`` its viewer stands; a single one stands for all rays."""
+    return np.float64(rays.t_viewer[r if len(rays.t_viewer) > 1 else 0])
+
+
+@lean(forceinline=True)
+def first_place(r, limits):
+    """Where the hits of ray ``r`` may be stored from: each ray before it has room for its own."""
+    return r * (limits.max_hits + SPARE)

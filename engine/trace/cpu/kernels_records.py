@@ -23,9 +23,10 @@ def rotation_columns(q0, q1, q2, q3):
 @njit(error_model="numpy")
 def opacity_and_radius(logit, q):
     """Opacity, and the octagon's corner radius in standard deviations."""
-    # ln sigmoid(x) without overflow at either end
-    log_opacity = -math.log1p(math.exp(-logit)) if logit > 0 else logit - math.log1p(math.exp(logit))
-    return math.exp(log_opacity), math.sqrt(max(0.0, q + 2.0 * log_opacity))
+    # without overflow at either end
+    part = math.exp(-abs(logit))
+    opacity = (1.0 if logit > 0 else part) / (1.0 + part)
+    return opacity, math.sqrt(max(0.0, q + 2.0 * math.log(opacity)))
 
 
 @njit(error_model="numpy")
@@ -45,13 +46,13 @@ def write_record(records, i, means, quats, log_scales, logits, q):
     r1, r2, r3 = rotation_columns(
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
     )
-    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    per_s2, per_s3 = math.exp(-np.float64(log_scales[i, 0])), math.exp(-np.float64(log_scales[i, 1]))
     opacity, radius = opacity_and_radius(np.float64(logits[i]), q)
     for axis in range(3):
         records[i, MEAN + axis] = means[i, axis]
         records[i, NORMAL + axis] = r1[axis]
-        records[i, AXIS_U + axis] = r2[axis] / s2
-        records[i, AXIS_V + axis] = r3[axis] / s3
+        records[i, AXIS_U + axis] = r2[axis] * per_s2
+        records[i, AXIS_V + axis] = r3[axis] * per_s3
     # A Gaussian without an octagon must not be hit even through its centre.
     records[i, INNER_RADIUS] = radius * COS_22 if radius > 0.0 else -1.0
     records[i, OPACITY] = opacity

@@ -1,4 +1,9 @@
-"""Real spherical harmonics of degree 0 to 3 in the sign and order of the 3DGS family."""
+"""Real spherical harmonics of degree 0 to 3 in the sign and order of the 3DGS family.
+
+A Gaussian has one colour for all rays with one viewer, that in the direction from there to its mean.
+"""
+
+import math
 
 import numpy as np
 
@@ -41,3 +46,83 @@ def colour(sh, i, basis):
         green += np.float64(sh[i, k, 1]) * basis[k]
         blue += np.float64(sh[i, k, 2]) * basis[k]
     return max(red, 0.0), max(green, 0.0), max(blue, 0.0)
+
+
+@lean(forceinline=True, fastmath={"contract"})
+def write_view(basis, count, x, y, z):
+    """The first ``count`` harmonics for a mean at (x, y, z) from the viewer.
+
+    Returns the direction there, and one over the distance. A mean at the viewer has the direction zero.
+    """
+    length = math.sqrt(x * x + y * y + z * z)
+    scale = 1.0 / length if length > 0.0 else 0.0
+    x, y, z = x * scale, y * scale, z * scale
+    write_basis(basis, count, x, y, z)
+    return x, y, z, scale
+
+
+@lean(forceinline=True, fastmath={"contract"})
+def write_ray_view(basis, count, to_mean, direction, t_viewer):
+    """:func:`write_view` for a ray, ``to_mean`` from its origin; no slope where its viewer is at infinity."""
+    x, y, z = to_mean
+    if math.isinf(t_viewer):
+        x, y, z = direction
+        write_basis(basis, count, x, y, z)
+        return x, y, z, 0.0
+    return write_view(
+        basis, count, x - t_viewer * direction[0], y - t_viewer * direction[1], z - t_viewer * direction[2]
+    )
+
+
+@lean(forceinline=True, fastmath={"contract"})
+def _by(sh, i, k, by_colour):
+    """Gradient by the value of harmonic ``k``."""
+    return by_colour[0] * sh[i, k, 0] + by_colour[1] * sh[i, k, 1] + by_colour[2] * sh[i, k, 2]
+
+
+@lean(fastmath={"contract"})
+def slope_by_mean(sh, i, count, view, by_colour):
+    """Gradient by the mean of Gaussian ``i``, through the direction in which its colour is seen.
+
+    ``view`` is that direction and one over the distance, as :func:`write_view` gives them; 0 for a viewer at
+    infinity, where the mean changes nothing.
+    """
+    x, y, z, scale = view
+
+    gx, gy, gz = (
+        -SH_C1 * _by(sh, i, 3, by_colour),
+        -SH_C1 * _by(sh, i, 1, by_colour),
+        SH_C1 * _by(sh, i, 2, by_colour),
+    )
+    if count > 4:
+        a, b, c, d, e = (
+            SH_C2[0] * _by(sh, i, 4, by_colour),
+            SH_C2[1] * _by(sh, i, 5, by_colour),
+            SH_C2[2] * _by(sh, i, 6, by_colour),
+            SH_C2[3] * _by(sh, i, 7, by_colour),
+            SH_C2[4] * _by(sh, i, 8, by_colour),
+        )
+        gx += a * y - 2.0 * c * x + d * z + 2.0 * e * x
+        gy += a * x + b * z - 2.0 * c * y - 2.0 * e * y
+        gz += b * y + 4.0 * c * z + d * x
+        if count > 9:
+            xx, yy, zz = x * x, y * y, z * z
+            a, b, c, d = (
+                SH_C3[0] * _by(sh, i, 9, by_colour),
+                SH_C3[1] * _by(sh, i, 10, by_colour),
+                SH_C3[2] * _by(sh, i, 11, by_colour),
+                SH_C3[3] * _by(sh, i, 12, by_colour),
+            )
+            e, f, g = (
+                SH_C3[4] * _by(sh, i, 13, by_colour),
+                SH_C3[5] * _by(sh, i, 14, by_colour),
+                SH_C3[6] * _by(sh, i, 15, by_colour),
+            )
+            gx += a * 6.0 * x * y + b * y * z - c * 2.0 * x * y - d * 6.0 * x * z
+            gx += e * (4.0 * zz - 3.0 * xx - yy) + f * 2.0 * x * z + g * 3.0 * (xx - yy)
+            gy += a * 3.0 * (xx - yy) + b * x * z + c * (4.0 * zz - xx - 3.0 * yy) - d * 6.0 * y * z
+            gy -= e * 2.0 * x * y + f * 2.0 * y * z + g * 6.0 * x * y
+            gz += b * x * y + c * 8.0 * y * z + d * (6.0 * zz - 3.0 * xx - 3.0 * yy)
+            gz += e * 8.0 * x * z + f * (xx - yy)
+    along = gx * x + gy * y + gz * z
+    return (gx - along * x) * scale, (gy - along * y) * scale, (gz - along * z) * scale

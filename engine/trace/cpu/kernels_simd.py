@@ -27,13 +27,13 @@ class Vector:
         return ir.Constant(DOUBLE8, [float(other)] * LANES)
 
     def __add__(self, other):
-        return Vector(self.builder, self.builder.fadd(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fadd(self.value, self._other(other), flags=("contract",)))
 
     def __sub__(self, other):
-        return Vector(self.builder, self.builder.fsub(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fsub(self.value, self._other(other), flags=("contract",)))
 
     def __mul__(self, other):
-        return Vector(self.builder, self.builder.fmul(self.value, self._other(other), ("contract",)))
+        return Vector(self.builder, self.builder.fmul(self.value, self._other(other), flags=("contract",)))
 
     def __truediv__(self, other):
         return Vector(self.builder, self.builder.fdiv(self.value, self._other(other)))
@@ -127,37 +127,6 @@ def broadcast(builder, scalar):
 
 
 @intrinsic
-def meet_block(typingctx, block, dx, dy, dz):
-    """Bit k: the ray meets the octagon of candidate k of a block of rows; leaves its t, u and v there.
-
-    A ray that makes a cosine below 1e-6 with the normal runs inside the plane and meets nothing.
-    """
-    signature = types.int64(types.uintp, types.float64, types.float64, types.float64)
-
-    def codegen(context, builder, sig, args):
-        rows = Lanes(builder, args[0], DOUBLE8)
-        d = [broadcast(builder, component) for component in args[1:]]
-
-        def along(row):
-            return rows[row] * d[0] + rows[row + 1] * d[1] + rows[row + 2] * d[2]
-
-        cosine = along(0)
-        one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
-        inverse = one / cosine
-        u = along(3) * inverse
-        v = along(6) * inverse
-        rows[12] = rows[9] * inverse
-        rows[13] = u
-        rows[14] = v
-        cos_22, sin_22 = 0.9238795325112867, 0.3826834323650898
-        farthest = (abs(u) * cos_22 + abs(v) * sin_22).larger(abs(u) * sin_22 + abs(v) * cos_22)
-        met = (farthest <= rows[10]) & (abs(cosine) >= 1e-6)
-        return met.mask()
-
-    return signature, codegen
-
-
-@intrinsic
 def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
     """Bit k: box k of a node reaches into the pyramid with apex o and the five inward ``planes``.
 
@@ -220,34 +189,6 @@ def _plane(builder, planes, side, axis):
 
 
 @intrinsic
-def write_ranks(typingctx, keys, first, count, ranks):
-    """Write how many of ``count`` keys are below each of the eight from ``first`` on to ``ranks``."""
-    signature = types.void(types.uintp, types.int64, types.int64, types.uintp)
-
-    def codegen(context, builder, sig, args):
-        keys, first, count, ranks = args
-        word = ir.Constant(I64, 8)
-        integers = ir.VectorType(I64, LANES)
-        offset = builder.mul(first, word)
-        mine = builder.load(builder.inttoptr(builder.add(keys, offset), integers.as_pointer()), align=8)
-        below = cgutils.alloca_once_value(builder, ir.Constant(integers, [0] * LANES))
-        base = builder.inttoptr(keys, I64.as_pointer())
-        undefined = ir.Constant(integers, ir.Undefined)
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-        with cgutils.for_range(builder, count) as loop:
-            key = builder.load(builder.gep(base, [loop.index]))
-            one = builder.insert_element(undefined, key, ir.Constant(ir.IntType(32), 0))
-            other = builder.shuffle_vector(one, undefined, zeros)
-            smaller = builder.icmp_unsigned("<", other, mine)
-            builder.store(builder.add(builder.load(below), builder.zext(smaller, integers)), below)
-        target = builder.inttoptr(builder.add(ranks, offset), integers.as_pointer())
-        builder.store(builder.load(below), target, align=8)
-        return context.get_dummy_value()
-
-    return signature, codegen
-
-
-@intrinsic
 def lowest_bit(typingctx, mask):
     """Place of the lowest bit that is set; ``mask`` must not be zero."""
     signature = types.int64(types.int64)
@@ -290,4 +231,3 @@ def _reinterpret(source, target):
 
 float32_bits = _reinterpret(types.float32, types.uint32)
 float32_from_bits = _reinterpret(types.uint32, types.float32)
-float64_from_bits = _reinterpret(types.int64, types.float64)

@@ -26,8 +26,7 @@ from engine.trace.cpu.kernels_hit import (
     T_LIMIT,
     TRANSMITTANCE,
 )
-from engine.trace.cpu.kernels_rays import ray_direction, ray_limits, ray_origin
-from engine.trace.cpu.kernels_sh import write_basis
+from engine.trace.cpu.kernels_rays import first_place, ray_direction, ray_limits, ray_origin
 from engine.trace.kernels_native import call_with_three_pointers, lean, next_from_counter
 
 INT32_MAX = 2**31 - 1
@@ -71,9 +70,9 @@ def write_query(ray, ray_i32, context_i32, origin, direction, t_near, t_far):
 def trace_from_counter(embree, forward, which, rays_per_chunk, counter, basis):
     """Trace the rays ``which``, in ascending order, until the ``counter`` has passed the last chunk.
 
-    The hits of ray r are stored from r * max_hits on, or behind those of ray r - 1 where its chunk has it. A
-    ray's result depends on nothing but the ray, so it is the same for every number of threads. ``basis`` has
-    room for the harmonics.
+    The hits of ray r are stored from ``first_place(r)`` on, or behind those of ray r - 1 where its chunk has
+    it. A ray's result depends on nothing but the ray, so it is the same for every number of threads.
+    ``basis`` has room for the harmonics.
     """
     rays, scene, limits = forward.rays, forward.scene, forward.limits
     chunk_count = (len(which) + rays_per_chunk - 1) // rays_per_chunk
@@ -91,14 +90,13 @@ def trace_from_counter(embree, forward, which, rays_per_chunk, counter, basis):
         for s in range(chunk * rays_per_chunk, min(len(which), (chunk + 1) * rays_per_chunk)):
             r = which[s]
             if r != before + 1:
-                place = r * limits.max_hits
+                place = first_place(r, limits)
             before = r
             origin, direction = ray_origin(rays, r), ray_direction(rays, r)
             t_min, t_max = ray_limits(rays, r)
             for axis in range(3):
                 context_f64[RAY64 + axis] = origin[axis]
                 context_f64[RAY64 + 3 + axis] = direction[axis]
-            write_basis(basis, forward.scene.sh.shape[1], direction[0], direction[1], direction[2])
             front = begin(forward, r, place)
             context[LAST_T], context_i32[LAST_ID], context[T_LIMIT] = t_min, INT32_MAX, t_max
             stop = not t_min < t_max
@@ -122,7 +120,7 @@ def trace_from_counter(embree, forward, which, rays_per_chunk, counter, basis):
                         np.float64(record[NORMAL + 1]),
                         np.float64(record[NORMAL + 2]),
                     )
-                    front, ends = composite(front, hit, forward, r, direction, basis)
+                    front, ends = composite(front, hit, forward, r, origin, direction, basis)
                     if ends:
                         stop = True
                         break

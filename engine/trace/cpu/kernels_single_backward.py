@@ -14,9 +14,9 @@ from numba import njit, prange
 
 from engine.gaussians.model import SH_C0
 from engine.trace.cpu.kernels_hit import NORMAL, OPACITY
-from engine.trace.cpu.kernels_rays import ray_direction, ray_origin
+from engine.trace.cpu.kernels_rays import ray_direction, ray_origin, ray_viewer
 from engine.trace.cpu.kernels_records import rotation_columns
-from engine.trace.cpu.kernels_sh import write_basis
+from engine.trace.cpu.kernels_sh import slope_by_mean, write_ray_view
 from engine.trace.kernels_native import lean, next_from_counter
 
 RED_OFF, GREEN_OFF, BLUE_OFF = 1 << 28, 1 << 29, 1 << 30
@@ -40,7 +40,8 @@ class Shares(NamedTuple):
 class Moments(NamedTuple):
     """Sums over a Gaussian's hits; with the hit at u, v standard deviations and tau = dL/dt / <d, r1>.
 
-    ``n0`` to ``n2`` sum the gradient of the turned normal times the weight.
+    ``n0`` to ``n2`` sum the gradient of the turned normal times the weight, ``m0`` to ``m2`` that by the mean
+    through the direction in which its colour is seen.
     """
 
     h: float
@@ -55,6 +56,9 @@ class Moments(NamedTuple):
     n0: float
     n1: float
     n2: float
+    m0: float
+    m1: float
+    m2: float
 
 
 @lean(forceinline=True, fastmath={"contract"})
@@ -126,19 +130,17 @@ def replay_rays(rays, which, offsets, hits, counts, scene, limits, g, shares):
 
 
 @lean(forceinline=True, fastmath={"contract"})
-def write_gradients(segment, i, parameters, records, sums, out):
+def write_gradients(segment, i, frame, quats, records, sums, out):
     """Gradients of one Gaussian's raw geometry from its sums over rays.
 
     In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point
     over <d, r1>: dL/dm = S(h u)/s2 r2 + S(h v)/s3 r3 + S(tau) r1, dL/dln s = S(h u^2), S(h v^2), and the
-    frame turns by the torque S r_i x dL/dr_i.
+    frame turns by the torque S r_i x dL/dr_i. ``frame`` are r1, r2, r3, s2 and s3.
     """
-    quats, log_scales = parameters.quats, parameters.log_scales
     q0, q1, q2, q3 = (
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
     )  # fmt: skip
-    r1, r2, r3 = rotation_columns(q0, q1, q2, q3)
-    s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
+    r1, r2, r3, s2, s3 = frame
     inv_s2, inv_s3 = 1.0 / s2, 1.0 / s3
     # torque = r1 x G1 + r2 x G2 + r3 x G3, G1 = -(sums.tau_u s2 r2 + sums.tau_v s3 r3) + normal channel
     on_r3, on_r2 = -sums.tau_u * s2, sums.tau_v * s3
@@ -152,9 +154,10 @@ def write_gradients(segment, i, parameters, records, sums, out):
     out.quats[segment, 1] = factor * (w0 * q0 + w1 * q3 - w2 * q2)
     out.quats[segment, 2] = factor * (w1 * q0 + w2 * q1 - w0 * q3)
     out.quats[segment, 3] = factor * (w2 * q0 + w0 * q2 - w1 * q1)
+    by_view = sums.m0, sums.m1, sums.m2
     for axis in range(3):
         out.means[segment, axis] = (
-            sums.hu * inv_s2 * r2[axis] + sums.hv * inv_s3 * r3[axis] + sums.tau * r1[axis]
+            sums.hu * inv_s2 * r2[axis] + sums.hv * inv_s3 * r3[axis] + sums.tau * r1[axis] + by_view[axis]
         )
     out.log_scales[segment, 0] = sums.huu
     out.log_scales[segment, 1] = sums.hvv
@@ -162,7 +165,7 @@ def write_gradients(segment, i, parameters, records, sums, out):
 
 
 @lean(fastmath={"contract"})
-def gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, shares, g, out):
+def gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shares, g, out):
     """Gradients of the Gaussians ``first`` to ``last`` of the sorted hits.
 
     In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point and
@@ -189,7 +192,7 @@ def gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, sh
         b0, b1, b2 = r3[0] * inv_s3, r3[1] * inv_s3, r3[2] * inv_s3
         s_h = s_hu = s_hv = s_huu = s_hvv = s_huv = 0.0
         s_tau = s_tau_u = s_tau_v = 0.0
-        s_n0 = s_n1 = s_n2 = s_w = s_error = 0.0
+        s_n0 = s_n1 = s_n2 = s_w = s_error = s_m0 = s_m1 = s_m2 = 0.0
         sh_sum[:basis_count] = 0.0
         feature_sum[:] = 0.0
         for k in range(starts[segment], starts[segment + 1]):
@@ -200,6 +203,7 @@ def gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, sh
             d0, d1, d2 = ray_direction(rays, r)
             o0, o1, o2 = ray_origin(rays, r)
             x, y, z = o0 - m0, o1 - m1, o2 - m2
+            to_mean = -x, -y, -z
             inverse = 1.0 / (d0 * n0 + d1 * n1 + d2 * n2)
             t = -(x * n0 + y * n1 + z * n2) * inverse
             x += t * d0
@@ -233,7 +237,9 @@ def gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, sh
                 sh_sum[0, 1] += gg
                 sh_sum[0, 2] += gb
             else:
-                write_basis(basis, basis_count, d0, d1, d2)
+                view = write_ray_view(basis, basis_count, to_mean, (d0, d1, d2), ray_viewer(rays, r))
+                m_x, m_y, m_z = slope_by_mean(scene.sh, i, basis_count, view, (gr, gg, gb))
+                s_m0, s_m1, s_m2 = s_m0 + m_x, s_m1 + m_y, s_m2 + m_z
                 for j in range(basis_count):
                     sh_sum[j, 0] += basis[j] * gr
                     sh_sum[j, 1] += basis[j] * gg
@@ -245,8 +251,10 @@ def gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, sh
                 s_n2 += facing * g.normal[r, 2]
             for f in range(feature_count):
                 feature_sum[f] += w * g.features[r, f]
-        moments = Moments(s_h, s_hu, s_hv, s_huu, s_huv, s_hvv, s_tau, s_tau_u, s_tau_v, s_n0, s_n1, s_n2)
-        write_gradients(segment, i, parameters, records, moments, out)
+        moments = Moments(
+            s_h, s_hu, s_hv, s_huu, s_huv, s_hvv, s_tau, s_tau_u, s_tau_v, s_n0, s_n1, s_n2, s_m0, s_m1, s_m2
+        )
+        write_gradients(segment, i, (r1, r2, r3, s2, s3), quats, scene.records, moments, out)
         for j in range(basis_count):
             for channel in range(3):
                 # degree 0 skips the basis in the loop above
@@ -260,7 +268,7 @@ def gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, sh
 
 
 @njit(cache=True, parallel=True, fastmath={"contract"}, error_model="numpy")
-def gather_gaussians(rays, parameters, records, by_gaussian, chunk_bounds, workers, counter, shares, g, out):
+def gather_gaussians(rays, parameters, scene, by_gaussian, chunk_bounds, workers, counter, shares, g, out):
     """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters.
 
     Chunk c has the Gaussians ``chunk_bounds[c]`` to ``chunk_bounds[c + 1]``; ``counter`` holds one zero.
@@ -277,4 +285,4 @@ def gather_gaussians(rays, parameters, records, by_gaussian, chunk_bounds, worke
             if chunk >= len(chunk_bounds) - 1:
                 break
             first, last = chunk_bounds[chunk], chunk_bounds[chunk + 1]
-            gather_chunk(first, last, memory, rays, parameters, records, by_gaussian, shares, g, out)
+            gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shares, g, out)

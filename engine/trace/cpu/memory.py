@@ -3,19 +3,25 @@
 import weakref
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 from numpy.typing import DTypeLike
 
 from engine.trace.cpu.bundles import OutputGradients, Outputs, RawGradients
 from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
 
+LINE = 64
+"""Bytes of a cache line."""
+
 
 def aligned_empty(shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
-    """Uninitialised float32 array whose memory starts on a cache line (64 bytes)."""
-    size = int(np.prod(shape)) * 4
-    raw = np.empty(size + 64, np.uint8)
-    offset = -raw.ctypes.data % 64
-    return raw[offset : offset + size].view(np.float32).reshape(shape)
+    """Uninitialised float32 array whose memory starts on a cache line."""
+    return _aligned_bytes(int(np.prod(shape)) * 4).view(np.float32).reshape(shape)
+
+
+def _aligned_bytes(size: int) -> UInt8[np.ndarray, " b"]:
+    raw = np.empty(size + LINE, np.uint8)
+    offset = -raw.ctypes.data % LINE
+    return raw[offset : offset + size]
 
 
 class Pool:
@@ -30,14 +36,14 @@ class Pool:
         self._free: list[np.ndarray] = []
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
-        """An uninitialised array; pages are only taken when they are written to."""
+        """An uninitialised array from a cache line on; pages are only taken when they are written to."""
         size = int(np.prod(shape)) * np.dtype(dtype).itemsize
         fitting = [block for block in self._free if size <= block.nbytes <= 4 * size]
         if fitting:
             block = min(fitting, key=lambda block: block.nbytes)
             self._free = [other for other in self._free if other is not block]
         else:
-            block = np.empty(size + size // 4, np.uint8)
+            block = _aligned_bytes(size + size // 4)
         lease = _Lease(block)
         weakref.finalize(lease, _give_back, weakref.ref(self), block).atexit = False
         return np.asarray(lease)[:size].view(dtype).reshape(shape)

@@ -16,6 +16,7 @@ from engine.trace.cpu.kernels_tree import (
     write_leaves,
     write_upper_levels,
 )
+from engine.trace.cpu.memory import aligned_empty
 
 _SAMPLE = 4096
 
@@ -44,9 +45,10 @@ class PacketTree:
         while sizes[-1] > 1:
             sizes.append(-(-sizes[-1] // WIDTH))
         level_starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        nodes = np.full((int(level_starts[-1]), BOX_ROWS, WIDTH), np.inf, np.float32)
+        nodes = aligned_empty((int(level_starts[-1]), BOX_ROWS, WIDTH))
+        nodes[:, :3] = np.inf
         nodes[:, 3:] = -np.inf  # boxes turned inside out are in no pyramid
-        self.arrays = Tree(nodes, level_starts, np.empty((blocks, LEAF_ROWS, WIDTH), np.float32), order)
+        self.arrays = Tree(nodes, level_starts, aligned_empty((blocks, LEAF_ROWS, WIDTH)), order)
         self._slots = np.full(count, -1, np.int32)
         write_leaves(self.arrays.blocks, self._slots, records, order, nodes)
         write_upper_levels(nodes, level_starts)

@@ -17,8 +17,15 @@ from engine.trace.cpu.bundles import (
     Scene,
 )
 from engine.trace.cpu.kernels_packet import packet_starts
-from engine.trace.cpu.kernels_packet_backward import ROW_WORDS, Rows, replay_packets, sum_packets
+from engine.trace.cpu.kernels_packet_backward import (
+    GEOMETRY_WORDS,
+    ROW_WORDS,
+    Rows,
+    replay_packets,
+    sum_packets,
+)
 from engine.trace.cpu.kernels_packet_forward import absorb_packets, trace_packets
+from engine.trace.cpu.kernels_rays import SPARE
 from engine.trace.cpu.kernels_sort import sort_by_gaussian
 from engine.trace.cpu.memory import Pool, empty_gradients, raw_gradients
 from engine.trace.cpu.packet_tree import PacketTree
@@ -41,22 +48,24 @@ Ways = Literal["auto", "always", "never"]
 
 
 def find_packets(
-    rays: RayBatch, ways: Ways = "auto"
+    rays: RayBatch, ways: Ways = "auto", *, coloured: bool = True
 ) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
     """Which rays go in packets, and which alone.
 
     A group are neighbours in the batch that share an origin, to the bit, and look about one way. Each is
-    judged by its own size, but few small ones go as packets, too.
+    judged by its own size, but few small ones go as packets, too. A packet sees a Gaussian in one colour, so
+    that where colours matter the viewers have to stand at the origins.
 
     Args:
         rays: any rays.
-        ways: ``auto`` by what is faster; ``always`` or ``never`` in packets.
+        ways: ``auto`` by what is faster; ``always`` (where that is possible) or ``never`` in packets.
+        coloured: whether colours matter.
 
     Returns:
         First ray of each packet and the one behind its last; and the rays that go alone.
     """
     count = len(rays)
-    if ways == "never" or count == 0:
+    if ways == "never" or count == 0 or (coloured and rays.t_viewer.any()):
         return np.empty((0, 2), np.int64), np.arange(count)
     starts = np.empty(count + 1, np.int64)
     groups = packet_starts(rays.origins_world, rays.directions_world, MAX_RAYS, LEAST_COSINE, starts)
@@ -94,12 +103,13 @@ class PacketTracer:
 
     def room(self, packets: Int64[np.ndarray, "p 2"], rays: int, *, recording: bool) -> PacketHits:
         """Memory for what packets keep of their hits."""
-        places = rays * self._limits.max_hits if recording and len(packets) else 0
+        places = rays * (self._limits.max_hits + SPARE) if recording and len(packets) else 0
         return PacketHits(
             us=self._pool.empty((places,), np.float32),
             vs=self._pool.empty((places,), np.float32),
             slots=self._pool.empty((places,), np.int32),
             slot_ids=self._pool.empty((places,), np.int32),
+            slot_rgb=self._pool.empty((places, 3), np.float32),
             slot_counts=np.zeros(len(packets), np.int32),
         )
 
@@ -128,20 +138,23 @@ class PacketTracer:
         """Gradients of the raw parameters: summed within each packet, then over packets in their order."""
         firsts = np.concatenate([[0], np.cumsum(recording.kept.slot_counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
+        geometry = GEOMETRY_WORDS if gradients.with_geometry else 0
         rows = Rows(
             firsts=firsts,
             ids=self._pool.empty((count,), np.int32),
             sums=self._pool.empty((count, ROW_WORDS), np.float32),
-            sh=self._pool.empty((count, basis_count, 3), np.float32),
+            geometry=self._pool.empty((count, geometry), np.float32),
             features=np.empty((count, feature_count), np.float32),
         )
+        rays, packets = Rays.of(recording.rays), recording.packets
         replay_packets(
-            Rays.of(recording.rays), recording.packets, recording.hits, recording.kept, recording.counts,
-            parameters, scene.features, self._limits, gradients, self._threads, np.zeros(1, np.int64), rows,
+            rays, packets, recording.hits, recording.kept, recording.counts, parameters, scene.features,
+            self._limits, gradients, self._threads, np.zeros(1, np.int64), rows,
         )  # fmt: skip
         by_gaussian = ByGaussian(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
         out = empty_gradients(len(by_gaussian.starts) - 1, basis_count, feature_count)
         sum_packets(
-            parameters, scene.records, by_gaussian, rows, SUM_CHUNKS * self._threads, raw_gradients(out)
-        )
+            rays, packets, parameters, scene, by_gaussian, rows, SUM_CHUNKS * self._threads,
+            raw_gradients(out),
+        )  # fmt: skip
         return out

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Int32, Int64
 
 from engine.rays import RayBatch
-from engine.trace.cpu.bundles import Hits, PacketHits
+from engine.trace.cpu.bundles import Hits, Limits, PacketHits
+from engine.trace.cpu.kernels_rays import first_place
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class CpuRecording:
         alone: the other rays, in ascending order.
         hits: the hits of both.
         kept: what packets keep beside them; of no size where there are none.
+        limits: where rays end.
         build: which build of which tracer it belongs to.
     """
 
@@ -29,6 +31,7 @@ class CpuRecording:
     alone: Int64[np.ndarray, " s"]
     hits: Hits
     kept: PacketHits
+    limits: Limits
     build: object
 
     def place(self, ray: int) -> slice:
@@ -38,4 +41,9 @@ class CpuRecording:
 
     def of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
         """Ids of the Gaussians of one ray, front to back."""
-        return self.hits.ids[self.place(ray)]
+        hits = self.place(ray)
+        packet = int(np.searchsorted(self.packets[:, 0], ray, side="right")) - 1
+        if packet < 0 or ray >= self.packets[packet, 1]:
+            return self.hits.ids[hits]
+        first = first_place.py_func(int(self.packets[packet, 0]), self.limits)
+        return self.kept.slot_ids[first + self.kept.slots[hits]]

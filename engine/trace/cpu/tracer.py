@@ -9,6 +9,7 @@ from engine.rays import RayBatch
 from engine.threads import use_threads
 from engine.trace.cpu.bundles import Forward, Hits, Limits, Parameters, Rays, Scene
 from engine.trace.cpu.kernels_hit import RECORD_WORDS
+from engine.trace.cpu.kernels_rays import SPARE
 from engine.trace.cpu.kernels_records import outgrown_boxes, refresh_records, write_boxes, write_records
 from engine.trace.cpu.memory import Pool, aligned_empty, empty_result, output_gradients, outputs
 from engine.trace.cpu.packets import PacketTracer, Ways, find_packets
@@ -23,8 +24,8 @@ MAX_RAYS_PER_TRACE = 1 << 28
 class CpuTracer:
     """Flat Gaussians for a CPU; follows :class:`engine.trace.protocol.Tracer`.
 
-    Rays that lie beside each other in the batch, share their origin and look about one way form packets; the
-    others are followed one by one (:func:`engine.trace.cpu.packets.find_packets`).
+    Rays that lie beside each other in the batch, share their origin, have their viewer there and look about
+    one way form packets; the others are followed one by one (:func:`engine.trace.cpu.packets.find_packets`).
 
     Hits are exact: a hierarchy only says which octagons to test, the octagon test and the distance come
     from the parameters in float64, and hits are ordered by (float32 distance, id). So neither the shape of
@@ -95,7 +96,7 @@ class CpuTracer:
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Follow rays; see the protocol. Directions must have unit length."""
-        packets, alone = self._sorted_out(rays)
+        packets, alone = self._sorted_out(rays, coloured=True)
         count = len(rays)
         result = empty_result(count, self._features.shape[1])
         hits = self._room(count if record else 0)
@@ -106,12 +107,14 @@ class CpuTracer:
         if len(alone):
             self._singles.trace(forward, alone)
         if record:
-            result.hits = CpuRecording(rays, result.hit_counts, packets, alone, hits, kept, self._build)
+            result.hits = CpuRecording(
+                rays, result.hit_counts, packets, alone, hits, kept, self._limits, self._build
+            )
         return result
 
     def transmittance(self, rays: RayBatch) -> Float32[np.ndarray, " r"]:
         """What light is left along each ray; see the protocol."""
-        packets, alone = self._sorted_out(rays)
+        packets, alone = self._sorted_out(rays, coloured=False)
         left = np.empty(len(rays), np.float32)
         if len(packets):
             self._packets.absorb(Rays.of(rays), self._scene, packets, left)
@@ -140,11 +143,13 @@ class CpuTracer:
         assert self._gaussians is not None, "build first"
         return Scene(self._records, self._gaussians.sh, self._features)
 
-    def _sorted_out(self, rays: RayBatch) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
+    def _sorted_out(
+        self, rays: RayBatch, *, coloured: bool
+    ) -> tuple[Int64[np.ndarray, "p 2"], Int64[np.ndarray, " s"]]:
         """Packets and single rays of a batch, with what they need ready."""
         assert len(rays) < MAX_RAYS_PER_TRACE
         use_threads(self.threads)
-        packets, alone = find_packets(rays, self._ways)
+        packets, alone = find_packets(rays, self._ways, coloured=coloured)
         if len(alone) and not self._built_singles:
             assert self._gaussians is not None, "build first"
             write_boxes(self._boxes, *Parameters.of(self._gaussians), self.settings.q, self._padding)
@@ -154,7 +159,7 @@ class CpuTracer:
 
     def _room(self, rays: int) -> Hits:
         """Memory for the hits of so many recorded rays."""
-        places = rays * self._limits.max_hits
+        places = rays * (self._limits.max_hits + SPARE)
         return Hits(
             starts=np.empty(rays, np.int64),
             ids=self._pool.empty((places,), np.int32),

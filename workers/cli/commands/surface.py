@@ -165,7 +165,7 @@ def surface(
         for name, value in given.items()
         if name == "fill_holes" or (value is not None and value is not False)
     }
-    options = (dict(ROOM) if room else {}) | options
+    options = {**(ROOM if room else {}), **options}
     levels = max_triangles or {}
     if len(levels) == 1:
         options["max_triangles"], levels = next(iter(levels.values())), {}

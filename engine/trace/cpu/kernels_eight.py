@@ -1,0 +1,302 @@
+"""Eight hits of a ray at a time, as explicit vectors: where they are, how opaque, and what light is left.
+
+Addresses point to doubles, eight to a vector, unless said otherwise; stores may write up to eight values
+where fewer count, so that arrays have room for eight more. No flag allows the compiler to change a result.
+"""
+
+import llvmlite.ir as ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from engine.trace.cpu.kernels_lanes import (
+    DOUBLE,
+    FLOAT,
+    I32,
+    INT8,
+    LONG8,
+    MASK8,
+    compress,
+    distances_of,
+    first_lanes,
+    gather,
+    lanes_below,
+    load,
+    offset,
+    places_of,
+    scan,
+    shifted,
+    splat,
+    store,
+)
+from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
+
+N_X, A_X, B_X, N_0, INNER, ALPHA_0 = 0, 3, 6, 9, 10, 11
+ROWS = 12
+"""Rows of a block of eight candidates: u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0."""
+
+
+@intrinsic
+def meet_block(
+    typingctx, block, dx, dy, dz, t_min, t_max, first, tail, keys, powers, opacities, us, vs, numbers
+):
+    """Test the eight candidates of a block, from ``first`` on; how many octagons the ray meets.
+
+    Of each that it meets between the two distances writes from place ``tail`` on, without gaps: a key, the
+    float32 distance in the upper half and the place in the lower (uint64); the exponent -(u^2 + v^2)/2;
+    and as 32-bit words the opacity, u, v and the number of the candidate. A ray that makes a cosine below
+    1e-6 with the normal runs inside the plane and meets nothing.
+    """
+    double, single, address = types.float64, types.float32, types.uintp
+    signature = types.int64(
+        address, double, double, double, single, single, types.int64, types.int64, *(address,) * 6
+    )
+
+    def codegen(context, builder, sig, args):
+        block, dx, dy, dz, t_min, t_max, first, tail, keys, powers, opacities, us, vs, numbers = args
+        rows = Lanes(builder, block, DOUBLE8)
+        d = [broadcast(builder, component) for component in (dx, dy, dz)]
+
+        def along(row):
+            return rows[row] * d[0] + rows[row + 1] * d[1] + rows[row + 2] * d[2]
+
+        cosine = along(N_X)
+        inverse = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES)) / cosine
+        u, v = along(A_X) * inverse, along(B_X) * inverse
+        cos_22, sin_22 = 0.9238795325112867, 0.3826834323650898
+        farthest = (abs(u) * cos_22 + abs(v) * sin_22).larger(abs(u) * sin_22 + abs(v) * cos_22)
+        met = ((farthest <= rows[INNER]) & (abs(cosine) >= 1e-6)).value
+        t = builder.fptrunc((rows[N_0] * inverse).value, FLOAT8)
+        behind = builder.fcmp_ordered(">", t, splat(builder, t_min, FLOAT))
+        before = builder.fcmp_ordered("<", t, splat(builder, t_max, FLOAT))
+        met = builder.and_(met, builder.and_(behind, before))
+
+        def write(value, array, size):
+            packed = compress(builder, value, met)
+            store(builder, packed, offset(builder, array, tail, size))
+
+        places = builder.add(splat(builder, tail, I64), ir.Constant(LONG8, list(range(LANES))))
+        distance = builder.zext(compress(builder, builder.bitcast(t, INT8), met), LONG8)
+        key = builder.or_(builder.shl(distance, ir.Constant(LONG8, [32] * LANES)), places)
+        store(builder, key, offset(builder, keys, tail, 8))
+        write(((u * u + v * v) * -0.5).value, powers, 8)
+        write(builder.fptrunc(rows[ALPHA_0].value, FLOAT8), opacities, 4)
+        write(builder.fptrunc(u.value, FLOAT8), us, 4)
+        write(builder.fptrunc(v.value, FLOAT8), vs, 4)
+        number = builder.add(
+            splat(builder, builder.trunc(first, I32), I32), ir.Constant(INT8, list(range(LANES)))
+        )
+        write(number, numbers, 4)
+        bits = builder.zext(builder.bitcast(met, ir.IntType(LANES)), I64)
+        return builder.ctpop(bits)
+
+    return signature, codegen
+
+
+@intrinsic
+def write_alphas(typingctx, powers, opacities, place, alpha_max):
+    """Eight exponents from ``place`` on become alphas: opacity exp(power), at most the max, as float32.
+
+    The exponential is right to a relative 1e-8 for |power| < 700.
+    """
+    signature = types.void(types.uintp, types.uintp, types.int64, types.float64)
+
+    def codegen(context, builder, sig, args):
+        powers, opacities, place, alpha_max = args
+        at = offset(builder, powers, place, 8)
+        opacity = Lanes(builder, offset(builder, opacities, place, 4), FLOAT8)[0]
+        found = opacity * _exponential(builder, Lanes(builder, at, DOUBLE8)[0])
+        found = found.smaller(broadcast(builder, alpha_max))
+        rounded = builder.fpext(builder.fptrunc(found.value, FLOAT8), DOUBLE8)
+        store(builder, rounded, at)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@intrinsic
+def sort_few(typingctx, keys, count, sorted_keys):
+    """Sort ``count`` different keys (uint64) in place: each goes behind as many as are smaller than it.
+
+    That takes as many steps as pairs, but no branch that the processor could guess wrongly. Both arrays have
+    room for eight more; ``sorted_keys`` is for the work. Tells whether the upper halves of some are the same.
+    """
+    signature = types.boolean(types.uintp, types.int64, types.uintp)
+
+    def codegen(context, builder, sig, args):
+        keys, count, sorted_keys = args
+        zeros = ir.Constant(LONG8, [0] * LANES)
+        last = builder.sub(count, ir.Constant(I64, 1))
+        blocks = builder.add(builder.ashr(last, ir.Constant(I64, 3)), ir.Constant(I64, 1))
+        words = builder.inttoptr(keys, I64.as_pointer())
+        pointers = ir.VectorType(ir.IntType(8).as_pointer(), LANES)
+        function_type = ir.FunctionType(ir.VoidType(), [LONG8, pointers, I32, MASK8])
+        scatter = cgutils.get_or_insert_function(
+            builder.module, function_type, "llvm.masked.scatter.v8i64.v8p0"
+        )
+        with cgutils.for_range(builder, blocks) as block:
+            first = builder.mul(block.index, ir.Constant(I64, LANES))
+            mine = load(builder, offset(builder, keys, first, 8), LONG8)
+            below = cgutils.alloca_once(builder, LONG8)
+            builder.store(zeros, below)
+            with cgutils.for_range(builder, count) as loop:
+                other = splat(builder, builder.load(builder.gep(words, [loop.index])), I64)
+                so_far = builder.load(below)
+                more = builder.add(so_far, ir.Constant(LONG8, [1] * LANES))
+                smaller = builder.icmp_unsigned("<", other, mine)
+                builder.store(builder.select(smaller, more, so_far), below)
+            places = builder.mul(builder.load(below), ir.Constant(LONG8, [8] * LANES))
+            where = builder.inttoptr(builder.add(places, splat(builder, sorted_keys, I64)), pointers)
+            valid = lanes_below(builder, builder.sub(count, first))
+            builder.call(scatter, [mine, where, ir.Constant(I32, 8), valid])
+        same = cgutils.alloca_once(builder, MASK8)
+        builder.store(ir.Constant(MASK8, [0] * LANES), same)
+        with cgutils.for_range(builder, blocks) as block:
+            first = builder.mul(block.index, ir.Constant(I64, LANES))
+            at = offset(builder, sorted_keys, first, 8)
+            one = load(builder, at, LONG8)
+            # One further on; what lies behind the last counts for nothing.
+            next_one = load(builder, builder.add(at, ir.Constant(I64, 8)), LONG8)
+            alike = builder.icmp_unsigned("<", builder.xor(one, next_one), ir.Constant(LONG8, [1 << 32] * 8))
+            alike = builder.and_(alike, lanes_below(builder, builder.sub(last, first)))
+            builder.store(builder.or_(builder.load(same), alike), same)
+            store(builder, one, offset(builder, keys, first, 8))
+        bits = builder.bitcast(builder.load(same), ir.IntType(LANES))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+
+    return signature, codegen
+
+
+@intrinsic
+def weigh_next(typingctx, keys, most, safe, known_alphas, t, stop_below, alphas, weights, after):
+    """Weights of the next of a ray's sorted hits, eight at the most, before which the transmittance is ``t``.
+
+    Counts those of the first ``most`` of the ``keys`` that are below ``safe``. Writes their alphas, read from
+    ``known_alphas`` at the places in the keys, to ``alphas``, alpha T to ``weights``, and the transmittance
+    behind each to ``after``; what lies beyond them changes nothing. The result has the bits of those behind
+    which it is below ``stop_below``; eight bits higher of those behind which it is one half or less; and
+    their number from bit 16 on.
+    """
+    address, double, word = types.uintp, types.float64, types.int64
+    signature = word(address, word, types.uint64, address, double, double, address, address, address)
+
+    def codegen(context, builder, sig, args):
+        keys, most, safe, known_alphas, t, stop_below, alphas, weights, after = args
+        key = load(builder, keys, LONG8)
+        valid = builder.icmp_unsigned("<", key, splat(builder, safe, I64))
+        valid = builder.and_(valid, lanes_below(builder, most))
+        alpha = gather(builder, known_alphas, places_of(builder, key, valid), DOUBLE8)
+        alpha = Vector(builder, builder.select(valid, alpha, ir.Constant(DOUBLE8, [0.0] * LANES)))
+        store(builder, alpha.value, alphas)
+        one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
+        product = scan(builder, one - alpha, lambda a, b: a * b, 1.0)
+        through = shifted(builder, product, 1, 1.0)
+        begin = broadcast(builder, t)
+        left = product * begin
+        store(builder, (alpha * (through * begin)).value, weights)
+        store(builder, left.value, after)
+        count = builder.ctpop(Vector(builder, valid).mask())
+        stops = (left < broadcast(builder, stop_below)).mask()
+        halves = builder.shl((left <= 0.5).mask(), ir.Constant(I64, LANES))
+        count = builder.shl(count, ir.Constant(I64, 2 * LANES))
+        return builder.or_(builder.or_(stops, halves), count)
+
+    return signature, codegen
+
+
+@intrinsic
+def know_slots(typingctx, keys, count, known_numbers, slot_of, weights, numbers, slots, depths):
+    """Which candidates the first ``count`` of eight hits are, and under which slots their packet knows them.
+
+    Writes ``numbers``, read from ``known_numbers`` at the places in the keys, and ``slots``, both int64;
+    adds weights times distances to the eight ``depths``. Bit k of the result: hit k has no slot yet.
+    """
+    address, word = types.uintp, types.int64
+    signature = word(address, word, *(address,) * 6)
+
+    def codegen(context, builder, sig, args):
+        keys, count, known_numbers, slot_of, weights, numbers, slots, depths = args
+        key = load(builder, keys, LONG8)
+        valid = lanes_below(builder, count)
+        number = gather(builder, known_numbers, places_of(builder, key, valid), INT8)
+        number = builder.zext(number, LONG8)
+        slot = builder.sext(gather(builder, slot_of, number, INT8), LONG8)
+        store(builder, number, numbers)
+        store(builder, slot, slots)
+        weight = Lanes(builder, weights, DOUBLE8)[0]
+        distance = Vector(builder, builder.fpext(distances_of(builder, key), DOUBLE8))
+        distance = first_lanes(builder, distance, count)
+        store(builder, (Lanes(builder, depths, DOUBLE8)[0] + weight * distance).value, depths)
+        new = builder.icmp_signed("<", slot, ir.Constant(LONG8, [0] * LANES))
+        return Vector(builder, builder.and_(new, valid)).mask()
+
+    return signature, codegen
+
+
+@intrinsic
+def keep_hits(
+    typingctx, keys, count, alphas, slots, known_us, known_vs, place,
+    kept_alphas, kept_distances, kept_us, kept_vs, kept_slots,
+):  # fmt: skip
+    """Store ``count`` of eight hits from ``place`` on, 32 bits a number; what follows them is undefined.
+
+    u and v are read from where the keys say.
+    """
+    address, word = types.uintp, types.int64
+    signature = types.void(address, word, *(address,) * 4, word, *(address,) * 5)
+
+    def codegen(context, builder, sig, args):
+        keys, count, alphas, slots, known_us, known_vs, place, *kept = args
+        key = load(builder, keys, LONG8)
+        where = places_of(builder, key, lanes_below(builder, count))
+        values = (
+            builder.fptrunc(load(builder, alphas, DOUBLE8), FLOAT8),
+            distances_of(builder, key),
+            gather(builder, known_us, where, FLOAT8),
+            gather(builder, known_vs, where, FLOAT8),
+            builder.trunc(load(builder, slots, LONG8), INT8),
+        )
+        for value, array in zip(values, kept, strict=True):
+            store(builder, value, offset(builder, array, place, 4))
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@intrinsic
+def add_shown(typingctx, sums, shown, slots, weights, count):
+    """Add to the eight ``sums`` what ``count`` Gaussians show, times their weights, one after the other.
+
+    Row s of ``shown``, eight doubles, is what the one in slot s shows; ``slots`` are int64.
+    """
+    signature = types.void(types.uintp, types.uintp, types.uintp, types.uintp, types.int64)
+
+    def codegen(context, builder, sig, args):
+        sums, shown, slots, weights, count = args
+        slots = builder.inttoptr(slots, I64.as_pointer())
+        weights = builder.inttoptr(weights, DOUBLE.as_pointer())
+        total = cgutils.alloca_once_value(builder, Lanes(builder, sums, DOUBLE8)[0].value)
+        with cgutils.for_range(builder, count) as loop:
+            slot = builder.load(builder.gep(slots, [loop.index]))
+            weight = broadcast(builder, builder.load(builder.gep(weights, [loop.index])))
+            row = Lanes(builder, offset(builder, shown, slot, 64), DOUBLE8)[0]
+            added = Vector(builder, builder.load(total)) + weight * row
+            builder.store(added.value, total)
+        store(builder, builder.load(total), sums)
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+def _exponential(builder, x):
+    """Exponentials of eight doubles: 2^n times a polynomial of what is left, at most half of ln 2."""
+    shift = 6755399441055744.0  # 1.5 * 2^52: adding it rounds to a whole number, which the low bits then are
+    moved = x * 1.4426950408889634 + shift
+    n = moved - shift
+    r = x - n * 0.6931471805599453
+    p = r * (1.0 / 40320.0) + 1.0 / 5040.0
+    for term in (1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0):
+        p = p * r + term
+    bits = builder.shl(builder.bitcast(moved.value, LONG8), ir.Constant(LONG8, [52] * LANES))
+    bits = builder.add(bits, ir.Constant(LONG8, [1023 << 52] * LANES))
+    return p * Vector(builder, builder.bitcast(bits, DOUBLE8))

@@ -1,0 +1,97 @@
+"""What vectors of eight are made with: constants, lanes that move, and arrays at an address."""
+
+import llvmlite.ir as ir
+from numba.core import cgutils
+
+from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Vector
+
+I1, I32 = ir.IntType(1), ir.IntType(32)
+FLOAT, DOUBLE = ir.FloatType(), ir.DoubleType()
+INT8, MASK8 = ir.VectorType(I32, LANES), ir.VectorType(I1, LANES)
+LONG8 = ir.VectorType(I64, LANES)
+
+
+def scan(builder, vector, combine, neutral, backwards=False):
+    """Each lane with all before it, or behind it, combined in three steps."""
+    for step in (1, 2, 4):
+        vector = combine(vector, shifted(builder, vector, -step if backwards else step, neutral))
+    return vector
+
+
+def shifted(builder, vector, by, filling):
+    """Lane k moves to lane k + ``by``; ``filling`` comes in."""
+    fill = ir.Constant(DOUBLE8, [float(filling)] * LANES)
+    places = [k - by if 0 <= k - by < LANES else LANES for k in range(LANES)]
+    order = ir.Constant(ir.VectorType(I32, LANES), places)
+    return Vector(builder, builder.shuffle_vector(vector.value, fill, order))
+
+
+def splat(builder, scalar, kind):
+    """A vector of eight times ``scalar``."""
+    vector = ir.VectorType(kind, LANES)
+    one = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(I32, 0))
+    return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), ir.Constant(INT8, [0] * LANES))
+
+
+def first_lanes(builder, vector, count):
+    """The first ``count`` lanes; zero in the others."""
+    valid = lanes_below(builder, count)
+    return Vector(builder, builder.select(valid, vector.value, ir.Constant(DOUBLE8, [0.0] * LANES)))
+
+
+def lanes_below(builder, count):
+    """Truth for the first ``count`` lanes."""
+    lanes = ir.Constant(LONG8, list(range(LANES)))
+    return builder.icmp_signed("<", lanes, splat(builder, count, I64))
+
+
+def places_of(builder, key, valid):
+    """The lower halves of the keys, 0 where they are not valid."""
+    lower = builder.and_(key, ir.Constant(LONG8, [0xFFFFFFFF] * LANES))
+    return builder.select(valid, lower, ir.Constant(LONG8, [0] * LANES))
+
+
+def distances_of(builder, key):
+    """The upper halves of the keys, float32."""
+    upper = builder.lshr(key, ir.Constant(LONG8, [32] * LANES))
+    return builder.bitcast(builder.trunc(upper, INT8), FLOAT8)
+
+
+def gather(builder, address, places, kind):
+    """Eight elements of ``kind`` at places of an array."""
+    element = kind.element
+    size, name = {FLOAT: (4, "f32"), DOUBLE: (8, "f64"), I32: (4, "i32")}[element]
+    pointers = ir.VectorType(ir.IntType(8).as_pointer(), LANES)
+    places = builder.mul(places, ir.Constant(LONG8, [size] * LANES))
+    where = builder.inttoptr(builder.add(places, splat(builder, address, I64)), pointers)
+    function_type = ir.FunctionType(kind, [pointers, I32, MASK8, kind])
+    function = cgutils.get_or_insert_function(
+        builder.module, function_type, f"llvm.masked.gather.v8{name}.v8p0"
+    )
+    mask = ir.Constant(MASK8, [1] * LANES)
+    return builder.call(function, [where, ir.Constant(I32, 4), mask, ir.Constant(kind, ir.Undefined)])
+
+
+def load(builder, address, kind):
+    """A vector of that kind from an address."""
+    return builder.load(builder.inttoptr(address, kind.as_pointer()), align=4)
+
+
+def compress(builder, value, mask):
+    """The lanes of ``mask`` without gaps, in order; what follows them is undefined."""
+    element = {FLOAT: "f32", DOUBLE: "f64", I32: "i32"}[value.type.element]
+    kind = ir.FunctionType(value.type, [value.type, MASK8, value.type])
+    function = cgutils.get_or_insert_function(
+        builder.module, kind, f"llvm.experimental.vector.compress.v8{element}"
+    )
+    return builder.call(function, [value, mask, ir.Constant(value.type, ir.Undefined)])
+
+
+def offset(builder, address, place, size):
+    """The address of an element of an array."""
+    return builder.add(address, builder.mul(place, ir.Constant(I64, size)))
+
+
+def store(builder, value, address):
+    """Store a vector at an address."""
+    builder.store(value, builder.inttoptr(address, value.type.as_pointer()), align=4)
