@@ -93,8 +93,8 @@ def _levels(_context: click.Context, _parameter: click.Parameter, value: str | N
 @click.option("--backdrop", is_flag=True, help="A sphere around everything that shows what lies in gaps.")
 @click.option(
     "--room", is_flag=True,
-    help="What pictures of a room need: --unbounded --unseen solid --backdrop, finer voxels, and vertices moved "
-    "to where the photographs agree.",
+    help="What pictures of a room need: --unbounded --unseen solid --backdrop, finer voxels, and vertices "
+    "moved to where the photographs agree.",
 )  # fmt: skip
 @click.option("--components", "keep_components", type=click.IntRange(1), help="Keep so many parts only.")
 @click.option(
