@@ -31,6 +31,8 @@ def conjugate_gradients(
 ) -> Float32[np.ndarray, "n c"]:
     """An approximate solution of ``times(x) = wanted`` (Hestenes and Stiefel 1952), from x = 0.
 
+    SciPy's takes one column at a time, and its products are added up in an order that depends on the threads.
+
     Args:
         times: a positive definite linear map.
         diagonal: of the map, by which steps are scaled.

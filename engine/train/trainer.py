@@ -249,12 +249,12 @@ class Trainer:
         self, gaussians: FlatGaussians
     ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
         """Which Gaussians are too near to a camera, and which are that or in no view."""
-        near = gone = np.zeros(len(gaussians), np.bool_)
+        near = np.zeros(len(gaussians), np.bool_)
         if self._near_zones is not None:
-            near = gone = self._near_zones.holds(gaussians.means_world)
-        if self._seen_space is not None:
-            gone = gone | ~self._seen_space.holds(gaussians.means_world)
-        return near, gone.copy()
+            near = self._near_zones.holds(gaussians.means_world)
+        if self._seen_space is None:
+            return near, near.copy()
+        return near, near | ~self._seen_space.holds(gaussians.means_world)
 
     def _densify(self) -> bool:
         """Let the strategy change the set of Gaussians if it is time; whether it was."""
