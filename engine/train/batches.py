@@ -110,20 +110,39 @@ class PixelSampler:
         """``rays`` pixels (a square number) in each of ``count`` windows of about ``side`` x ``side`` pixels.
 
         A window is a grid of cells, one random pixel in each. What sticks out of its view is folded back,
-        so that every pixel is about as likely as any other.
+        so that every pixel is about as likely as any other. Windows are spread over views and within them.
         """
-        areas = np.diff(self._ends, prepend=0)
-        which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
-        width, height = self._sizes[which].T
         cells = math.isqrt(rays)
         cell = max(1, round(side / cells))
+        which, x, y = self._spread(rng, count, cell * cells)
+        width, height = self._sizes[which].T
         rows, columns = np.divmod(np.arange(rays), cells)
-        left = rng.integers(-(cell * cells // 2), width - cell * cells // 2)
-        top = rng.integers(-(cell * cells // 2), height - cell * cells // 2)
+        left, top = x - cell * cells // 2, y - cell * cells // 2
         y = top[:, None] + rows * cell + rng.integers(0, cell, (count, rays))
         x = left[:, None] + columns * cell + rng.integers(0, cell, (count, rays))
         view = np.broadcast_to(self._views[which][:, None], x.shape)
         return view.reshape(-1), _fold(y, height[:, None]).reshape(-1), _fold(x, width[:, None]).reshape(-1)
+
+    def _spread(
+        self, rng: np.random.Generator, count: int, side: int
+    ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
+        """``count`` pixels as (place of the view among those drawn from, x, y), in strata.
+
+        All views lie end to end, each as a way to and fro through tiles of about ``side`` x ``side`` pixels;
+        steps of one length lead along it from a random beginning, each to a random pixel of the tile there.
+        Every pixel is as likely as any other.
+        """
+        at = (np.arange(count) + rng.random()) * (self.pixel_count / count)
+        which = np.searchsorted(self._ends, at, side="right")
+        width, height = self._sizes[which].T
+        share = (at - (self._ends[which] - width * height)) / (width * height)
+        columns = np.maximum(1, np.rint(width / side).astype(np.int64))
+        rows = np.maximum(1, np.rint(height / side).astype(np.int64))
+        row, column = np.divmod((share * columns * rows).astype(np.int64), columns)
+        column = np.where(row % 2 == 1, columns - 1 - column, column)
+        x = (column + rng.random(count)) * (width / columns)
+        y = (row + rng.random(count)) * (height / rows)
+        return which, x.astype(np.int64), y.astype(np.int64)
 
     def patches(
         self, rng: np.random.Generator, count: int, side: int

@@ -39,6 +39,9 @@ class LearningRates(_Frozen):
     mean_of: Literal["size", "extent"] = Field(
         "size", description="unit of the two: the Gaussian's own size, or the scene's extent"
     )
+    axes: Literal["own", "world"] = Field(
+        "own", description="along and around which means and rotations take their steps"
+    )
     quat: float = Field(0.03, ge=0)
     log_scale: float = Field(0.04, ge=0)
     opacity: float = Field(0.2, ge=0)
@@ -159,6 +162,12 @@ class TrainConfig(_Frozen):
     misfits_after: float = Field(
         0.3, ge=0, le=1, description="share of the iterations after which checkpoints look for them"
     )
+    average_after: float = Field(
+        0.85,
+        ge=0,
+        le=1,
+        description="share of the iterations after which states are averaged; the mean is exported",
+    )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
     trace: TraceSettings = TraceSettings()
@@ -258,6 +267,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "sh_degree": min(config.sh_degree, 1),
             "rays": 8192,
             "step_back_db": 0.3,
+            "average_after": 1.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
             "max_gaussians_auto": min(config.max_gaussians_auto, 40_000),
@@ -295,6 +305,7 @@ def preset(name: str) -> TrainConfig:
                 mean=5e-4,
                 mean_final=3e-6,
                 mean_of="extent",
+                axes="world",
                 quat=0.01,
                 log_scale=5e-3,
                 opacity=0.05,

@@ -57,6 +57,24 @@ def test_windows_reach_every_pixel_about_as_often() -> None:
         assert inside.max() < 800
 
 
+def test_windows_of_a_batch_are_spread_over_the_views_and_within_them() -> None:
+    sizes = np.array([[60, 40]] * 10)
+    sampler = PixelSampler(np.arange(10), sizes)
+    for seed in range(5):
+        view, y, x = (
+            a.reshape(60, 16) for a in sampler.windows(np.random.default_rng(seed), 60, rays=16, side=20)
+        )
+        assert (np.bincount(view[:, 0]) == 6).all()
+        for index in range(10):  # 3 x 2 tiles: a window in each, but for the seam between two views
+            tiles = {
+                (round(b), round(a))
+                for a, b in zip(
+                    x[view[:, 0] == index].mean(1) // 20, y[view[:, 0] == index].mean(1) // 20, strict=True
+                )
+            }
+            assert len(tiles) >= 4
+
+
 def test_patches_are_whole_and_in_rows() -> None:
     sampler = PixelSampler(np.array([1, 2]), SIZES)
     view, y, x = (a.reshape(500, 4, 4) for a in sampler.patches(np.random.default_rng(0), 500, 4))
