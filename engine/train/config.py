@@ -18,6 +18,9 @@ from engine.trace.protocol import TraceSettings
 MOST_PLANNED_ITERATIONS = 30_000
 """Where a time decides their number, see :mod:`engine.train.within`."""
 
+RAYS_A_PIXEL = 4
+"""Of the training views, where nothing says how many iterations there are."""
+
 FOR_SURFACE = 0.05
 """Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""
 
@@ -35,7 +38,7 @@ class LearningRates(_Frozen):
     """
 
     mean: float = Field(0.14, gt=0)
-    mean_final: float = Field(1.4e-3, gt=0)
+    mean_final: float = Field(1e-2, gt=0)
     mean_of: Literal["size", "extent"] = Field(
         "size", description="unit of the two: the Gaussian's own size, or the scene's extent"
     )
@@ -51,7 +54,7 @@ class LearningRates(_Frozen):
     albedo: float = Field(0.03, ge=0, description="of the logit, as for the two below")
     metallic: float = Field(0.03, ge=0)
     roughness: float = Field(0.03, ge=0)
-    decay: float = Field(0.1, gt=0, le=1)
+    decay: float = Field(0.3, gt=0, le=1)
 
     def of_channel(self, name: str) -> float:
         """The rate of a named channel; 0 where it is not trained."""
@@ -122,7 +125,7 @@ class TrainConfig(_Frozen):
     iterations: int = Field(
         0,
         ge=0,
-        description="0: three rays for each pixel of the training views, in thousands, 5,000 to 12,000",
+        description="0: four rays for each pixel of the training views, in thousands, 5,000 to 12,000",
     )
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
@@ -137,7 +140,7 @@ class TrainConfig(_Frozen):
     patch_side: int = Field(32, ge=16)
     fit_iterations: int = Field(100, ge=0, description="fitting before anything is added")
     sh_degree: int = Field(2, ge=0, le=3)
-    sh_every: int = Field(400, ge=1, description="iterations between raising the degree")
+    sh_every: int = Field(100, ge=1, description="iterations between raising the degree")
     max_gaussians: int = Field(
         0,
         ge=0,
@@ -214,13 +217,11 @@ class TrainConfig(_Frozen):
 
 
 def iteration_count(config: TrainConfig, training_pixels: int) -> int:
-    """``config.iterations``, or where that is 0 three rays for each pixel, in whole thousands.
+    """``config.iterations``, or where that is 0 four rays for each pixel, in whole thousands.
 
-    Large scenes learn as long as there is something to see; small ones are done after 5,000. Materials take
-    four rays for each pixel, since normals go on getting better.
+    Large scenes learn as long as there is something to see; small ones are done after 5,000.
     """
-    rays_a_pixel = 4 if config.materials.learn else 3
-    wanted = round(rays_a_pixel * training_pixels / config.rays / 1000)
+    wanted = round(RAYS_A_PIXEL * training_pixels / config.rays / 1000)
     return config.iterations or min(max(wanted, 5), 12) * 1000
 
 
@@ -257,7 +258,15 @@ def with_materials(config: TrainConfig) -> TrainConfig:
     Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
     show reflections lie behind the surface, so there are none.
     """
-    rates = {"quat": 2e-3, "mean": 0.008, "mean_final": 1e-3, "log_scale": 0.004, "opacity": 0.03}
+    rates = {
+        "axes": "world",
+        "quat": 2e-3,
+        "mean": 0.008,
+        "mean_final": 1e-3,
+        "log_scale": 0.004,
+        "opacity": 0.03,
+        "decay": 0.1,
+    }
     return config.model_copy(
         update={
             "materials": config.materials.model_copy(update={"learn": True}),
@@ -265,6 +274,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "lift_pixels": False,
             "plane_points": 10,
             "sh_degree": min(config.sh_degree, 1),
+            "sh_every": 400,
             "rays": 8192,
             "step_back_db": 0.3,
             "average_after": 1.0,
@@ -283,11 +293,9 @@ def preset(name: str) -> TrainConfig:
     """
     if name == "fast":
         return TrainConfig(
-            iterations=1000,
+            iterations=1400,
             sh_degree=1,
-            sh_every=300,
             max_gaussians_auto=40_000,
-            rates=LearningRates(decay=0.3),
         )
     if name == "standard":
         return TrainConfig()

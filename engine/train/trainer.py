@@ -145,9 +145,9 @@ class Trainer:
                 self._build()
             if schedule.ends(state.iteration):
                 return self._conclude()
-            batch = batches.draw(state.rng)
+            batch = batches.draw(state.rng, state.iteration)
             if self._threads != 1 and not self._draws_or_stops(state.iteration + 1):
-                batches.begin(state.rng)
+                batches.begin(state.rng, state.iteration + 1)
             progress = schedule.progress(state.iteration)
             found = iterate(state, batch, machinery, self._config, progress=progress, extent=self._extent)
             stale = schedule.may_densify(state.iteration) and self._change()
