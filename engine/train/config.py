@@ -14,17 +14,13 @@ from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from engine.gaussians.octagon import CHI2_3_99
 from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import TraceSettings
+from engine.train.preset_names import PRESETS
 
 MOST_PLANNED_ITERATIONS = 30_000
 """Where a time decides their number, see :mod:`engine.train.within`."""
 
-RAYS_A_PIXEL = 4
-"""Of the training views, where nothing says how many iterations there are."""
-
 FOR_SURFACE = 0.05
 """Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""
-
-PresetName = Literal["fast", "standard", "paper"]
 
 
 class _Frozen(BaseModel):
@@ -125,8 +121,9 @@ class TrainConfig(_Frozen):
     iterations: int = Field(
         0,
         ge=0,
-        description="0: four rays for each pixel of the training views, in thousands, 5,000 to 12,000",
+        description="0: rays_a_pixel rays for each pixel of the training views, in thousands",
     )
+    rays_a_pixel: int = Field(4, ge=1, description="where iterations is 0; 5,000 to 12,000 iterations for 4")
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
     window_side: int = Field(
@@ -146,6 +143,7 @@ class TrainConfig(_Frozen):
         ge=0,
         description="0: one for each 50 pixels of the training views or, of up to 10,000, for each 10",
     )
+    pixels_a_gaussian: int = Field(50, ge=10, description="where max_gaussians is 0")
     max_gaussians_auto: int = Field(200_000, ge=1, description="the most that 0 comes to in max_gaussians")
     initial_points: int = Field(100_000, ge=1, description="most points to begin from")
     plane_points: int = Field(8, ge=3, description="points around one whose plane gives its first normal")
@@ -217,12 +215,14 @@ class TrainConfig(_Frozen):
 
 
 def iteration_count(config: TrainConfig, training_pixels: int) -> int:
-    """``config.iterations``, or where that is 0 four rays for each pixel, in whole thousands.
+    """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
-    Large scenes learn as long as there is something to see; small ones are done after 5,000.
+    Large scenes learn as long as there is something to see; small ones are done after 5,000 with 4 rays a
+    pixel.
     """
-    wanted = round(RAYS_A_PIXEL * training_pixels / config.rays / 1000)
-    return config.iterations or min(max(wanted, 5), 12) * 1000
+    each = config.rays_a_pixel
+    wanted = round(each * training_pixels / config.rays / 1000)
+    return config.iterations or min(max(wanted, 5 * each // 4), 3 * each) * 1000
 
 
 def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
@@ -232,7 +232,7 @@ def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
     """
     if config.max_gaussians:
         return config.max_gaussians
-    wanted = max(training_pixels // 50, min(training_pixels // 10, 10_000), 1)
+    wanted = max(training_pixels // config.pixels_a_gaussian, min(training_pixels // 10, 10_000), 1)
     return min(wanted, config.max_gaussians_auto)
 
 
@@ -299,6 +299,8 @@ def preset(name: str) -> TrainConfig:
         )
     if name == "standard":
         return TrainConfig()
+    if name == "high":
+        return TrainConfig(rays_a_pixel=12, pixels_a_gaussian=30, max_gaussians_auto=400_000)
     if name == "paper":
         return TrainConfig(
             iterations=10_000,
@@ -324,4 +326,5 @@ def preset(name: str) -> TrainConfig:
             trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),
             densify=PaperConfig(),
         )
-    raise ConfigError(f"There is no preset called {name!r}; choose fast, standard or paper.")
+    listed = ", ".join(PRESETS)
+    raise ConfigError(f"There is no preset called {name!r}; choose {listed}.")
