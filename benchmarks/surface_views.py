@@ -6,7 +6,8 @@
 
 Prints PSNR in dB, means over the views: of the surface and of the scene to the photographs (of a run), of the
 surface to the scene, and how much of the picture the surface covers. Surfaces are drawn as an unlit viewer
-draws them, with four rays a pixel.
+draws them, with four rays a pixel, and so is the scene that they are held against; itself held against
+photographs, it is drawn with one, as it was trained.
 """
 
 import argparse
@@ -31,7 +32,7 @@ from engine.render.renderer import background_colour, render_rays
 from engine.run_folder import CONFIG, SCENE, is_run, open_photographs, photographs_folder
 from engine.trace.make import make_tracer
 from engine.trace.meshes import TriangleScene
-from engine.trace.protocol import TraceSettings
+from engine.trace.protocol import Tracer, TraceSettings
 
 TURNTABLE = {"frames": 8, "width_px": 480, "height_px": 480}
 OFFSETS = (-0.25, 0.25)
@@ -108,6 +109,14 @@ def views_of(
     return found, config.train.trace, colour
 
 
+def drawn_scene(tracer: Tracer, rays: ImageRays, background: Float32[np.ndarray, "3"]) -> Picture:
+    """The scene's picture with as many rays a pixel as the surface's."""
+    total = np.zeros((rays.height_px, rays.width_px, 3), np.float32)
+    for down, across in product(OFFSETS, OFFSETS):
+        total += render_rays(tracer, rays.shifted(across, down), background).rgb_srgb / len(OFFSETS) ** 2
+    return total
+
+
 def psnr_db(one: Picture, other: Picture) -> float:
     """Of display values."""
     return float(-10 * np.log10(np.mean((one.astype(np.float64) - other) ** 2)))
@@ -124,10 +133,11 @@ def main() -> None:
     views, settings, background = views_of(given.source, gaussians)
     tracer = make_tracer(settings)
     tracer.build(gaussians)
-    scenes = [render_rays(tracer, rays, background).rgb_srgb for _, rays, _ in views]
+    scenes = [drawn_scene(tracer, rays, background) for _, rays, _ in views]
     photographs = [photograph for _, _, photograph in views if photograph is not None]
     if photographs:
-        pairs = zip(scenes, photographs, strict=True)
+        plain = [render_rays(tracer, rays, background).rgb_srgb for _, rays, _ in views]
+        pairs = zip(plain, photographs, strict=True)
         print(f"scene to photographs: {np.mean([psnr_db(*pair) for pair in pairs]):.2f} dB")
     for path in given.surfaces:
         surface = Surface(path)

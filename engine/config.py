@@ -60,23 +60,37 @@ def resolve_config(
         preset_name: ``fast``, ``standard`` or ``paper``.
         materials: learn materials and the environment too, see :func:`engine.train.config.with_materials`.
         settings: fields of :class:`ReconstructionConfig`; None values are left at their defaults.
-        assignments: into the training configuration, values as JSON, e.g. ``rates.mean=2e-4``.
+        assignments: of any setting, values as JSON: ``rates.mean=2e-4``, which is
+            ``train.rates.mean=2e-4``, or ``test_every=4``.
 
     Raises:
         ConfigError: an unknown name, a value out of range, or no such preset.
     """
     chosen = preset(preset_name)
     train: dict[str, Any] = (with_materials(chosen) if materials else chosen).model_dump()
+    values = {key: value for key, value in (settings or {}).items() if value is not None}
     for assignment in assignments:
-        name, equals, text = assignment.partition("=")
+        name, equals, text = (part.strip() for part in assignment.partition("="))
         if not equals:
             raise ConfigError(f"--set {assignment}: write it as name=value, e.g. rates.mean=2e-4.")
-        _assign(train, name.strip(), text.strip())
-    values = {key: value for key, value in (settings or {}).items() if value is not None}
+        if name in ReconstructionConfig.model_fields and name not in ("preset", "train"):
+            values[name] = _value(text)
+        else:
+            _assign(train, training_setting(name) or name, text)
     try:
         return ReconstructionConfig.model_validate({"preset": preset_name, "train": train, **values})
     except ValidationError as error:
         raise ConfigError(_first_complaint(error)) from None
+
+
+def training_setting(name: str) -> str | None:
+    """The setting of the training that a dotted name means; None if it means none.
+
+    >>> training_setting("rates.mean"), training_setting("train.rates.mean"), training_setting("test_every")
+    ('rates.mean', 'rates.mean', None)
+    """
+    inner = name.removeprefix("train.")
+    return inner if inner.partition(".")[0] in TrainConfig.model_fields else None
 
 
 def read_config(path: Path) -> ReconstructionConfig:
@@ -107,14 +121,19 @@ def _assign(target: dict[str, Any], name: str, text: str) -> None:
         raise ConfigError(
             f"--set {name}: there is no such setting; see config.json of any run for all names."
         )
-    try:
-        value = json.loads(text)
-    except ValueError:
-        value = text
+    value = _value(text)
     if path == ["densify"] and last == "kind" and section.get("kind") != value:
         # Another strategy has other settings: begin from its defaults.
         section.clear()
     section[last] = value
+
+
+def _value(text: str) -> Any:
+    """JSON, or else the text itself."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 def _first_complaint(error: ValidationError) -> str:

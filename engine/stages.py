@@ -25,8 +25,9 @@ DOING = {
     "depth": "Rendering depth",
     "fusing": "Fusing depth",
     "meshing": "Meshing",
-    "unwrapping": "Unwrapping",
     "settling": "Settling",
+    "decimating": "Decimating",
+    "unwrapping": "Unwrapping",
     "colouring": "Colouring",
     "fitting": "Fitting colours",
 }

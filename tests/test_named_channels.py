@@ -195,13 +195,20 @@ def test_channels_come_back_from_files(exporter: object, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("exporter", exporters(), ids=lambda each: each.name)
 def test_a_format_holds_channels_or_it_is_told(exporter: object) -> None:
-    told = [text for text in export_losses(scene(), Path("a.x"), exporter.name) if "channels" in text]
-    assert export_losses(scene().bare(), Path("a.x"), exporter.name) == ()
+    told = [text for text in export_losses(scene(), [Path("a.x")], exporter.name) if "channels" in text]
+    assert export_losses(scene().bare(), [Path("a.x")], exporter.name) == ()
     if exporter.holds_channels:
         assert told == []
     else:
         (text,) = told
         assert f"format {exporter.name} " in text and "label, albedo, spectrum" in text
+
+
+def test_what_several_formats_lose_is_told_once() -> None:
+    paths = [Path("mesh.ply"), Path("mesh.glb"), Path("a.splat"), Path("scene.ply"), Path("mesh.obj")]
+    channels, harmonics = export_losses(scene(), paths)
+    assert channels.startswith("The formats splat and obj have no place for named channels")
+    assert harmonics.startswith("The formats mesh-ply, glb, splat and obj have one colour")
 
 
 def test_a_scene_without_a_channel_gets_zeros(tmp_path: Path) -> None:

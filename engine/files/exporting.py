@@ -1,5 +1,6 @@
 """Scenes and surfaces written to files of any known format."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from engine.errors import ConfigError, SceneFileError
@@ -30,23 +31,36 @@ def export_scene(
         raise SceneFileError(f"{path}: cannot be written ({error.strerror or error}).") from error
 
 
-def export_losses(gaussians: FlatGaussians, path: Path, format: str | None = None) -> tuple[str, ...]:
-    """What :func:`export_scene` will leave out, a sentence each.
+def export_losses(
+    gaussians: FlatGaussians, paths: Sequence[Path], format: str | None = None
+) -> tuple[str, ...]:
+    """What :func:`export_scene` will leave out at all of ``paths``, a sentence for each thing left out.
 
     Raises:
         SceneFileError: there is no such format.
     """
-    exporter = exporter_for(path, format)
+    chosen = {exporter.name: exporter for exporter in (exporter_for(path, format) for path in paths)}
     lines = []
-    if gaussians.channels and not exporter.holds_channels:
+    without = [name for name, exporter in chosen.items() if not exporter.holds_channels]
+    if gaussians.channels and without:
         names = ", ".join(gaussians.channels)
-        lines.append(f"The format {exporter.name} has no place for named channels; {names} will be left out.")
-    if gaussians.sh_degree > 0 and not exporter.holds_harmonics:
         lines.append(
-            f"The format {exporter.name} has one colour for each Gaussian; how colours change with the "
+            f"{_formats(without, 'has', 'have')} no place for named channels; {names} will be left out."
+        )
+    without = [name for name, exporter in chosen.items() if not exporter.holds_harmonics]
+    if gaussians.sh_degree > 0 and without:
+        lines.append(
+            f"{_formats(without, 'has', 'have')} one colour for each Gaussian; how colours change with the "
             "direction will be left out (octasplat export --colour chooses the one)."
         )
     return tuple(lines)
+
+
+def _formats(names: Sequence[str], one: str, several: str) -> str:
+    """Formats as the subject of a sentence, and its verb."""
+    if len(names) == 1:
+        return f"The format {names[0]} {one}"
+    return f"The formats {', '.join(names[:-1])} and {names[-1]} {several}"
 
 
 def check_surface_path(path: Path, *, textured: bool, lit: bool = False) -> None:

@@ -28,7 +28,7 @@ def export_files(
         options: of all of them.
         plain: makes the scene for formats that have one colour for each Gaussian.
         on_done: told how many files have been dealt with, after each; it may raise to stop.
-        on_loss: told in a sentence what of the scene a format cannot hold.
+        on_loss: told in a sentence each thing of the scene that formats cannot hold, before the first file.
 
     Returns:
         What could not be written and why, in a sentence for each file, or None.
@@ -37,10 +37,10 @@ def export_files(
         NoSpaceLeft: there is no room for a file.
     """
     failed: list[str] = []
+    for lost in export_losses(gaussians, [folder / name for name in names if _known(name)]):
+        on_loss(lost)
     for done, name in enumerate(names, start=1):
         try:
-            for lost in export_losses(gaussians, folder / name):
-                on_loss(lost)
             chosen = gaussians if exporter_for(folder / name).holds_harmonics else plain()
             export_scene(chosen, folder / name, options)
         except NoSpaceLeft:
@@ -54,3 +54,12 @@ def export_files(
         return None
     count = f"{len(failed)} of {len(names)} files" if len(names) > 1 else "The file"
     return f"{count} could not be written: {'; '.join(failed)}."
+
+
+def _known(name: str) -> bool:
+    """Whether a file's name says a format."""
+    try:
+        exporter_for(Path(name))
+    except OctasplatError:
+        return False
+    return True

@@ -103,9 +103,8 @@ def extract_levels(
             (:func:`engine.surface.materials.material_features`), for light with these rows right, up and
             forward in the world; None bakes colours. Needs a texture.
         photographs: what colours are fitted to; without any, what the scene shows from ``cameras``.
-        listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``unwrapping`` (with a texture),
-            ``settling`` (if asked),
-            ``colouring`` and ``fitting`` (of colours).
+        listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``settling`` and ``decimating`` (if
+            asked), ``unwrapping`` (with a texture), ``colouring`` and ``fitting`` (of colours).
         should_stop: asked now and then.
 
     Raises:
@@ -125,30 +124,25 @@ def extract_levels(
     if options.unseen == "solid":
         solid_where_unseen(volume, options.min_weight)
     volume_bytes = len(volume.blocks) * BYTES_PER_BLOCK
-    steps = 3 + len(levels)
-    with counted_stage("meshing", tell, steps) as progress:
+    with counted_stage("meshing", tell, 3) as progress:
         mesh = surface_of(volume, options.min_weight)
         volume, found = None, len(mesh.faces)
-        progress(1, steps)
+        progress(1, 3)
         mesh = _large_parts(mesh, options)
-        progress(2, steps)
+        progress(2, 3)
         max_rim = None if options.fill_holes is None else options.fill_holes * region.voxel_world
         mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
-        progress(3, steps)
-        meshes = []
-        for done, level in enumerate(levels, 4):
-            # Thin parts may come apart.
-            meshes.append(mesh if level is None else _large_parts(decimate(mesh, level), options))
-            progress(done, steps)
+        progress(3, 3)
+    if options.settle:  # while triangles are small enough to show what the pictures do
+        with counted_stage("settling", tell, 0) as progress:
+            mesh = settled(mesh, photographs or renders, progress)
+    meshes = _in_levels(mesh, options, levels, tell)
     del mesh
     result = []
     for mesh in meshes:
         edges = edge_report(mesh.faces)
         if options.backdrop:
             mesh = with_backdrop(mesh, np.mean([camera.centre_world for camera in cameras], axis=0))
-        if options.settle:
-            with counted_stage("settling", tell, 0) as progress:
-                mesh = settled(mesh, photographs or renders, progress)
         coloured = _coloured(tracer, cameras, renders, photographs, options, mesh, region, light_frame, tell)
         result.append(ExtractedSurface(coloured, region, volume_bytes, found, closed, edges))
     return tuple(result)
@@ -194,6 +188,21 @@ def _coloured(
         return with_materials(layout, *look_at(points, normals, MATERIALS), light_frame)
     rgb = colours(TexturePalette(layout), points, normals)
     return replace(layout.mesh, texture_srgb=to_bytes(layout.image(rgb)))
+
+
+def _in_levels(
+    mesh: TriangleMesh, options: SurfaceOptions, levels: Sequence[int | None], tell: Listener
+) -> list[TriangleMesh]:
+    """The mesh with at most so many triangles, for each level."""
+    if all(level is None for level in levels):
+        return [mesh] * len(levels)
+    meshes = []
+    with counted_stage("decimating", tell, len(levels)) as progress:
+        for done, level in enumerate(levels, 1):
+            # Thin parts may come apart.
+            meshes.append(mesh if level is None else _large_parts(decimate(mesh, level), options))
+            progress(done, len(levels))
+    return meshes
 
 
 def _large_parts(mesh: TriangleMesh, options: SurfaceOptions) -> TriangleMesh:

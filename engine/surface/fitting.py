@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix, identity
 
 from engine.rays import ImageRays
 from engine.surface.least_squares import conjugate_gradients, differences, share_rows
-from engine.surface.mesh import TriangleMesh, directed_edges
+from engine.surface.mesh import TriangleMesh, edges_of
 from engine.surface.texture import TextureLayout
 from engine.trace.meshes import TriangleScene
 
@@ -25,6 +25,8 @@ SMOOTHNESS = 0.3
 TRUST = 1e-3
 """How much a colour that pixels say little of stays as it was."""
 ROUNDS = 15
+SAMPLES = ((-0.25, -0.25), (0.25, 0.25))
+"""Where in a pixel the surface is looked at, from its middle, px; the pixel shows their mean."""
 MIN_ALPHA = 0.25
 """Pixels that the scene covers less than this say nothing of its colour."""
 RAYS_AT_ONCE = 1 << 20
@@ -57,7 +59,7 @@ class VertexPalette:
     @property
     def neighbours(self) -> Int[np.ndarray, "e 2"]:
         """Both ends of each edge."""
-        return np.unique(np.sort(directed_edges(self.mesh.faces), axis=1), axis=0)
+        return edges_of(self.mesh.faces)
 
     def shares(
         self, faces: Int32[np.ndarray, " r"], weights: Float32[np.ndarray, "r 3"]
@@ -178,11 +180,16 @@ def _normal_equations(
 def _equations(
     scene: TriangleScene, points: Palette, rays: ImageRays, rgba: UInt8[np.ndarray, "h w 4"]
 ) -> tuple[Int[np.ndarray, "r k"], Float32[np.ndarray, "r k"], Float32[np.ndarray, "r 3"]]:
-    """Points and their shares in each pixel that shows surface and scene, and its colour."""
+    """Points and their shares in each pixel that shows nothing but surface, and scene, and its colour."""
     seen = rgba.reshape(-1, 4).astype(np.float32) / 255
-    hits = scene.closest(rays.rays)
-    used = np.flatnonzero(hits.hit & (seen[:, 3] >= MIN_ALPHA))
-    others = hits.barycentrics[used]
-    weights = np.concatenate([1 - others.sum(axis=1, keepdims=True), others], axis=1)
-    numbers, shares = points.shares(hits.faces[used], weights)
-    return numbers, shares, np.clip(seen[used, :3] / seen[used, 3:], 0.0, 1.0)
+    samples = [scene.closest(rays.shifted(*offset).rays) for offset in SAMPLES]
+    used = np.flatnonzero(np.all([hits.hit for hits in samples], axis=0) & (seen[:, 3] >= MIN_ALPHA))
+    numbers, shares = [], []
+    for hits in samples:
+        others = hits.barycentrics[used]
+        weights = np.concatenate([1 - others.sum(axis=1, keepdims=True), others], axis=1)
+        number, share = points.shares(hits.faces[used], weights)
+        numbers.append(number)
+        shares.append(share / np.float32(len(samples)))
+    rgb = np.clip(seen[used, :3] / seen[used, 3:], 0.0, 1.0)
+    return np.concatenate(numbers, axis=1), np.concatenate(shares, axis=1), rgb

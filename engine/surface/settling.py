@@ -9,29 +9,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
-from scipy.sparse import identity
+from scipy.sparse import csr_matrix
 
 from engine.rays import ImageRays, RayBatch
 from engine.surface.fitting import MIN_ALPHA, Picture, Progress, VertexPalette
-from engine.surface.least_squares import conjugate_gradients, differences, share_rows
+from engine.surface.kernels_settling import gather, gather_squares, linearise, show
+from engine.surface.least_squares import conjugate_gradients, differences
 from engine.surface.mesh import TriangleMesh
 from engine.trace.meshes import TriangleScene
 
-COARSENING = 4
-"""Pictures are made this much smaller: displacements count that are about a pixel of theirs."""
+SIDE_PX = 260
+"""Pictures are made about this large: displacements count that are about a pixel of theirs."""
+MOST_PICTURES = 128
+"""Of more, so many are taken, spread evenly: about 100 bytes a pixel are needed at once."""
 STEPS = 2
 ROUNDS = 15
 COLOUR_ROUNDS = 8
 COLOUR_SMOOTHNESS = 0.1
-SMOOTHNESS = 0.003
+SMOOTHNESS = 0.001
 TRUST = 1e-4
-OUTLIER = 0.08
+OUTLIER = 0.16
 """Errors of display values from which on a pixel counts less."""
 JUMP = 1.06
 """Pixels beside a depth this much larger see a rim, which moves otherwise."""
-MIN_COSINE = 0.15
 MOST_PX = 2.0
 
 
@@ -43,7 +45,7 @@ class _Sight:
     weights: Float32[np.ndarray, "p 3"]
     directions_world: Float32[np.ndarray, "p 3"]
     size_world: Float32[np.ndarray, " p"]
-    steady: Float32[np.ndarray, " p"]
+    steady: Bool[np.ndarray, " p"]
     rgb_srgb: Float32[np.ndarray, "p 3"]
 
 
@@ -57,11 +59,14 @@ def settled(
         pictures: of the scene.
         progress: told (steps done, steps in all).
     """
-    small = [_smaller(*picture()) for picture in pictures]
-    rgb = np.full((len(mesh.vertices_world), 3), 0.5, np.float32)
+    count = len(mesh.vertices_world)
+    taken = np.unique(np.linspace(0, len(pictures) - 1, min(MOST_PICTURES, len(pictures))).astype(int))
+    small = [_smaller(*pictures[number]()) for number in taken]
+    rgb = np.full((count, 3), 0.5, np.float32)
+    apart = differences(VertexPalette(mesh).neighbours, count)
     for step in range(STEPS):
         progress(step, STEPS)
-        mesh, rgb = _step(mesh, rgb, small)
+        mesh, rgb = _step(mesh, rgb, small, apart)
     progress(STEPS, STEPS)
     return mesh
 
@@ -70,7 +75,8 @@ def _smaller(
     rays: ImageRays, rgba: UInt8[np.ndarray, "h w 4"]
 ) -> tuple[ImageRays, Float32[np.ndarray, "_h _w 4"]]:
     """Means of blocks of pixels."""
-    side = min(COARSENING, *rgba.shape[:2])
+    side = max(1, round(max(rgba.shape[:2]) / SIDE_PX))
+    side = min(side, *rgba.shape[:2])
     height, width = rgba.shape[0] // side, rgba.shape[1] // side
 
     def blocks(values: np.ndarray) -> np.ndarray:
@@ -101,7 +107,7 @@ def _seen(mesh: TriangleMesh, pictures: Sequence[tuple[ImageRays, np.ndarray]]) 
                 np.concatenate([1 - others.sum(axis=1, keepdims=True), others], axis=1),
                 batch.directions_world[used],
                 (hits.distances[used] * angle).astype(np.float32),
-                np.where(rim[used], 0.0, 1.0).astype(np.float32),
+                ~rim[used],
                 np.clip(pixels[:, :3] / pixels[:, 3:], 0.0, 1.0),
             )
         )
@@ -114,47 +120,83 @@ def _seen(mesh: TriangleMesh, pictures: Sequence[tuple[ImageRays, np.ndarray]]) 
 
 
 def _step(
-    mesh: TriangleMesh, rgb: Float32[np.ndarray, "n 3"], pictures: Sequence[tuple[ImageRays, np.ndarray]]
+    mesh: TriangleMesh,
+    rgb: Float32[np.ndarray, "n 3"],
+    pictures: Sequence[tuple[ImageRays, np.ndarray]],
+    apart: csr_matrix,
 ) -> tuple[TriangleMesh, Float32[np.ndarray, "n 3"]]:
     """One step; displacements are counted in pixels of the pictures, at each vertex's distance."""
     sight = _seen(mesh, pictures)
     count, corners = len(rgb), mesh.faces[sight.faces]
-    shares = share_rows(sight.weights, corners, count)
-    apart = differences(VertexPalette(mesh).neighbours, count)
-    shares_t = shares.T.tocsr()
-    colours = (shares_t @ shares + COLOUR_SMOOTHNESS * apart + TRUST * identity(count, np.float32)).tocsr()
-    lacking = shares_t @ (sight.rgb_srgb - shares @ rgb)
-    rgb = rgb + conjugate_gradients(
-        lambda x: colours @ x, colours.diagonal()[:, None], lacking, COLOUR_ROUNDS
+    size = _pixel_sizes(sight, corners, count)
+    still = np.zeros_like(sight.weights)
+    sure = np.ones(len(corners), np.float32)
+    x = _solved(
+        _Pixels(corners, sight.weights, still, still), sight.rgb_srgb, sure, rgb, apart, COLOUR_ROUNDS
     )
-    lacking = sight.rgb_srgb - shares @ rgb
-    sure = (1 / (1 + (lacking**2).sum(axis=1) / OUTLIER**2)).astype(np.float32)[:, None]
-    normals, size = mesh.vertex_normals(), _pixel_sizes(sight, corners, count)
-    change, facing = _colour_change(mesh, rgb, sight)
-    lift = (normals[corners] * facing[:, None]).sum(axis=2) * size[corners]
-    lifts = share_rows((sight.weights * lift).astype(np.float32), corners, count)
-    lifts_t = lifts.T.tocsr()
+    rgb = rgb + x[:, :3]
+    normals = mesh.vertex_normals()
+    change, lifts = np.empty_like(sight.weights), np.empty_like(sight.weights)
+    linearise(
+        mesh.vertices_world, normals, size, rgb, corners, sight.weights,
+        sight.directions_world, sight.steady, change, lifts,
+    )  # fmt: skip
+    pixels = _Pixels(corners, sight.weights, lifts, change)
+    lacking = sight.rgb_srgb - pixels.of(_with_places(rgb))
+    sure = (1 / (1 + (lacking**2).sum(axis=1) / OUTLIER**2)).astype(np.float32)
+    x = _solved(pixels, sight.rgb_srgb, sure, rgb, apart, ROUNDS)
+    moved = np.clip(x[:, 3:], -MOST_PX, MOST_PX) * size[:, None] * normals
+    return replace(mesh, vertices_world=mesh.vertices_world + moved), rgb + x[:, :3]
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """The linear map from colours and displacements of vertices to colours of pixels."""
+
+    corners: Int32[np.ndarray, "p 3"]
+    weights: Float32[np.ndarray, "p 3"]
+    lifts: Float32[np.ndarray, "p 3"]
+    change: Float32[np.ndarray, "p 3"]
+
+    def of(self, values: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarray, "p 3"]:
+        pixels = np.empty_like(self.change)
+        show(self.corners, self.weights, self.lifts, self.change, values, pixels)
+        return pixels
+
+    def back(self, pixels: Float32[np.ndarray, "p 3"], count: int) -> Float32[np.ndarray, "n 4"]:
+        values = np.zeros((count, 4), np.float32)
+        gather(self.corners, self.weights, self.lifts, self.change, pixels, values)
+        return values
+
+    def squares(self, sure: Float32[np.ndarray, " p"], count: int) -> Float32[np.ndarray, "n 4"]:
+        values = np.zeros((count, 4), np.float32)
+        gather_squares(self.corners, self.weights, self.lifts, self.change, sure, values)
+        return values
+
+
+def _solved(
+    pixels: _Pixels,
+    wanted_srgb: Float32[np.ndarray, "p 3"],
+    sure: Float32[np.ndarray, " p"],
+    rgb: Float32[np.ndarray, "n 3"],
+    apart: csr_matrix,
+    rounds: int,
+) -> Float32[np.ndarray, "n 4"]:
+    """Corrections of colours, and displacements, with which the pixels are most like those wanted."""
+    count, now = len(rgb), _with_places(rgb)
+    smooth = np.array([COLOUR_SMOOTHNESS] * 3 + [SMOOTHNESS], np.float32)
 
     def times(x: Float32[np.ndarray, "n 4"]) -> Float32[np.ndarray, "n 4"]:
-        pixels = sure * (shares @ x[:, :3] + change * (lifts @ x[:, 3:]))
-        smooth = apart @ x
-        out = np.empty_like(x)
-        out[:, :3] = shares_t @ pixels + COLOUR_SMOOTHNESS * smooth[:, :3] + TRUST * x[:, :3]
-        moved = (change * pixels).sum(axis=1, keepdims=True)
-        out[:, 3:] = lifts_t @ moved + SMOOTHNESS * smooth[:, 3:] + TRUST * x[:, 3:]
-        return out
+        return pixels.back(sure[:, None] * pixels.of(x), count) + smooth * (apart @ x) + TRUST * x
 
-    wanted = np.empty((count, 4), np.float32)
-    wanted[:, :3] = shares_t @ (sure * lacking) - COLOUR_SMOOTHNESS * (apart @ rgb)
-    wanted[:, 3:] = lifts_t @ (change * sure * lacking).sum(axis=1, keepdims=True)
-    degree = apart.diagonal()[:, None]
-    scale = np.empty_like(wanted)
-    scale[:, :3] = shares_t.power(2) @ sure + COLOUR_SMOOTHNESS * degree + TRUST
-    strength = sure * (change**2).sum(axis=1, keepdims=True)
-    scale[:, 3:] = lifts_t.power(2) @ strength + SMOOTHNESS * degree + TRUST
-    x = conjugate_gradients(times, scale, wanted, ROUNDS, coupled=True)
-    moved = np.clip(x[:, 3:], -MOST_PX, MOST_PX) * size[:, None] * normals
-    return replace(mesh, vertices_world=mesh.vertices_world + moved), (rgb + x[:, :3]).astype(np.float32)
+    lacking = pixels.back(sure[:, None] * (wanted_srgb - pixels.of(now)), count) - smooth * (apart @ now)
+    diagonal = pixels.squares(sure, count) + smooth * apart.diagonal()[:, None] + TRUST
+    return conjugate_gradients(times, diagonal, lacking, rounds, coupled=True)
+
+
+def _with_places(rgb: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 4"]:
+    """Colours, and vertices where they are."""
+    return np.concatenate([rgb, np.zeros_like(rgb[:, :1])], axis=1)
 
 
 def _pixel_sizes(sight: _Sight, corners: Int32[np.ndarray, "p 3"], count: int) -> Float32[np.ndarray, " n"]:
@@ -163,27 +205,3 @@ def _pixel_sizes(sight: _Sight, corners: Int32[np.ndarray, "p 3"], count: int) -
     uses = np.bincount(corners.reshape(-1), minlength=count)
     middle = float(np.median(sight.size_world)) if len(corners) else 0.0
     return np.where(uses > 0, sums / np.maximum(uses, 1), middle).astype(np.float32)
-
-
-def _colour_change(
-    mesh: TriangleMesh, rgb: Float32[np.ndarray, "n 3"], sight: _Sight
-) -> tuple[Float32[np.ndarray, "p 3"], Float32[np.ndarray, "p 3"]]:
-    """How each pixel's colour changes when its triangle moves by one along its normal, and that normal.
-
-    The point that the ray meets then moves along the ray by one over the cosine, and with it the colour.
-    """
-    corners = mesh.face_corners_world
-    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    across = np.cross(one, two)
-    area = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-20)
-    normals = across / area
-    ways, faces = sight.directions_world.astype(np.float64), sight.faces
-    along_one = (np.cross(two, normals) / area)[faces] * ways
-    along_two = (np.cross(normals, one) / area)[faces] * ways
-    colours = rgb[mesh.faces]
-    change = (colours[:, 1] - colours[:, 0])[faces] * along_one.sum(axis=1, keepdims=True)
-    change = change + (colours[:, 2] - colours[:, 0])[faces] * along_two.sum(axis=1, keepdims=True)
-    cosine = (normals[faces] * ways).sum(axis=1)
-    use = (sight.steady > 0) & (np.abs(cosine) > MIN_COSINE)
-    share = np.where(use, 1.0 / np.where(use, cosine, 1.0), 0.0)
-    return (change * share[:, None]).astype(np.float32), normals[faces].astype(np.float32)

@@ -87,6 +87,8 @@ def test_output_with_other_files(octasplat, run, tmp_path):
         (["--set", "colour=7"], "colour"),
         (["--set", "rates.mean"], "name=value"),
         (["--set", "rates.mean=-1"], "mean"),
+        (["--set", "train.rates.mean=-1"], "mean"),
+        (["--set", "test_every=-1"], "test_every"),
         (["--iterations", "-1"], "iterations"),
     ],
 )

@@ -10,6 +10,7 @@ from threejs_example import draw_glb
 
 from engine.colour import to_bytes
 from engine.files import ExportOptions, export_scene
+from engine.gaussians.frames import frames_from_normals, quaternions
 from engine.gaussians.model import FlatGaussians
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
@@ -74,3 +75,28 @@ def test_the_opaque_variant_needs_no_order(scene: FlatGaussians, cameras: Path, 
         images.append(draw_glb(tmp_path / f"{number}.glb", cameras, 0, sort=False).image)
     assert (images[0].max(axis=2) > 20).mean() > 0.1
     np.testing.assert_array_equal(images[0], images[1])
+
+
+def test_cores_hide_what_lies_behind_whatever_the_order(cameras: Path, tmp_path: Path) -> None:
+    # Two opaque discs that face the camera, the near one first, so that the far one is blended over it.
+    camera = shell_cameras()[0]
+    towards = camera.centre_world / np.linalg.norm(camera.centre_world)
+    scene = FlatGaussians(
+        np.stack([0.3 * towards, -0.3 * towards]).astype(np.float32),
+        quaternions(frames_from_normals(np.tile(towards, (2, 1)))).astype(np.float32),
+        np.log(np.array([[0.15, 0.15], [0.3, 0.3]], np.float32)),
+        np.full(2, 7.0, np.float32),
+        np.array([[[1.5, -1.5, -1.5]], [[-1.5, -1.5, 1.5]]], np.float32),
+    )
+    ours = to_bytes(our_view(scene, camera))
+    middle = (101, 120)
+    shown = []
+    for cores in (None, 0.3):
+        export_scene(scene, tmp_path / "scene.glb", ExportOptions(chunks=1, cores=cores))
+        shown.append(draw_glb(tmp_path / "scene.glb", cameras, 0, sort=False).image)
+    red, blue = ours[middle][0], ours[middle][2]
+    assert red > 200 > 40 > blue
+    assert (
+        shown[0][middle][2] > 200 > 40 > shown[0][middle][0]
+    )  # without cores the far disc is before the near
+    assert np.abs(shown[1][middle].astype(int) - ours[middle]).max() <= 3

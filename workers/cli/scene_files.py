@@ -40,5 +40,5 @@ def warn_of_losses(gaussians: FlatGaussians, target: Path, format_name: str | No
     Raises:
         SceneFileError: there is no such format.
     """
-    for text in export_losses(gaussians, target, format_name):
+    for text in export_losses(gaussians, [target], format_name):
         click.echo(f"Warning: {text}", err=True)

@@ -37,6 +37,7 @@ _DONE = {
     "meshing": ("Made the mesh", ""),
     "unwrapping": ("Cut the mesh open for the texture", ""),
     "settling": ("Moved the vertices to where the pictures agree", ""),
+    "decimating": ("Merged triangles", ""),
     "colouring": ("Coloured", "point"),
     "fitting": ("Fitted the colours", ""),
 }

@@ -38,7 +38,7 @@ def set_option(command: F) -> F:
         "assignments",
         multiple=True,
         metavar="NAME=VALUE",
-        help="Any setting, e.g. test_every=10 or train.rates.quat=0.02; may be repeated.",
+        help="Any setting, e.g. test_every=10 or rates.quat=0.02; may be repeated.",
     )(command)
 
 
@@ -245,10 +245,11 @@ def retry(job_id: str, from_start: bool, server: str | None, **given: Any) -> No
     --from-start.
     """
     body: dict[str, Any] = {"from": "start" if from_start else "checkpoint"}
-    if options := _options(given):
-        body["options"] = options
     with connected(server) as api:
-        job = api.post(f"/v1/jobs/{_job(api, job_id)['id']}/retry", body)
+        job = _job(api, job_id)
+        if options := _options(given, training=job["kind"] == "reconstruct"):
+            body["options"] = options
+        job = api.post(f"/v1/jobs/{job['id']}/retry", body)
     click.echo(f"{job['id']}: {job['state']}")
     for note in job.get("notes", ()):
         click.echo(f"Note: {note}", err=True)
@@ -271,8 +272,8 @@ def download(
         fetch(api, job["id"], output or Path(f"octasplat-{job['id'][-12:]}"), names, quiet=quiet)
 
 
-def _options(given: dict[str, Any]) -> dict[str, Any]:
-    """The options of the job."""
+def _options(given: dict[str, Any], *, training: bool = True) -> dict[str, Any]:
+    """The options of the job, which is a training or not."""
     options: dict[str, Any] = {
         name: given[name]
         for name in ("preset", "poses", "max_side", "minutes")
@@ -283,15 +284,22 @@ def _options(given: dict[str, Any]) -> dict[str, Any]:
         options["exports"] = list(exports)
     if given.get("iterations") is not None:
         options["train"] = {"iterations": given["iterations"]}
-    return _assigned(options, given["assignments"])
+    return _assigned(options, given["assignments"], training=training)
 
 
-def _assigned(options: dict[str, Any], assignments: tuple[str, ...]) -> dict[str, Any]:
-    """The options with ``--set`` on top."""
+def _assigned(
+    options: dict[str, Any], assignments: tuple[str, ...], *, training: bool = False
+) -> dict[str, Any]:
+    """The options with ``--set`` on top; those of a ``training`` may be named as ``reconstruct`` does."""
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals:
-            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. train.rates.quat=0.02.")
+            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. rates.quat=0.02.")
+        if training:
+            from engine.config import training_setting  # here, as it takes half a second
+
+            inner = training_setting(name.strip())
+            name = f"train.{inner}" if inner else name
         try:
             value = json.loads(text)
         except ValueError:

@@ -82,7 +82,7 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
     "assignments",
     multiple=True,
     metavar="NAME=VALUE",
-    help="Any other training setting as in config.json, e.g. rates.quat=0.02; may be repeated.",
+    help="Any other setting as in config.json, e.g. rates.quat=0.02; may be repeated.",
 )
 @click.option("--resume", is_flag=True, help="Go on with the run in the output folder, if there is one.")
 @threads_option

@@ -91,10 +91,10 @@ def _levels(_context: click.Context, _parameter: click.Parameter, value: str | N
     help="Space that no view saw: open leaves holes there, solid closes the mesh.  [default: open]",
 )  # fmt: skip
 @click.option("--backdrop", is_flag=True, help="A sphere around everything that shows what lies in gaps.")
+@click.option("--settle", is_flag=True, help="Move vertices to where the pictures agree, before colours.")
 @click.option(
     "--room", is_flag=True,
-    help="What pictures of a room need: --unbounded --unseen solid --backdrop, finer voxels, and vertices "
-    "moved to where the photographs agree.",
+    help="What pictures of a room need: --unbounded --unseen solid --backdrop --settle and finer voxels.",
 )  # fmt: skip
 @click.option("--components", "keep_components", type=click.IntRange(1), help="Keep so many parts only.")
 @click.option(
