@@ -17,9 +17,10 @@ from engine.gaussians.materials import has_materials
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.poses.find import read_record
-from engine.render.environment_map import read_environment
+from engine.render.environment_map import read_background, read_environment
 from engine.render.renderer import background_colour
 from engine.run_folder import (
+    BACKGROUND,
     CACHE,
     CONFIG,
     ENVIRONMENT,
@@ -39,7 +40,7 @@ from engine.stages import counted_stage, stage
 from engine.threads import use_threads
 from engine.trace.make import make_tracer
 from engine.train.config import TrainConfig
-from engine.train.shading import deferred_of, make_shading
+from engine.train.shading import background_of, deferred_of, make_shading
 from engine.versions import versions
 from engine.writing import write_json
 
@@ -224,14 +225,16 @@ def _truth(dataset: Dataset, tell: Listener, *, needed: bool) -> Truth | None:
 def finished_shading(
     output: Path, config: TrainConfig, dataset: Dataset, extent_world: float
 ) -> ShadingModel:
-    """The shading model of a finished run, with the environment that it left.
+    """The shading model of a finished run, with the environment or the background that it left.
 
     Raises:
-        ConfigError: the run learnt materials and its environment is missing or damaged.
+        ConfigError: the run learnt one of these and its file is missing or damaged.
     """
     shading = make_shading(config, len(dataset.views), extent_world)
     if (deferred := deferred_of(shading)) is not None:
         deferred.light.put(read_environment(output / ENVIRONMENT))
+    if (background := background_of(shading)) is not None:
+        background.put(read_background(output / BACKGROUND))
     return shading
 
 

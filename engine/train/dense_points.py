@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
 from engine.scene import Dataset
+from engine.train.first_background import FirstBackground
 
 GUESSES = 6
 """Depths tried for a pixel: those of the nearest points in the image."""
@@ -55,12 +56,17 @@ class _Patches:
 
 
 def dense_points(
-    dataset: Dataset, count: int, rng: np.random.Generator, *, threads: int = 1
+    dataset: Dataset,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    threads: int = 1,
+    behind: FirstBackground | None = None,
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """About ``count`` points or fewer, and their display colours, beside those of the sparse model.
 
-    The sparse model must have points. Masked and transparent pixels give none. ``threads`` work on the views
-    side by side, which changes no point.
+    The sparse model must have points. Masked and transparent pixels, and those that show what is ``behind``
+    everything, give none. ``threads`` work on the views side by side, which changes no point.
     """
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
@@ -76,7 +82,7 @@ def dense_points(
             job: tuple[int, int, np.random.Generator], known: np.ndarray = known
         ) -> tuple[np.ndarray, ...]:
             index, samples, generator = job
-            return _lift(dataset, index, samples, known, neighbours[index], generator)
+            return _lift(dataset, index, samples, known, neighbours[index], generator, behind)
 
         with ThreadPoolExecutor(threads) as pool:
             found, seen = map(np.concatenate, zip(*pool.map(lift, jobs), strict=True))
@@ -122,6 +128,7 @@ def _lift(
     points: Float64[np.ndarray, "k 3"],
     neighbours: list[int],
     rng: np.random.Generator,
+    behind: FirstBackground | None,
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """Points for random pixels of one view."""
     nothing = np.empty((0, 3), np.float32)
@@ -133,12 +140,16 @@ def _lift(
     if len(patches.y) == 0:
         return nothing, nothing
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
-    _, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
+    away_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
     guesses = depths[inside][nearest]
     costs = np.stack([_cost(dataset, patches, guesses[:, g], neighbours) for g in range(GUESSES)], axis=1)
     best = np.argmin(costs, axis=1)
     rows = np.arange(len(best))
     good = costs[rows, best] < MAX_COST
+    if behind is not None:
+        longer_px = max(dataset.views[index].width_px, dataset.views[index].height_px)
+        directions, rgb = patches.directions_world[:, 0], patches.rgb_srgb[:, 0]
+        good &= ~behind.shows(directions, rgb, away_px[:, 0], longer_px)
     distance = guesses[rows, best] * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
     return xyz[good].astype(np.float32), patches.rgb_srgb[good, 0]
