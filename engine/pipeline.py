@@ -19,7 +19,6 @@ from engine.errors import (
     Cancelled,
     CheckpointError,
     ConfigError,
-    DamagedCheckpoint,
     DatasetError,
     ExportFailed,
     OutputError,
@@ -71,13 +70,13 @@ from engine.stages import StageClock, stage
 from engine.threads import use_threads
 from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from engine.train.checkpoint import newest_state
 from engine.train.config import TrainConfig, iteration_count
+from engine.train.exposure_changes import complaint, log_brightness
 from engine.train.fingerprint import run_fingerprint
 from engine.train.first_state import first_state
 from engine.train.floors import ScaleFloor
-from engine.train.shading import background_of, deferred_of
-from engine.train.state import TrainState
+from engine.train.shading import background_of, deferred_of, exposures_of
 from engine.train.trainer import Trainer
 from engine.train.within import make_plan, read_plan, write_plan
 from engine.versions import versions
@@ -285,9 +284,14 @@ def _train(
     folder = output / CHECKPOINTS
     config = _planned(dataset, output, settings, threads, should_stop, clock)
     fingerprint = run_fingerprint(dataset, config)
-    state = _resume(folder, fingerprint, tell)
+    state = newest_state(folder, fingerprint, tell)
     if state is None:
         state = first_state(dataset, config, threads=use_threads(threads))
+        if not (config.exposure or config.materials.learn or dataset.has_alpha):
+            # What shines, or was cut out, looks brighter from here than from there by itself.
+            advice = complaint(log_brightness(dataset))
+            if advice is not None:
+                tell(Warned(advice))
         state.seconds = clock.seconds()
     else:
         clock.add(state.seconds)
@@ -325,6 +329,9 @@ def _train(
     record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
     if trainer.views is not None:
         record["training_views"] = trainer.views.as_dict()
+    if (exposures := exposures_of(trainer.shading)) is not None:
+        exposures.guess_others()
+        record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
     if config.near_share > 0:
         record["taken_near"] = trainer.state.taken_near
     depths = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
@@ -359,17 +366,6 @@ def _planned(
         plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
         write_plan(output / PLAN, plan)
     return read_plan(output / PLAN).applied(config)
-
-
-def _resume(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None:
-    """The newest checkpoint; a damaged one is passed over for the one before."""
-    while (path := latest_checkpoint(folder)) is not None:
-        try:
-            return load_checkpoint(path, fingerprint)
-        except DamagedCheckpoint as error:
-            tell(Warned(str(error)))
-            path.unlink()
-    return None
 
 
 def _export(output: Path, config: ReconstructionConfig, threads: int, tell: Listener) -> str | None:

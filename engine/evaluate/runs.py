@@ -40,7 +40,7 @@ from engine.stages import counted_stage, stage
 from engine.threads import use_threads
 from engine.trace.make import make_tracer
 from engine.train.config import TrainConfig
-from engine.train.shading import background_of, deferred_of, make_shading
+from engine.train.shading import background_of, deferred_of, exposures_of, make_shading
 from engine.versions import versions
 from engine.writing import write_json
 
@@ -189,7 +189,7 @@ def measure_run(
         gaussians,
         into or output,
         settings=config.train.trace,
-        shading=finished_shading(output, config.train, dataset, extent),
+        shading=finished_shading(output, config.train, dataset, extent, exposed=into is None),
         background=config.evaluate_background,
         run={
             "gaussians": len(gaussians),
@@ -223,9 +223,16 @@ def _truth(dataset: Dataset, tell: Listener, *, needed: bool) -> Truth | None:
 
 
 def finished_shading(
-    output: Path, config: TrainConfig, dataset: Dataset, extent_world: float
+    output: Path, config: TrainConfig, dataset: Dataset, extent_world: float, *, exposed: bool = True
 ) -> ShadingModel:
-    """The shading model of a finished run, with the environment or the background that it left.
+    """The shading model of a finished run, with what it left: environment, background and exposures.
+
+    Args:
+        output: folder of the run.
+        config: its settings.
+        dataset: photographs.
+        extent_world: of the scene.
+        exposed: whether the photographs are those of the run, whose exposures are known or guessed.
 
     Raises:
         ConfigError: the run learnt one of these and its file is missing or damaged.
@@ -235,6 +242,9 @@ def finished_shading(
         deferred.light.put(read_environment(output / ENVIRONMENT))
     if (background := background_of(shading)) is not None:
         background.put(read_background(output / BACKGROUND))
+    if exposed and (exposures := exposures_of(shading)) is not None:
+        known = json.loads((output / TRAINING).read_text(encoding="utf-8")).get("exposures", {})
+        exposures.take([view.name for view in dataset.views], known)
     return shading
 
 

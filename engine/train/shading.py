@@ -34,6 +34,17 @@ def make_deferred(config: TrainConfig, extent_world: float) -> Deferred:
     return Deferred(config.materials, extent_world=extent_world, window_rays=config.window_rays)
 
 
+def exposures_of(shading: ShadingModel) -> Exposures | None:
+    """The exposures that a shading model learns."""
+    return shading if isinstance(shading, Exposures) else None
+
+
+def exposed_as(shading: ShadingModel, view: int) -> ShadingModel:
+    """What develops a view of the dataset, trained on or held out, as exposed as that is known to be."""
+    exposures = exposures_of(shading)
+    return shading if exposures is None else exposures.shown_as(view)
+
+
 def background_of(shading: ShadingModel) -> LearntBackground | None:
     """The learnt background that a shading model is, or has inside."""
     if isinstance(shading, Exposures):
