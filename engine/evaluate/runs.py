@@ -45,6 +45,7 @@ from engine.versions import versions
 from engine.writing import write_json
 
 SCALES = "scales.json"
+GUESSED = "held-out views are shown as exposed as the training views beside them by name suggest"
 RAYS_ACROSS = (1, 2, 4)
 """Rays across a pixel with which smaller sizes are measured."""
 
@@ -201,6 +202,7 @@ def measure_run(
             "versions": versions(),
             **{key: training[key] for key in ("training_views", "taken_near") if key in training},
             **_placed(output),
+            **({"exposure": GUESSED} if config.train.exposure and into is None else {}),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
         threads=threads,
