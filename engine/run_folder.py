@@ -116,12 +116,12 @@ def run_background(output: Path) -> LearntBackground | None:
 
 
 def not_exported(output: Path) -> str | None:
-    """A sentence on what a run has learnt that no file of Gaussians or octagons carries, or None."""
+    """A sentence on what a run has learnt that no other file carries, or None."""
     if not (output / CONFIG).exists() or read_config(output / CONFIG).train.background != "learnt":
         return None
     return (
-        f"What is infinitely far away is a map of its own, {output / BACKGROUND}, and in no exported file; "
-        "give it to the other program as its environment, with -y up."
+        f"What is infinitely far away is a map of its own, {output / BACKGROUND}, and in no other file; "
+        "give it to the program that shows them as its environment, with -y up."
     )
 
 

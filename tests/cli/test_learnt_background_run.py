@@ -53,6 +53,15 @@ def test_renders_show_it_unless_another_background_is_asked_for(far_run, octaspl
     assert (shown[None] - shown["black"])[beside].mean() > 0
 
 
+def test_what_carries_gaussians_alone_says_so(far_run, run, octasplat, tmp_path):
+    for source, told in ((far_run, True), (run.output, False)):
+        for command in ("export", "clean"):
+            asked = (tmp_path / f"{command}.spz",) if command == "export" else ("--dry-run",)
+            result = octasplat(command, source, *asked)
+            assert result.exit_code == 0, result.output
+            assert ("background.exr" in result.output) is told
+
+
 def test_a_run_that_was_stopped_has_the_same_background(far_run, scene, octasplat, tiny, tmp_path):
     other = tmp_path / "run"
     shutil.copytree(far_run, other)

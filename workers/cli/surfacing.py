@@ -28,7 +28,6 @@ from engine.run_folder import (
     SCENE,
     found_model,
     is_run,
-    not_exported,
     open_photographs,
     photographs_folder,
     run_viewpoints,
@@ -122,8 +121,6 @@ def run_surface(
         require_materials(gaussians, source / SCENE if is_run(source) else source)
         features, frame = material_features(gaussians), environment_frame(light_up(source, asked.up))
         light = _light_to_copy(source, output)
-    if is_run(source) and (left_out := not_exported(source)) is not None:
-        click.echo(f"Warning: {left_out}", err=True)
     cameras, settings = _cameras(source, asked.scene, gaussians, options)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)

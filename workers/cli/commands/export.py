@@ -131,7 +131,6 @@ def export(
     from engine.files import ExportOptions, export_scene, exporter_for
     from engine.gaussians.materials import require_materials
     from engine.gaussians.octagon import CHI2_2_99
-    from engine.run_folder import is_run, not_exported
     from workers.cli.scene_files import open_scene, warn_of_losses
     from workers.cli.signals import orderly_termination
     from workers.rendering.cameras import light_up
@@ -164,8 +163,6 @@ def export(
     )
     if not materials:
         warn_of_losses(gaussians, target, exporter.name)
-    if is_run(source) and (left_out := not_exported(source)) is not None:
-        click.echo(f"Warning: {left_out}", err=True)
     with orderly_termination():
         if not (exporter.holds_harmonics or materials):
             gaussians = _one_colour(gaussians, source, chosen)
