@@ -109,21 +109,27 @@ class LearntBackground:
         by_rgb: Float32[np.ndarray, "r 3"],
         by_transmittance: Float32[np.ndarray, " r"],
     ) -> Reversed:
-        """Gradients by what the model inside developed, and by the map's texels."""
+        """Gradients by what the model inside developed, and by the map's colours in the rays' directions."""
         assert isinstance(developed.kept, tuple)
         inner, behind = developed.kept
         through = (by_rgb * behind).sum(axis=1, dtype=np.float32)
         below = self.inner.reverse(sight, inner, by_rgb, through)
-        sums = np.zeros_like(self.sums)
+        own = {
+            "background.directions": sight.rays.directions_world,
+            "background.by_colours": inner.transmittance[:, None] * by_rgb,
+        }
+        return Reversed(below.seen, below.further, {**below.parameters, **own})
+
+    def add(self, parameters: Mapping[str, np.ndarray]) -> None:
+        """Add what :meth:`reverse` found to the sums over the texels."""
         add_to_texels(
             self.rgb_srgb.reshape(-1, 3),
-            len(sums),
+            len(self.sums),
             self.frame,
-            sight.rays.directions_world,
-            inner.transmittance[:, None] * by_rgb,
-            sums.reshape(-1, 3),
+            parameters["background.directions"],
+            parameters["background.by_colours"],
+            self.sums.reshape(-1, 3),
         )
-        return Reversed(below.seen, below.further, {**below.parameters, "background.sums": sums})
 
     def step(
         self,
@@ -135,7 +141,7 @@ class LearntBackground:
     ) -> None:
         """Count an iteration, and take a step of Adam if it is time; colours stay what a screen can show."""
         self.inner.step(gaussians, gradients, parameters, progress=progress)
-        self.sums += parameters["background.sums"]
+        self.add(parameters)
         self.steps += 1
         if self.steps[0] % EVERY:
             return

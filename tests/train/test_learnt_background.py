@@ -133,7 +133,8 @@ def test_gradients_agree_with_finite_differences() -> None:
         more[ray] += step
         moved = (loss(replace(before, seen=replace(before.seen, transmittance=more))) - loss()) / step
         assert found.seen.transmittance[ray] == pytest.approx(moved, abs=1e-5)
-    sums = found.parameters["background.sums"]
+    background.add(found.parameters)
+    sums = background.sums
     assert (np.abs(sums).sum(axis=2) > 0).sum() <= 4 * 5
     for row, column, channel in [*np.argwhere(sums != 0)[::7].tolist(), [8, 3, 1]]:
         background.rgb_srgb[row, column, channel] += step
