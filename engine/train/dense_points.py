@@ -28,6 +28,10 @@ STEP_PX = 2
 OFFSETS_PX = STEP_PX * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]], np.int64)
 MAX_COST = 0.06
 """Mean difference of colour, in display values, above which no guess counts as right."""
+AS_WELL = 0.005
+"""A pixel that matches infinitely far away about as well as at any guess shows the sky."""
+INFINITY = 1e6
+"""So many times the largest depth."""
 LEVEL_WEIGHT = 0.3
 """Weight of a difference in brightness against one in texture."""
 LEAST_COSINE = 0.5
@@ -140,16 +144,16 @@ def _lift(
     if len(patches.y) == 0:
         return nothing, nothing
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
-    away_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
+    _, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
     guesses = depths[inside][nearest]
     costs = np.stack([_cost(dataset, patches, guesses[:, g], neighbours) for g in range(GUESSES)], axis=1)
     best = np.argmin(costs, axis=1)
     rows = np.arange(len(best))
     good = costs[rows, best] < MAX_COST
     if behind is not None:
-        longer_px = max(dataset.views[index].width_px, dataset.views[index].height_px)
-        directions, rgb = patches.directions_world[:, 0], patches.rgb_srgb[:, 0]
-        good &= ~behind.shows(directions, rgb, away_px[:, 0], longer_px)
+        at_infinity = _cost(dataset, patches, np.full(len(rows), INFINITY * guesses.max()), neighbours)
+        as_well = at_infinity < costs[rows, best] + AS_WELL
+        good &= ~(as_well & behind.may_show(patches.directions_world[:, 0]))
     distance = guesses[rows, best] * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
     return xyz[good].astype(np.float32), patches.rgb_srgb[good, 0]

@@ -13,7 +13,7 @@ DARKEST, BRIGHTEST = 0.1, 0.95
 LEAST_POINTS = 30
 """A photograph that shows fewer points says nothing."""
 ROUNDS = 8
-CHANGES = 0.08
+CHANGES = 0.05
 """Standard deviation of the photographs' log brightness from which on exposure makes a difference."""
 
 

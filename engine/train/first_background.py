@@ -30,8 +30,6 @@ MOST_VIEWS = 96
 """Of more photographs, evenly spaced ones are looked at."""
 SOFT_TEXELS = (2.0, 6.0)
 """How softly what no photograph shows goes on from what is known, down and across."""
-LIKE = 0.12
-"""Largest mean difference of colour, display values, of what counts as the background."""
 
 
 @runtime_checkable
@@ -48,30 +46,15 @@ class FirstBackground:
 
     Attributes:
         map: of ``ROWS`` rows.
-        far: texels above the horizon in which photographs show nothing near.
+        up_world: about which way is up, of any length.
     """
 
     map: LearntBackground
-    far: Bool[np.ndarray, "h w"]
+    up_world: Float64[np.ndarray, "3"]
 
-    def shows(
-        self,
-        directions_world: Float64[np.ndarray, "n 3"],
-        rgb_srgb: Float32[np.ndarray, "n 3"],
-        from_points_px: Float64[np.ndarray, " n"],
-        longer_side_px: int,
-    ) -> Bool[np.ndarray, " n"]:
-        """Whether pixels show the background: their colour is about its, and no sparse point is beside them.
-
-        Args:
-            directions_world: of the pixels, unit length.
-            rgb_srgb: display colours.
-            from_points_px: distances to the nearest sparse point in the picture.
-            longer_side_px: of the picture.
-        """
-        unlike = np.abs(self.map.colours(directions_world.astype(np.float32)) - rgb_srgb).mean(axis=1)
-        near = from_points_px <= EMPTY_SHARE * longer_side_px
-        return np.asarray((unlike < LIKE) & ~near & self.far[_texels(self.map, directions_world)])
+    def may_show(self, directions_world: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether directions are above the horizon, where what is far away is."""
+        return np.asarray(_cosines(directions_world, self.up_world) > 0)
 
     def enlarged(self, height: int) -> Float32[np.ndarray, "h w 3"]:
         """The map with so many rows."""
@@ -93,11 +76,12 @@ def first_background(dataset: MappedPhotographs) -> FirstBackground:
     shown, shown_by = _medians(texel, rgb, count)
     far, far_by = _medians(texel[empty], rgb[empty], count)
     # Floors have no points either, close to the camera.
-    is_far = (far_by >= LEAST_VIEWS) & (_cosines(directions, _up_world(dataset)) > 0)
+    found = FirstBackground(background, _up_world(dataset))
+    is_far = (far_by >= LEAST_VIEWS) & found.may_show(directions)
     known = is_far | (shown_by > 0)
     colours = np.where(is_far[:, None], far, shown).reshape(ROWS, 2 * ROWS, 3)
     background.put(_filled(colours, known.reshape(ROWS, 2 * ROWS)))
-    return FirstBackground(background, is_far.reshape(ROWS, 2 * ROWS))
+    return found
 
 
 def _directions(background: LearntBackground) -> Float64[np.ndarray, "t 3"]:
@@ -121,17 +105,6 @@ def _cosines(
 ) -> Float64[np.ndarray, " n"]:
     """Products with an axis, added up column by column: the same bits on any number of threads."""
     return np.asarray(sum(directions[:, k] * axis[k] for k in range(3)))
-
-
-def _texels(
-    background: LearntBackground, directions_world: Float64[np.ndarray, "n 3"]
-) -> tuple[np.ndarray, ...]:
-    """Row and column of the texel that each direction lies in."""
-    height, width = background.rgb_srgb.shape[:2]
-    right, up, forward = (_cosines(directions_world, axis) for axis in background.frame)
-    row = (np.arccos(np.clip(up, -1, 1)) / np.pi * height).astype(np.int64)
-    column = ((0.5 + np.arctan2(right, forward) / (2 * np.pi)) * width).astype(np.int64)
-    return np.minimum(row, height - 1), column % width
 
 
 def _seen(
