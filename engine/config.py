@@ -11,7 +11,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from engine.errors import ConfigError
-from engine.train.config import PresetName, TrainConfig, preset, with_materials
+from engine.train.config import TrainConfig, preset, with_materials
+from engine.train.preset_names import PresetName
 
 
 class ReconstructionConfig(BaseModel):

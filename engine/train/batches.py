@@ -14,6 +14,9 @@ from engine.rays import RayBatch
 from engine.scene import View
 from engine.train.config import TrainConfig, window_side_px
 
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Its multiples fill the unit interval evenly, however many there are."""
+
 
 @runtime_checkable
 class Pixels(Protocol):
@@ -105,25 +108,45 @@ class PixelSampler:
         return self._views[which], local // width, local % width
 
     def windows(
-        self, rng: np.random.Generator, count: int, *, rays: int, side: int
+        self, rng: np.random.Generator, count: int, *, rays: int, side: int, turn: int = 0
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """``rays`` pixels (a square number) in each of ``count`` windows of about ``side`` x ``side`` pixels.
 
         A window is a grid of cells, one random pixel in each. What sticks out of its view is folded back,
-        so that every pixel is about as likely as any other.
+        so that every pixel is about as likely as any other. Windows are spread over views and within them,
+        and those of one ``turn`` after the other over what those before have left.
         """
-        areas = np.diff(self._ends, prepend=0)
-        which = rng.choice(len(self._views), size=count, p=areas / areas.sum())
-        width, height = self._sizes[which].T
         cells = math.isqrt(rays)
         cell = max(1, round(side / cells))
+        which, x, y = self._spread(rng, count, cell * cells, turn)
+        width, height = self._sizes[which].T
         rows, columns = np.divmod(np.arange(rays), cells)
-        left = rng.integers(-(cell * cells // 2), width - cell * cells // 2)
-        top = rng.integers(-(cell * cells // 2), height - cell * cells // 2)
+        left, top = x - cell * cells // 2, y - cell * cells // 2
         y = top[:, None] + rows * cell + rng.integers(0, cell, (count, rays))
         x = left[:, None] + columns * cell + rng.integers(0, cell, (count, rays))
         view = np.broadcast_to(self._views[which][:, None], x.shape)
         return view.reshape(-1), _fold(y, height[:, None]).reshape(-1), _fold(x, width[:, None]).reshape(-1)
+
+    def _spread(
+        self, rng: np.random.Generator, count: int, side: int, turn: int
+    ) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " c"], Int64[np.ndarray, " c"]]:
+        """``count`` pixels as (place of the view among those drawn from, x, y), in strata.
+
+        All views lie end to end, each as a way to and fro through tiles of about ``side`` x ``side`` pixels;
+        steps of one length lead along it, each to a random pixel of the tile there. Each turn begins the
+        golden section of a step further on, so that all tiles are seen equally often.
+        """
+        at = (np.arange(count) + turn * GOLDEN % 1.0) * (self.pixel_count / count)
+        which = np.searchsorted(self._ends, at, side="right")
+        width, height = self._sizes[which].T
+        share = (at - (self._ends[which] - width * height)) / (width * height)
+        columns = np.maximum(1, np.rint(width / side).astype(np.int64))
+        rows = np.maximum(1, np.rint(height / side).astype(np.int64))
+        row, column = np.divmod((share * columns * rows).astype(np.int64), columns)
+        column = np.where(row % 2 == 1, columns - 1 - column, column)
+        x = (column + rng.random(count)) * (width / columns)
+        y = (row + rng.random(count)) * (height / rows)
+        return which, x.astype(np.int64), y.astype(np.int64)
 
     def patches(
         self, rng: np.random.Generator, count: int, side: int
@@ -178,14 +201,16 @@ class BatchSource:
         kept = np.setdiff1d(self._dataset.train_indices, views)
         self.sampler = PixelSampler(kept, view_sizes_px(self._dataset))
 
-    def draw(self, rng: np.random.Generator) -> Batch:
-        """The next batch."""
+    def draw(self, rng: np.random.Generator, turn: int = 0) -> Batch:
+        """The next batch, after ``turn`` others."""
         config, sampler, side = self._config, self.sampler, self._config.patch_side
         loose = config.rays - self._patches * side**2
         windows = loose // config.window_rays if config.window_rays > 1 else 0
         drawn = [sampler.pixels(rng, loose - windows * config.window_rays)]
         if windows:
-            drawn.append(sampler.windows(rng, windows, rays=config.window_rays, side=self._window_side_px))
+            drawn.append(
+                sampler.windows(rng, windows, rays=config.window_rays, side=self._window_side_px, turn=turn)
+            )
         if self._patches:
             drawn.append(sampler.patches(rng, self._patches, side))
         view, y, x = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
@@ -242,14 +267,14 @@ class DrawnAhead:
     def __exit__(self, *_error: object) -> None:
         self._worker.shutdown()
 
-    def begin(self, rng: np.random.Generator) -> None:
+    def begin(self, rng: np.random.Generator, turn: int) -> None:
         """Begin the next batch; until :meth:`draw` gives it nothing else may draw from ``rng``."""
-        self._next = self._worker.submit(self._source.draw, rng)
+        self._next = self._worker.submit(self._source.draw, rng, turn)
 
-    def draw(self, rng: np.random.Generator) -> Batch:
-        """The next batch, begun or not."""
+    def draw(self, rng: np.random.Generator, turn: int) -> Batch:
+        """The batch after ``turn`` others, begun or not."""
         begun, self._next = self._next, None
-        return self._source.draw(rng) if begun is None else begun.result()
+        return self._source.draw(rng, turn) if begun is None else begun.result()
 
 
 def still_background(config: TrainConfig) -> Float32[np.ndarray, "3"]:

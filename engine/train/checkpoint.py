@@ -14,14 +14,15 @@ from engine.errors import CheckpointError, DamagedCheckpoint
 from engine.events import Listener, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.rows import from_row_arrays, row_arrays
+from engine.train.averaging import RunningMean
 from engine.train.optimiser import Adam
 from engine.train.state import TrainState
 from engine.writing import replacing
 
-FORMAT = 4
+FORMAT = 5
 KEEP = 2
 _PREFIX = "iteration_"
-_GROUPS = ("gaussians", "adam", "densifier", "shading")
+_GROUPS = ("gaussians", "adam", "average", "densifier", "shading")
 # What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array.
 _DAMAGE = (
     OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
@@ -59,11 +60,14 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         "best_iteration": state.best_iteration,
         "left_out": state.left_out.tolist(),
         "taken_near": state.taken_near,
+        "averaged": state.average.count,
     }
     arrays: dict[str, Any] = {
         f"gaussians.{name}": array for name, array in row_arrays(state.gaussians).items()
     }
     arrays |= {f"adam.{name}": array for name, array in row_arrays(state.adam).items()}
+    if state.average.gaussians is not None:
+        arrays |= {f"average.{name}": array for name, array in row_arrays(state.average.gaussians).items()}
     arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
     arrays |= {f"shading.{name}": value for name, value in state.shading.items()}
     meta["arrays"] = sorted(arrays)
@@ -100,6 +104,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         ) from None
     rng = np.random.Generator(np.random.PCG64())
     rng.bit_generator.state = meta["rng"]
+    mean = from_row_arrays(FlatGaussians, groups["average"]) if groups["average"] else None
     return TrainState(
         iteration=meta["iteration"],
         gaussians=from_row_arrays(FlatGaussians, groups["gaussians"]),
@@ -113,6 +118,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         best_iteration=meta["best_iteration"],
         left_out=np.array(meta["left_out"], np.int64),
         taken_near=meta["taken_near"],
+        average=RunningMean(mean, meta["averaged"]),
     )
 
 

@@ -14,14 +14,13 @@ from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from engine.gaussians.octagon import CHI2_3_99
 from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import TraceSettings
+from engine.train.preset_names import PRESETS
 
 MOST_PLANNED_ITERATIONS = 30_000
 """Where a time decides their number, see :mod:`engine.train.within`."""
 
 FOR_SURFACE = 0.05
 """Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""
-
-PresetName = Literal["fast", "standard", "paper"]
 
 
 class _Frozen(BaseModel):
@@ -35,9 +34,12 @@ class LearningRates(_Frozen):
     """
 
     mean: float = Field(0.14, gt=0)
-    mean_final: float = Field(1.4e-3, gt=0)
+    mean_final: float = Field(1e-2, gt=0)
     mean_of: Literal["size", "extent"] = Field(
         "size", description="unit of the two: the Gaussian's own size, or the scene's extent"
+    )
+    axes: Literal["own", "world"] = Field(
+        "own", description="along and around which means and rotations take their steps"
     )
     quat: float = Field(0.03, ge=0)
     log_scale: float = Field(0.04, ge=0)
@@ -49,7 +51,7 @@ class LearningRates(_Frozen):
     albedo: float = Field(0.03, ge=0, description="of the logit, as for the two below")
     metallic: float = Field(0.03, ge=0)
     roughness: float = Field(0.03, ge=0)
-    decay: float = Field(0.1, gt=0, le=1)
+    decay: float = Field(0.3, gt=0, le=1)
 
     def of_channel(self, name: str) -> float:
         """The rate of a named channel; 0 where it is not trained."""
@@ -120,8 +122,9 @@ class TrainConfig(_Frozen):
     iterations: int = Field(
         0,
         ge=0,
-        description="0: three rays for each pixel of the training views, in thousands, 5,000 to 12,000",
+        description="0: rays_a_pixel rays for each pixel of the training views, in thousands",
     )
+    rays_a_pixel: int = Field(4, ge=1, description="where iterations is 0; 5,000 to 12,000 iterations for 4")
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
     window_side: int = Field(
@@ -135,12 +138,13 @@ class TrainConfig(_Frozen):
     patch_side: int = Field(32, ge=16)
     fit_iterations: int = Field(100, ge=0, description="fitting before anything is added")
     sh_degree: int = Field(2, ge=0, le=3)
-    sh_every: int = Field(400, ge=1, description="iterations between raising the degree")
+    sh_every: int = Field(100, ge=1, description="iterations between raising the degree")
     max_gaussians: int = Field(
         0,
         ge=0,
         description="0: one for each 50 pixels of the training views or, of up to 10,000, for each 10",
     )
+    pixels_a_gaussian: int = Field(50, ge=10, description="where max_gaussians is 0")
     max_gaussians_auto: int = Field(200_000, ge=1, description="the most that 0 comes to in max_gaussians")
     initial_points: int = Field(100_000, ge=1, description="most points to begin from")
     plane_points: int = Field(8, ge=3, description="points around one whose plane gives its first normal")
@@ -167,6 +171,12 @@ class TrainConfig(_Frozen):
     )
     misfits_after: float = Field(
         0.3, ge=0, le=1, description="share of the iterations after which checkpoints look for them"
+    )
+    average_after: float = Field(
+        0.85,
+        ge=0,
+        le=1,
+        description="share of the iterations after which states are averaged; the mean is exported",
     )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
@@ -219,14 +229,14 @@ class TrainConfig(_Frozen):
 
 
 def iteration_count(config: TrainConfig, training_pixels: int) -> int:
-    """``config.iterations``, or where that is 0 three rays for each pixel, in whole thousands.
+    """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
-    Large scenes learn as long as there is something to see; small ones are done after 5,000. Materials take
-    four rays for each pixel, since normals go on getting better.
+    Large scenes learn as long as there is something to see; small ones are done after 5,000 with 4 rays a
+    pixel.
     """
-    rays_a_pixel = 4 if config.materials.learn else 3
-    wanted = round(rays_a_pixel * training_pixels / config.rays / 1000)
-    return config.iterations or min(max(wanted, 5), 12) * 1000
+    each = config.rays_a_pixel
+    wanted = round(each * training_pixels / config.rays / 1000)
+    return config.iterations or min(max(wanted, 5 * each // 4), 3 * each) * 1000
 
 
 def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
@@ -236,7 +246,7 @@ def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
     """
     if config.max_gaussians:
         return config.max_gaussians
-    wanted = max(training_pixels // 50, min(training_pixels // 10, 10_000), 1)
+    wanted = max(training_pixels // config.pixels_a_gaussian, min(training_pixels // 10, 10_000), 1)
     return min(wanted, config.max_gaussians_auto)
 
 
@@ -262,7 +272,15 @@ def with_materials(config: TrainConfig) -> TrainConfig:
     Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
     show reflections lie behind the surface, so there are none.
     """
-    rates = {"quat": 2e-3, "mean": 0.008, "mean_final": 1e-3, "log_scale": 0.004, "opacity": 0.03}
+    rates = {
+        "axes": "world",
+        "quat": 2e-3,
+        "mean": 0.008,
+        "mean_final": 1e-3,
+        "log_scale": 0.004,
+        "opacity": 0.03,
+        "decay": 0.1,
+    }
     return config.model_copy(
         update={
             "materials": config.materials.model_copy(update={"learn": True}),
@@ -270,8 +288,10 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "lift_pixels": False,
             "plane_points": 10,
             "sh_degree": min(config.sh_degree, 1),
+            "sh_every": 400,
             "rays": 8192,
             "step_back_db": 0.3,
+            "average_after": 1.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
             "max_gaussians_auto": min(config.max_gaussians_auto, 40_000),
@@ -287,14 +307,14 @@ def preset(name: str) -> TrainConfig:
     """
     if name == "fast":
         return TrainConfig(
-            iterations=1000,
+            iterations=1400,
             sh_degree=1,
-            sh_every=300,
             max_gaussians_auto=40_000,
-            rates=LearningRates(decay=0.3),
         )
     if name == "standard":
         return TrainConfig()
+    if name == "high":
+        return TrainConfig(rays_a_pixel=12, pixels_a_gaussian=30, max_gaussians_auto=400_000)
     if name == "paper":
         return TrainConfig(
             iterations=10_000,
@@ -309,6 +329,7 @@ def preset(name: str) -> TrainConfig:
                 mean=5e-4,
                 mean_final=3e-6,
                 mean_of="extent",
+                axes="world",
                 quat=0.01,
                 log_scale=5e-3,
                 opacity=0.05,
@@ -319,4 +340,5 @@ def preset(name: str) -> TrainConfig:
             trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),
             densify=PaperConfig(),
         )
-    raise ConfigError(f"There is no preset called {name!r}; choose fast, standard or paper.")
+    listed = ", ".join(PRESETS)
+    raise ConfigError(f"There is no preset called {name!r}; choose {listed}.")

@@ -91,14 +91,50 @@ def _word(value):
 
 
 @lean(fastmath={"contract"})
+def own_axes_of(i, quats, room):
+    """The axes of Gaussian ``i`` as rows of ``room``: the normal and the two in its plane."""
+    w, x, y, z = quats[i]
+    w, x, y, z = np.float64(w), np.float64(x), np.float64(y), np.float64(z)
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    room[0, 0], room[0, 1], room[0, 2] = 1.0 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)
+    room[1, 0], room[1, 1], room[1, 2] = s * (x * y - w * z), 1.0 - s * (x * x + z * z), s * (y * z + w * x)
+    room[2, 0], room[2, 1], room[2, 2] = s * (x * z + w * y), s * (y * z - w * x), 1.0 - s * (x * x + y * y)
+
+
+@lean(fastmath={"contract"})
+def by_own_turns(k, i, quats, g_quats, out):
+    """Gradient of Gaussian ``i`` by turns around its own axes: by d of its quaternion times (1, d)."""
+    w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+    a, b, c, d = g_quats[k, 0], g_quats[k, 1], g_quats[k, 2], g_quats[k, 3]
+    out[3] = 0.0
+    out[4] = -a * x + b * w + c * z - d * y
+    out[5] = -a * y - b * z + c * w + d * x
+    out[6] = -a * z + b * y - c * x + d * w
+
+
+@lean(fastmath={"contract"})
+def turn(i, quats, by):
+    """Replace the quaternion of Gaussian ``i`` by that times (1, ``by[4:7]``), of length 1."""
+    w, x, y, z = (
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+    )  # fmt: skip
+    a, b, c = np.float64(by[4]), np.float64(by[5]), np.float64(by[6])
+    share = 1.0 / math.sqrt((w * w + x * x + y * y + z * z) * (1.0 + a * a + b * b + c * c))
+    quats[i, 0] = (w - x * a - y * b - z * c) * share
+    quats[i, 1] = (x + w * a + y * c - z * b) * share
+    quats[i, 2] = (y + w * b + z * a - x * c) * share
+    quats[i, 3] = (z + w * c + x * b - y * a) * share
+
+
+@lean(fastmath={"contract"})
 def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, corrections):
     """One step of Gaussian ``i``, row ``k`` of the gradients; see :func:`adam_step`."""
     first, second, numbers = state
     means, quats, log_scales, logits, sh = gaussian
     g_means, g_quats, g_log_scales, g_logits, g_sh = gradients
-    rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps = rates
+    rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps = rates
     opacity_weight, scale_weight, min_log_scale, max_log_scale = regular
-    values, by_values, by_rates = room[0], room[1], room[2]
+    values, by_values, by_rates, axes = room[0], room[1], room[2], room[3:]
     scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
     rate = rate_mean
     if mean_by_size:
@@ -113,6 +149,14 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
         values[7 + axis], by_rates[7 + axis] = log_scales[i, axis], rate_log_scale
     by_values[7] = g_log_scales[k, 0] + scale_weight * scale_0
     by_values[8] = g_log_scales[k, 1] + scale_weight * scale_1
+    if own_axes:
+        own_axes_of(i, quats, axes)
+        for axis in range(3):
+            by_values[axis] = (
+                axes[axis, 0] * g_means[k, 0] + axes[axis, 1] * g_means[k, 1] + axes[axis, 2] * g_means[k, 2]
+            )
+            values[4 + axis] = 0.0
+        by_own_turns(k, i, quats, g_quats, by_values)
     opacity = 0.0
     if opacity_weight != 0.0:
         opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[i])))
@@ -133,11 +177,19 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
             columns - column,
             numbers,
         )
+    if own_axes:
+        turn(i, quats, values)
+        for axis in range(3):
+            mean_steps[k, axis] = (
+                axes[0, axis] * values[0] + axes[1, axis] * values[1] + axes[2, axis] * values[2]
+            )
+    else:
+        for axis in range(4):
+            quats[i, axis] = values[3 + axis]
+        for axis in range(3):
+            mean_steps[k, axis] = values[axis]
     for axis in range(3):
-        mean_steps[k, axis] = values[axis]
-        means[i, axis] += values[axis]
-    for axis in range(4):
-        quats[i, axis] = values[3 + axis]
+        means[i, axis] += mean_steps[k, axis]
     for axis in range(2):
         log_scales[i, axis] = min(max(np.float64(values[7 + axis]), min_log_scale), max_log_scale)
     logits[i] = values[9]
@@ -164,7 +216,7 @@ def adam_step(
     ids, steps, powers, first, second,
     means, quats, log_scales, logits, sh,
     g_means, g_quats, g_log_scales, g_logits, g_sh,
-    rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rates_sh,
+    rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh,
     opacity_weight, scale_weight, min_log_scale, max_log_scale,
     beta1, beta2, epsilon, mean_steps, corrections,
 ):  # fmt: skip
@@ -172,20 +224,25 @@ def adam_step(
 
     ``powers`` are those of ``beta1`` and ``beta2``, for as many steps as any has taken and one more.
     ``rate_mean`` is in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric
-    mean of its two scales. ``rates_sh`` are those of the harmonics' coefficients, one after the other.
+    mean of its two scales. With ``own_axes`` means and quaternions are stepped along and around the
+    Gaussian's normal and the two axes in its plane, each with moments of its own; the first column of the
+    quaternion's is then unused. ``rates_sh`` are those of the harmonics' coefficients, one after the other.
 
     ``opacity_weight`` and ``scale_weight`` add the gradients of their regularisers. ``mean_steps`` receives
     each mean's step, world units, and ``corrections`` what both moments are multiplied by.
     """
     count = len(ids)
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        room = np.zeros((3, LANES), np.float32)
+        room = np.zeros((6, LANES), np.float32)
         step_chunk(
             chunk * CHUNK, min(count, (chunk + 1) * CHUNK), ids, steps, powers, room,
             (first, second, beta1, beta2, epsilon),
             (means, quats, log_scales, logits, sh),
             (g_means, g_quats, g_log_scales, g_logits, g_sh),
-            (rate_mean, mean_by_size, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps),
+            (
+                rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh,
+                mean_steps,
+            ),
             (opacity_weight, scale_weight, min_log_scale, max_log_scale),
             corrections,
         )  # fmt: skip

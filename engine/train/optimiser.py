@@ -22,7 +22,10 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 class Adam:
     """First and second moments of every parameter, one row a Gaussian, and each Gaussian's step count.
 
-    Columns: mean 3, quaternion 4, log scales 2, opacity 1, then the harmonics. A Gaussian that no ray of
+    Columns: mean 3, quaternion 4, log scales 2, opacity 1, then the harmonics. Where ``rates.axes`` is "own"
+    the first are along the normal and the two axes in the Gaussian's plane, and the last three of the
+    quaternion's are turns around these: where a Gaussian is in its plane photographs say at once, how deep
+    it lies they say by parallax, and each direction has steps of a size of its own. A Gaussian that no ray of
     the batch hits is left alone: neither its moments nor its parameters change. Named channels have columns
     of their own; those are trained for which there is a rate, and only where they are what was traced.
     """
@@ -105,6 +108,7 @@ class Adam:
             gradients.means_world, gradients.quats_wxyz, gradients.log_scales,
             gradients.opacity_logits, gradients.sh,
             mean_unit * rates.mean * (rates.mean_final / rates.mean) ** progress, rates.mean_of == "size",
+            rates.axes == "own",
             rates.quat * decay, rates.log_scale * decay, rates.opacity * decay,
             rates_sh,
             loss.opacity / hit, loss.scale / (2 * hit * extent),

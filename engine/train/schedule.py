@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from engine.train.averaging import AVERAGE_EVERY
 from engine.train.config import TrainConfig, iteration_count, rebuild_interval
 
 EVENT_EVERY = 10
@@ -40,6 +41,11 @@ class Schedule:
         """Whether views that do not fit are looked for after ``done`` iterations, for the rest of the run."""
         since = self.config.misfits_after * self.iterations
         return self.measures(done) and since <= done < self.iterations
+
+    def averages(self, done: int) -> bool:
+        """Whether the state after ``done`` iterations counts in the mean that is exported."""
+        since = self.config.average_after * self.iterations
+        return since < done and (done % AVERAGE_EVERY == 0 or self.ends(done))
 
     def rebuilds(self, done: int, gaussians: int) -> bool:
         """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from engine.gaussians.model import FlatGaussians
+from engine.train.averaging import RunningMean
 from engine.train.optimiser import Adam
 
 
@@ -25,6 +26,7 @@ class TrainState:
         best_psnr: best probe so far, dB; the Gaussians that reached it are in ``best.npz``.
         best_iteration: when that was.
         left_out: training views that are left out from here on.
+        average: the mean of the last states, where they are averaged.
         taken_near: Gaussians taken away so far for being too near to a camera.
     """
 
@@ -40,6 +42,7 @@ class TrainState:
     best_iteration: int = 0
     left_out: Int64[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
     taken_near: int = 0
+    average: RunningMean = field(default_factory=RunningMean)
 
     def raise_degree(self, degree: int) -> None:
         """Give the colours harmonics up to ``degree``, zero at first, if they have less."""

@@ -132,6 +132,9 @@ class Trainer:
         watch, began_at = Stopwatch(state.seconds), state.iteration
         stale = True  # whether the hierarchy is of other Gaussians
         while True:
+            if schedule.ends(state.iteration) and state.average.gaussians is not None:
+                state.gaussians = state.average.gaussians
+                state.average.clear()
             if schedule.rebuilds(state.iteration, len(state.gaussians)):
                 state.raise_degree(schedule.sh_degree(state.iteration))
                 if self._scale_floor is not None:
@@ -142,12 +145,16 @@ class Trainer:
                 self._build()
             if schedule.ends(state.iteration):
                 return self._conclude()
-            batch = batches.draw(state.rng)
+            batch = batches.draw(state.rng, state.iteration)
             if self._threads != 1 and not self._draws_or_stops(state.iteration + 1):
-                batches.begin(state.rng)
+                batches.begin(state.rng, state.iteration + 1)
             progress = schedule.progress(state.iteration)
             found = iterate(state, batch, machinery, self._config, progress=progress, extent=self._extent)
             stale = schedule.may_densify(state.iteration) and self._change()
+            if stale:
+                state.average.clear()
+            elif schedule.averages(state.iteration):
+                state.average.add(state.gaussians)
             if schedule.tells(state.iteration):
                 self._report(found, watch, state.iteration - began_at)
             if self._onlooker is not None and not stale:

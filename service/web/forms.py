@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from engine.files import exporters
 from engine.train.config import preset
+from engine.train.preset_names import PRESETS
 from workers.work.kinds import JobKind
 
 Control = Literal["choice", "yes_no", "whole", "number", "text", "list", "files"]
-PRESETS = ("fast", "standard", "paper")
 
 _FIRST = ("preset", "poses", "max_side", "minutes", "exports", "files")
 _FIRST_OF_TRAINING = ("train.iterations", "train.max_gaussians", "train.sh_degree")

@@ -353,7 +353,7 @@ def test_what_the_service_is(talk: Callable[..., None]) -> None:
         assert {"reconstruct", "evaluate", "export", "render", "toy"} <= set(info["kinds"])
         assert "glb" in [form["name"] for form in info["formats"]] and info["needs_token"] is False
         schema = (await http.get("/v1/options/reconstruct")).json()["options"]
-        assert schema["properties"]["preset"]["enum"] == ["fast", "standard", "paper"]
+        assert schema["properties"]["preset"]["enum"] == ["fast", "standard", "high", "paper"]
         assert is_problem(await http.get("/v1/options/nothing"), 404, "not-found")
         await new_job(http, service)
         (cpu,) = (await http.get("/v1/queues")).json()["queues"]

@@ -57,6 +57,32 @@ def test_windows_reach_every_pixel_about_as_often() -> None:
         assert inside.max() < 800
 
 
+def test_windows_of_a_batch_are_spread_over_the_views_and_within_them() -> None:
+    sizes = np.array([[60, 40]] * 10)
+    sampler = PixelSampler(np.arange(10), sizes)
+    for turn in range(5):
+        windows = sampler.windows(np.random.default_rng(turn), 60, rays=16, side=20, turn=turn)
+        view, y, x = (a.reshape(60, 16) for a in windows)
+        assert (np.bincount(view[:, 0]) == 6).all()
+        for index in range(10):  # 3 x 2 tiles: a window in each, but for the seam between two views
+            tiles = {
+                (round(b), round(a))
+                for a, b in zip(
+                    x[view[:, 0] == index].mean(1) // 20, y[view[:, 0] == index].mean(1) // 20, strict=True
+                )
+            }
+            assert len(tiles) >= 4
+
+
+def test_few_windows_a_turn_see_all_views_equally_often_in_time() -> None:
+    """Drawn at random, of 300 windows on 50 views some would have fewer than three."""
+    sampler = PixelSampler(np.arange(50), np.array([[60, 40]] * 50))
+    rng = np.random.default_rng(0)
+    views = [sampler.windows(rng, 3, rays=16, side=20, turn=turn)[0][::16] for turn in range(100)]
+    tally = np.bincount(np.concatenate(views), minlength=50)
+    assert tally.min() >= 5 and tally.max() <= 7
+
+
 def test_patches_are_whole_and_in_rows() -> None:
     sampler = PixelSampler(np.array([1, 2]), SIZES)
     view, y, x = (a.reshape(500, 4, 4) for a in sampler.patches(np.random.default_rng(0), 500, 4))

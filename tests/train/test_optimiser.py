@@ -1,11 +1,13 @@
 """Adam: that of torch where every Gaussian is hit, and hands off the others."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 import pytest
 import torch
 
+from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import GaussianGradients
@@ -29,6 +31,13 @@ def gaussians(count: int, degree: int = 1) -> FlatGaussians:
     return FlatGaussians(**{k: rng.normal(size=(count, *s)).astype(np.float32) for k, s in shapes.items()})
 
 
+def quat_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """One quaternion times each of others, w first."""
+    w, v = b[:, :1], b[:, 1:]
+    real = a[0] * w - v @ a[1:, None]
+    return np.concatenate([real, a[0] * v + w * a[1:] + np.cross(a[1:], v)], axis=1)
+
+
 def gradients(of: FlatGaussians, ids: np.ndarray, rng: np.random.Generator) -> GaussianGradients:
     ids = ids.astype(np.int32)
     parts = {name: rng.normal(size=getattr(of, name)[ids].shape).astype(np.float32) for name in NAMES}
@@ -43,7 +52,7 @@ def test_like_torch_when_all_are_hit() -> None:
     rng = np.random.default_rng(1)
     ours, extent = gaussians(50), 2.0
     rates = LearningRates(mean=1e-3, mean_final=1e-3, mean_of="extent", quat=2e-3, log_scale=3e-3,
-                          opacity=4e-2, colour=5e-3, sh_rest_ratio=0.1, decay=1.0)  # fmt: skip
+                          axes="world", opacity=4e-2, colour=5e-3, sh_rest_ratio=0.1, decay=1.0)  # fmt: skip
     colour = rates.colour / SH_C0
     leaves = {name: torch.tensor(getattr(ours, name), dtype=torch.float64) for name in NAMES}
     leaves["sh0"], leaves["sh_rest"] = leaves["sh"][:, :1].clone(), leaves.pop("sh")[:, 1:].clone()
@@ -68,6 +77,70 @@ def test_like_torch_when_all_are_hit() -> None:
     assert (adam.steps == 30).all()
     for name in NAMES:
         np.testing.assert_allclose(getattr(ours, name), leaves[name].numpy(), atol=2e-6)
+
+
+def test_own_axes_turn_with_the_gaussian_and_leave_the_rest_alone() -> None:
+    """What Adam does to a scene does not depend on how the world is turned."""
+    rng = np.random.default_rng(3)
+    rates = LearningRates(sh_rest_ratio=0.1)
+    ours = gaussians(40, degree=0)
+    turned, by = ours.copy(), np.array([0.4, -0.7, 0.2, 0.56])
+    by /= np.linalg.norm(by)
+    world = rotation_matrices(by[None])[0]
+    turned.means_world = (ours.means_world @ world.T).astype(np.float32)
+    turned.quats_wxyz = quat_product(by, ours.quats_wxyz).astype(np.float32)
+    adams = Adam.fresh(ours), Adam.fresh(turned)
+    for _ in range(20):
+        given = gradients(ours, np.arange(40), rng)
+        along = (ours.quats_wxyz * given.quats_wxyz).sum(axis=1, keepdims=True)
+        square = (ours.quats_wxyz**2).sum(axis=1, keepdims=True)
+        given.quats_wxyz -= along / square * ours.quats_wxyz  # a rotation has no length
+        also = replace(
+            given,
+            means_world=(given.means_world @ world.T).astype(np.float32),
+            quats_wxyz=quat_product(by, given.quats_wxyz).astype(np.float32),
+        )
+        moved = [
+            adam.step(scene, by_scene, rates, NO_LOSS, progress=0.5, extent=1.0)
+            for adam, scene, by_scene in zip(adams, (ours, turned), (given, also), strict=True)
+        ]
+        np.testing.assert_allclose(moved[1], moved[0] @ world.T, atol=2e-5)
+    np.testing.assert_allclose(turned.means_world, ours.means_world @ world.T, atol=2e-4)
+    np.testing.assert_allclose(turned.rotations, world @ ours.rotations, atol=2e-4)
+    np.testing.assert_allclose(turned.log_scales, ours.log_scales)
+
+
+def test_own_axes_each_have_their_own_steps() -> None:
+    """A weak steady pull along the normal moves as far as a strong one; in the world's axes it is lost."""
+    steps = {}
+    for axes in ("own", "world"):
+        ours = gaussians(1, degree=0)
+        ours.quats_wxyz[0] = np.array([0.8, 0.3, -0.4, 0.33]) / np.linalg.norm([0.8, 0.3, -0.4, 0.33])
+        ours.log_scales[:] = 0.0
+        adam, frame, total = Adam.fresh(ours), ours.rotations[0], np.zeros(3)
+        for k in range(20):
+            given = gradients(ours, np.arange(1), np.random.default_rng(k))
+            given.quats_wxyz[:], given.log_scales[:] = 0, 0
+            pull = 1.0 * frame[:, 0] + (-1.0) ** k * 100.0 * frame[:, 1]
+            given.means_world[0] = pull
+            total += adam.step(ours, given, LearningRates(axes=axes), NO_LOSS, progress=0.0, extent=1.0)[0]
+        steps[axes] = total @ frame
+    assert steps["own"][0] == pytest.approx(-20 * LearningRates().mean, rel=1e-2)
+    assert abs(steps["world"][0]) < 0.2 * abs(steps["own"][0])
+
+
+def test_a_turn_goes_downhill_by_the_angle_that_the_rate_says() -> None:
+    ours = gaussians(30, degree=0)
+    before, given = ours.rotations.copy(), gradients(ours, np.arange(30), np.random.default_rng(5))
+    wanted = given.quats_wxyz.astype(np.float64)
+    quats = ours.quats_wxyz.astype(np.float64)
+    Adam.fresh(ours).step(ours, given, LearningRates(), NO_LOSS, progress=0.0, extent=1.0)
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    change = ours.quats_wxyz - quats / length
+    assert ((change * wanted).sum(axis=1) < 0).all()
+    cosine = (np.trace(before.transpose(0, 2, 1) @ ours.rotations, axis1=1, axis2=2) - 1) / 2
+    half = np.sqrt(3) * LearningRates().quat  # the first step of each of three axes
+    np.testing.assert_allclose(np.arccos(cosine), 2 * np.arctan(half), rtol=1e-3)
 
 
 def test_gaussians_that_are_not_hit_stay_as_they_are() -> None:
@@ -107,7 +180,7 @@ def test_first_step_is_the_rate_whatever_the_gradient() -> None:
     adam.step(
         ours, gradients(ours, np.array([9]), np.random.default_rng(0)), rates, NO_LOSS, progress=0, extent=3
     )
-    step = np.abs(ours.means_world[9] - before.means_world[9])
+    step = np.abs((ours.means_world[9] - before.means_world[9]) @ before.rotations[9])
     size = np.exp(before.log_scales[9].mean())
     np.testing.assert_allclose(step, size * rates.mean, rtol=1e-2)
 
@@ -117,7 +190,7 @@ def test_rate_of_the_means_falls_exponentially(unit: Literal["size", "extent"]) 
     rates = LearningRates(mean_of=unit)
     for progress in (0.0, 0.5, 1.0):
         ours = gaussians(5)
-        adam = Adam.fresh(ours)
+        adam, frames = Adam.fresh(ours), ours.rotations
         lengths = np.exp(ours.log_scales.mean(axis=1)) if unit == "size" else np.full(5, 2.0)
         moved = adam.step(
             ours,
@@ -128,7 +201,8 @@ def test_rate_of_the_means_falls_exponentially(unit: Literal["size", "extent"]) 
             extent=2,
         )
         expected = lengths * rates.mean * (rates.mean_final / rates.mean) ** progress
-        np.testing.assert_allclose(np.abs(moved), np.tile(expected[:, None], 3), rtol=1e-5)
+        along = np.abs(np.einsum("ni,nij->nj", moved, frames))
+        np.testing.assert_allclose(along, np.tile(expected[:, None], 3), rtol=1e-4)
 
 
 @pytest.mark.parametrize("term", ["opacity", "scale"])
@@ -149,7 +223,10 @@ def test_regularisers_push_down(term: str) -> None:
     changed = {"opacity": "opacity_logits", "scale": "log_scales"}[term]
     for name in NAMES:
         difference = getattr(ours, name) - getattr(before, name)
-        assert (difference < 0).all() if name == changed else not difference.any()
+        if name == "quats_wxyz":  # of length 1 from then on
+            np.testing.assert_allclose(ours.rotations, before.rotations, atol=1e-6)
+        else:
+            assert (difference < 0).all() if name == changed else not difference.any()
 
 
 def test_select_append_reset_widen() -> None:

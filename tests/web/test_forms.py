@@ -3,6 +3,7 @@
 import json
 from itertools import chain
 
+from engine.train.preset_names import PRESETS
 from service.web.forms import Field, OptionsForm, options_form
 from workers.work.kinds import job_kinds, kind_named
 
@@ -21,7 +22,7 @@ def leaves(values: dict, prefix: str = "") -> set[str]:
 def test_every_setting_has_its_field() -> None:
     kind = kind_named("reconstruct")
     form = options_form(kind)
-    for preset in ("fast", "standard", "paper"):
+    for preset in PRESETS:
         assert leaves(kind.resolve({"preset": preset}).model_dump(mode="json")) <= set(fields_of(form))
     assert [f.path for f in form.first][:3] == ["preset", "poses", "max_side"]
 
@@ -31,8 +32,7 @@ def test_defaults_follow_the_preset() -> None:
     kind = kind_named("reconstruct")
     shown = json.loads(fields["train.iterations"].defaults)
     assert shown == {
-        name: str(kind.resolve({"preset": name}).model_dump()["train"]["iterations"])
-        for name in ("fast", "standard", "paper")
+        name: str(kind.resolve({"preset": name}).model_dump()["train"]["iterations"]) for name in PRESETS
     }
     assert json.loads(fields["train.densify.kind"].defaults)["paper"] == "paper"
     assert fields["test_every"].defaults == "" and fields["test_every"].default == "8"

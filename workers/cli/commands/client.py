@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from engine.errors import ConfigError
+from engine.train.preset_names import PRESETS
 from workers.cli.options import export_names, exports_option, quiet_option
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def connected(server: str | None) -> Iterator["Api"]:
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
-@click.option("--preset", type=click.Choice(["fast", "standard", "paper"]), help="Where settings come from.")
+@click.option("--preset", type=click.Choice(PRESETS), help="Where settings come from.")
 @click.option(
     "--poses",
     type=click.Choice(["given", "auto", "missing"]),

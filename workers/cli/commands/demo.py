@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from engine.train.preset_names import PRESETS
 from workers.cli.browsing import has_display
 from workers.cli.options import quiet_option, threads_option
 
@@ -23,7 +24,7 @@ DEFAULT_OUTPUT = Path("octasplat-demo")
 @click.option("--scene-only", is_flag=True, help="Only write the scene, right into the output folder.")
 @click.option(
     "--preset",
-    type=click.Choice(["fast", "standard", "paper"]),
+    type=click.Choice(PRESETS),
     default="fast",
     show_default=True,
     help="Settings of the reconstruction.",

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from engine.train.preset_names import PRESETS
 from workers.cli.options import (
     background_option,
     export_names,
@@ -16,7 +17,6 @@ from workers.cli.options import (
 if TYPE_CHECKING:
     from engine.config import ReconstructionConfig
 
-PRESETS = ("fast", "standard", "paper")
 _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
 
 

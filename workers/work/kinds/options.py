@@ -14,6 +14,7 @@ from engine.errors import SceneFileError
 from engine.files import exporter_for
 from engine.light.stage import Stage
 from engine.train.config import preset, with_materials
+from engine.train.preset_names import PRESETS
 
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _TAKEN = frozenset(
@@ -200,7 +201,7 @@ def resolve_reconstruction(asked: Mapping[str, Any]) -> ReconstructOptions:
         ValidationError: an unknown name or a value out of range.
     """
     name = asked.get("preset", "standard")
-    known = name in ("fast", "standard", "paper")
+    known = name in PRESETS
     train = asked.get("train")
     base: dict[str, Any] = {}
     if known:

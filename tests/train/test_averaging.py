@@ -1,0 +1,65 @@
+"""The mean of the last states: what it is, when it begins anew, and that it survives a checkpoint."""
+
+from pathlib import Path
+
+import numpy as np
+
+from engine.gaussians.model import FlatGaussians
+from engine.gaussians.rows import row_arrays
+from engine.train.averaging import AVERAGE_EVERY, RunningMean
+from engine.train.checkpoint import load_checkpoint, save_checkpoint
+from engine.train.config import TrainConfig
+from engine.train.schedule import Schedule
+from engine.train.state import fresh_state
+
+
+def random_gaussians(count: int, seed: int, degree: int = 0) -> FlatGaussians:
+    rng = np.random.default_rng(seed)
+    shapes = {
+        "means_world": (3,),
+        "quats_wxyz": (4,),
+        "log_scales": (2,),
+        "opacity_logits": (),
+        "sh": ((degree + 1) ** 2, 3),
+    }
+    return FlatGaussians(**{k: rng.normal(size=(count, *s)).astype(np.float32) for k, s in shapes.items()})
+
+
+def test_mean_of_the_states_that_were_added() -> None:
+    states = [random_gaussians(12, seed=seed) for seed in range(5)]
+    mean = RunningMean()
+    for state in states:
+        mean.add(state)
+    assert mean.gaussians is not None and mean.count == 5
+    for name, found in row_arrays(mean.gaussians).items():
+        expected = np.mean([row_arrays(state)[name] for state in states], axis=0)
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_other_parameters_begin_a_new_mean() -> None:
+    mean = RunningMean()
+    mean.add(random_gaussians(12, seed=0))
+    wider = random_gaussians(12, seed=1, degree=1)
+    mean.add(wider)
+    assert mean.gaussians is not None and mean.count == 1
+    np.testing.assert_array_equal(mean.gaussians.sh, wider.sh)
+    wider.sh[:] = 0  # the mean is a copy
+    assert mean.gaussians.sh.any()
+
+
+def test_a_checkpoint_keeps_it(tmp_path: Path) -> None:
+    state = fresh_state(random_gaussians(12, seed=0), seed=0)
+    assert load_checkpoint(save_checkpoint(state, tmp_path, "x"), "x").average.gaussians is None
+    for seed in range(3):
+        state.average.add(random_gaussians(12, seed=seed))
+    again = load_checkpoint(save_checkpoint(state, tmp_path, "x"), "x").average
+    assert again.count == 3 and again.gaussians is not None and state.average.gaussians is not None
+    for name, found in row_arrays(again.gaussians).items():
+        np.testing.assert_array_equal(found, row_arrays(state.average.gaussians)[name])
+
+
+def test_which_states_count() -> None:
+    schedule = Schedule(TrainConfig(average_after=0.5), 100)
+    assert [k for k in range(1, 101) if schedule.averages(k)] == list(range(60, 101, AVERAGE_EVERY))
+    assert not any(Schedule(TrainConfig(average_after=1), 100).averages(k) for k in range(1, 101))
+    assert Schedule(TrainConfig(), 17).averages(17)  # the last one always
