@@ -19,7 +19,6 @@ from engine.errors import (
     Cancelled,
     CheckpointError,
     ConfigError,
-    DamagedCheckpoint,
     DatasetError,
     ExportFailed,
     OutputError,
@@ -40,9 +39,10 @@ from engine.gaussians.materials import reflective_share
 from engine.gaussians.model import FlatGaussians
 from engine.plain_colours import PlainScene
 from engine.poses import find_poses
-from engine.render.environment_map import write_environment
+from engine.render.environment_map import write_background, write_environment
 from engine.render.jobs import trained_pixel_rad
 from engine.run_folder import (
+    BACKGROUND,
     CACHE,
     CHECKPOINTS,
     CONFIG,
@@ -55,6 +55,7 @@ from engine.run_folder import (
     TRAINING,
     VIEWS,
     found_model,
+    not_exported,
     open_photographs,
     run_scene,
 )
@@ -64,17 +65,18 @@ from engine.scene.load import photograph_folder
 from engine.scene.near import NearZones, nearest_depths
 from engine.scene.seen import SeenSpace
 from engine.scene.views_file import ViewsRecord, read_views, write_views
+from engine.shading.protocol import ShadingModel
 from engine.stages import StageClock, stage
 from engine.threads import use_threads
 from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from engine.train.checkpoint import newest_state
 from engine.train.config import TrainConfig, iteration_count
+from engine.train.exposure_changes import complaint, log_brightness
 from engine.train.fingerprint import run_fingerprint
+from engine.train.first_state import first_state
 from engine.train.floors import ScaleFloor
-from engine.train.initialise import initial_gaussians, with_first_materials
-from engine.train.shading import deferred_of
-from engine.train.state import TrainState, fresh_state
+from engine.train.shading import background_of, deferred_of, exposures_of
 from engine.train.trainer import Trainer
 from engine.train.within import make_plan, read_plan, write_plan
 from engine.versions import versions
@@ -83,8 +85,8 @@ from engine.writing import write_json
 LEAST_REFLECTIVE = 0.01
 """Share of the surface that must reflect for materials and the environment to be more than guesses."""
 
-Watcher = Callable[[int, Dataset, Tracer], None]
-"""Shown a training between two iterations: iterations done, photographs, and the tracer as it is then."""
+Watcher = Callable[[int, Dataset, Tracer, ShadingModel], None]
+"""Shown a training between two iterations: iterations done, photographs, tracer and shading as they are."""
 
 
 def reconstruct(
@@ -282,12 +284,14 @@ def _train(
     folder = output / CHECKPOINTS
     config = _planned(dataset, output, settings, threads, should_stop, clock)
     fingerprint = run_fingerprint(dataset, config)
-    state = _resume(folder, fingerprint, tell)
+    state = newest_state(folder, fingerprint, tell)
     if state is None:
-        first = initial_gaussians(dataset, config, threads=use_threads(threads))
-        if config.materials.learn:
-            first = with_first_materials(first, config.materials)
-        state = fresh_state(first, config.seed)
+        state = first_state(dataset, config, threads=use_threads(threads))
+        if not (config.exposure or config.materials.learn or dataset.has_alpha):
+            # What shines, or was cut out, looks brighter from here than from there by itself.
+            advice = complaint(log_brightness(dataset))
+            if advice is not None:
+                tell(Warned(advice))
         state.seconds = clock.seconds()
     else:
         clock.add(state.seconds)
@@ -306,7 +310,9 @@ def _train(
         scale_floor=_scale_floor(dataset, config),
         near_zones=zones if config.near_share > 0 else None,
         seen_space=seen if config.materials.clears_unseen else None,
-        onlooker=None if watch is None else lambda iteration, tracer: watch(iteration, dataset, tracer),
+        onlooker=None
+        if watch is None
+        else lambda done, tracer: watch(done, dataset, tracer, trainer.shading),
     )
     gaussians = trainer.run()
     if (deferred := deferred_of(trainer.shading)) is not None:
@@ -318,9 +324,14 @@ def _train(
                     "environment are guesses, and relighting will show it."
                 )
             )
+    if (background := background_of(trainer.shading)) is not None:
+        write_background(output / BACKGROUND, background.rgb_srgb)
     record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
     if trainer.views is not None:
         record["training_views"] = trainer.views.as_dict()
+    if (exposures := exposures_of(trainer.shading)) is not None:
+        exposures.guess_others()
+        record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
     if config.near_share > 0:
         record["taken_near"] = trainer.state.taken_near
     depths = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
@@ -350,24 +361,11 @@ def _planned(
     if settings.minutes is None:
         return config
     if not (output / PLAN).exists():
-        first = initial_gaussians(dataset, config, threads=use_threads(threads))
-        if config.materials.learn:
-            first = with_first_materials(first, config.materials)
+        first = first_state(dataset, config, threads=use_threads(threads)).gaussians
         left = 60 * settings.minutes - 2 * clock.seconds()  # the first Gaussians are made once more
         plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
         write_plan(output / PLAN, plan)
     return read_plan(output / PLAN).applied(config)
-
-
-def _resume(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None:
-    """The newest checkpoint; a damaged one is passed over for the one before."""
-    while (path := latest_checkpoint(folder)) is not None:
-        try:
-            return load_checkpoint(path, fingerprint)
-        except DamagedCheckpoint as error:
-            tell(Warned(str(error)))
-            path.unlink()
-    return None
 
 
 def _export(output: Path, config: ReconstructionConfig, threads: int, tell: Listener) -> str | None:
@@ -376,6 +374,8 @@ def _export(output: Path, config: ReconstructionConfig, threads: int, tell: List
     if not missing:
         return None
     gaussians, _ = read_gaussian_ply(output / SCENE)
+    if (left_out := not_exported(output)) is not None:
+        tell(Warned(left_out))
     options = ExportOptions(q=config.train.trace.q)
     plain = PlainScene(
         gaussians,

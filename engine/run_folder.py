@@ -9,9 +9,11 @@ import numpy as np
 from engine.config import ReconstructionConfig, read_config
 from engine.errors import ConfigError, DatasetError
 from engine.events import Listener, StageProgress, Warned
+from engine.render.environment_map import read_background
 from engine.scene import Dataset, load_scene
 from engine.scene.near import NearZones
 from engine.scene.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
+from engine.shading.learnt_background import LearntBackground
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
@@ -19,6 +21,7 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 PLAN = "plan.json"
 ENVIRONMENT = "environment.hdr"
+BACKGROUND = "background.exr"
 ON = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
 
@@ -99,6 +102,27 @@ def run_near_zones(output: Path, share: float) -> NearZones | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
         return None
     return NearZones.of(scene, depths, scene.train_indices)
+
+
+def run_background(output: Path) -> LearntBackground | None:
+    """The background that a finished run has learnt, if it has.
+
+    Raises:
+        ConfigError: ``output`` is no run, or the background is missing or damaged.
+    """
+    if read_config(output / CONFIG).train.background != "learnt":
+        return None
+    return LearntBackground.of(read_background(output / BACKGROUND))
+
+
+def not_exported(output: Path) -> str | None:
+    """A sentence on what a run has learnt that no other file carries, or None."""
+    if not (output / CONFIG).exists() or read_config(output / CONFIG).train.background != "learnt":
+        return None
+    return (
+        f"What is infinitely far away is a map of its own, {output / BACKGROUND}, and in no other file; "
+        "give it to the program that shows them as its environment, with -y up."
+    )
 
 
 def found_model(output: Path) -> Path | None:

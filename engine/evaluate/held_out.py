@@ -34,6 +34,7 @@ from engine.scene import Dataset
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer, TraceSettings
+from engine.train.shading import background_of, exposed_as
 from engine.writing import write_json
 
 SIDE = 2
@@ -103,6 +104,7 @@ def evaluate_held_out(
         run = {**run, "truth": measures.as_dict()}
     if environment is not None:
         write_png(output / LAYERS / "environment.png", shown_environment(environment.radiance_linear))
+    behind = background_of(shading)
     metrics = summarise(rows).as_dict(run)
     write_json(output / METRICS, metrics)
     write_report(
@@ -113,6 +115,7 @@ def evaluate_held_out(
         config=config,
         images=images,
         environment_linear=None if environment is None else environment.radiance_linear,
+        background_srgb=None if behind is None else behind.rgb_srgb,
     )
 
 
@@ -127,7 +130,7 @@ def _rendered(
     for index in dataset.test_indices:
         rgb, alpha, weight = dataset.view_image(int(index))
         rays = dataset.view_rays(int(index))
-        image = render_filtered(tracer, rays, colour, shading, SIDE)
+        image = render_filtered(tracer, rays, colour, exposed_as(shading, int(index)), SIDE)
         if measures is not None:
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])

@@ -80,6 +80,7 @@ def write_report(
     config: Mapping[str, object],
     images: Mapping[str, ViewImages],
     environment_linear: Float32[np.ndarray, "h w 3"] | None = None,
+    background_srgb: Float32[np.ndarray, "a b 3"] | None = None,
 ) -> None:
     """Write the report page, atomically.
 
@@ -92,6 +93,7 @@ def write_report(
         images: Pictures by view name. Views without any are in the table only; of more than 16, the 12
             worst and 4 best are embedded, and no others are asked for, so that the mapping may load lazily.
         environment_linear: The map that a scene with materials was learnt with.
+        background_srgb: The map that a scene was learnt before.
 
     Raises:
         OutputError: The page cannot be written.
@@ -106,6 +108,7 @@ def write_report(
     page = environment.get_template("report.html").render(
         _content(title, metrics, events, config, images),
         environment=None if environment_linear is None else _environment(environment_linear),
+        background=None if background_srgb is None else _map(background_srgb),
     )
     try:
         write_text(path, page)
@@ -154,13 +157,16 @@ def _content(
     }
 
 
-def _environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
+def _map(rgb_srgb: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
     """The map's picture and size."""
-    height, width = radiance_linear.shape[:2]
+    height, width = rgb_srgb.shape[:2]
+    return {"uri": data_uri(resized(rgb_srgb, MAX_SIDE_PX)), "width": width, "height": height}
+
+
+def _environment(radiance_linear: Float32[np.ndarray, "h w 3"]) -> dict[str, object]:
+    """The map's picture, size and brightest value."""
     return {
-        "uri": data_uri(resized(shown_environment(radiance_linear), MAX_SIDE_PX)),
-        "width": width,
-        "height": height,
+        **_map(shown_environment(radiance_linear)),
         "brightest": _shown(float(radiance_linear.max()), 1),
     }
 

@@ -17,9 +17,10 @@ from engine.gaussians.materials import has_materials
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.split_sum_relighting import SplitSumRelighter
 from engine.poses.find import read_record
-from engine.render.environment_map import read_environment
+from engine.render.environment_map import read_background, read_environment
 from engine.render.renderer import background_colour
 from engine.run_folder import (
+    BACKGROUND,
     CACHE,
     CONFIG,
     ENVIRONMENT,
@@ -39,11 +40,12 @@ from engine.stages import counted_stage, stage
 from engine.threads import use_threads
 from engine.trace.make import make_tracer
 from engine.train.config import TrainConfig
-from engine.train.shading import deferred_of, make_shading
+from engine.train.shading import background_of, deferred_of, exposures_of, make_shading
 from engine.versions import versions
 from engine.writing import write_json
 
 SCALES = "scales.json"
+GUESSED = "held-out views are shown as exposed as the training views beside them by name suggest"
 RAYS_ACROSS = (1, 2, 4)
 """Rays across a pixel with which smaller sizes are measured."""
 
@@ -188,7 +190,7 @@ def measure_run(
         gaussians,
         into or output,
         settings=config.train.trace,
-        shading=finished_shading(output, config.train, dataset, extent),
+        shading=finished_shading(output, config.train, dataset, extent, exposed=into is None),
         background=config.evaluate_background,
         run={
             "gaussians": len(gaussians),
@@ -200,6 +202,7 @@ def measure_run(
             "versions": versions(),
             **{key: training[key] for key in ("training_views", "taken_near") if key in training},
             **_placed(output),
+            **({"exposure": GUESSED} if config.train.exposure and into is None else {}),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
         threads=threads,
@@ -222,16 +225,28 @@ def _truth(dataset: Dataset, tell: Listener, *, needed: bool) -> Truth | None:
 
 
 def finished_shading(
-    output: Path, config: TrainConfig, dataset: Dataset, extent_world: float
+    output: Path, config: TrainConfig, dataset: Dataset, extent_world: float, *, exposed: bool = True
 ) -> ShadingModel:
-    """The shading model of a finished run, with the environment that it left.
+    """The shading model of a finished run, with what it left: environment, background and exposures.
+
+    Args:
+        output: folder of the run.
+        config: its settings.
+        dataset: photographs.
+        extent_world: of the scene.
+        exposed: whether the photographs are those of the run, whose exposures are known or guessed.
 
     Raises:
-        ConfigError: the run learnt materials and its environment is missing or damaged.
+        ConfigError: the run learnt one of these and its file is missing or damaged.
     """
     shading = make_shading(config, len(dataset.views), extent_world)
     if (deferred := deferred_of(shading)) is not None:
         deferred.light.put(read_environment(output / ENVIRONMENT))
+    if (background := background_of(shading)) is not None:
+        background.put(read_background(output / BACKGROUND))
+    if exposed and (exposures := exposures_of(shading)) is not None:
+        known = json.loads((output / TRAINING).read_text(encoding="utf-8")).get("exposures", {})
+        exposures.take([view.name for view in dataset.views], known)
     return shading
 
 

@@ -17,6 +17,7 @@ from engine.render.oversampling import render_averaged
 from engine.scene import Dataset
 from engine.shading.protocol import ShadingModel
 from engine.trace.protocol import Tracer
+from engine.train.shading import exposed_as
 
 
 def measure_scales(
@@ -46,14 +47,14 @@ def measure_scales(
     for done, index in enumerate(dataset.test_indices.tolist(), start=1):
         rgb, alpha, weight = dataset.view_image(index)
         photograph = composited(rgb, alpha, background_srgb)
-        rays = dataset.view_rays(index)
+        rays, shown = dataset.view_rays(index), exposed_as(shading, index)
         for scale in scales:
             if min(weight.shape) < scale:
                 continue
             counts = (blocks(weight[..., None], scale)[..., 0] == 1).astype(np.float32)
             small = rounded_to_8_bits(blocks(photograph, scale))
             for across in rays_across:
-                image = render_averaged(tracer, smaller(rays, scale), background_srgb, shading, across)
+                image = render_averaged(tracer, smaller(rays, scale), background_srgb, shown, across)
                 value = psnr(rounded_to_8_bits(image.rgb_srgb), small, counts)
                 if np.isfinite(value):
                     row = found.setdefault(f"1/{scale}", {})

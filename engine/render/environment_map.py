@@ -1,10 +1,14 @@
-"""Environment maps in files: equirectangular images of linear radiance, HDR or EXR."""
+"""Environment maps in files: equirectangular images of linear radiance, HDR or EXR.
+
+A learnt background, whose values are display values, is such a file too, so that other programs can use it.
+"""
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
+from engine.colour import linear_to_srgb, srgb_to_linear
 from engine.errors import ConfigError, DatasetError
 from engine.render.images import read_image, write_exr, write_rgbe
 
@@ -45,3 +49,21 @@ def write_environment(path: Path, radiance_linear: Float32[np.ndarray, "h w 3"])
         write_exr(path, {name: radiance_linear[..., k] for k, name in enumerate("RGB")})
     else:
         raise ConfigError(f"{path}: an environment is written as .hdr or .exr.")
+
+
+def write_background(path: Path, rgb_srgb: Float32[np.ndarray, "h w 3"]) -> None:
+    """Write a learnt background, display values, as a map of linear radiance.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_environment(path, srgb_to_linear(rgb_srgb).astype(np.float32))
+
+
+def read_background(path: Path) -> Float32[np.ndarray, "h w 3"]:
+    """The display values of a learnt background.
+
+    Raises:
+        ConfigError: the file is no such map.
+    """
+    return linear_to_srgb(read_environment(path)).astype(np.float32)

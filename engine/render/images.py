@@ -18,6 +18,8 @@ from engine.writing import replacing
 
 _AS_STORED = "oiio:UnassociatedAlpha"
 """Keeps OpenImageIO from multiplying or dividing colours by alpha on its own."""
+_NO_TIME = "1970:01:01 00:00:00"
+"""Else OpenImageIO notes the time in an EXR, and the same picture would have other bytes each time."""
 
 
 def exr_layers(
@@ -102,6 +104,7 @@ def write_exr(path: Path, channels: Mapping[str, Float32[np.ndarray, "h w"]], *,
     if half:
         spec.channelformats = tuple(oiio.TypeDesc(oiio.FLOAT if name == "Z" else oiio.HALF) for name in names)
     spec.attribute("compression", "zip")
+    spec.attribute("DateTime", _NO_TIME)
     if "Z" in names:
         spec.z_channel = names.index("Z")
     if "A" in names:

@@ -18,6 +18,7 @@ from engine.render.oversampling import rays_across, render_averaged
 from engine.render.paths import Turntable, fit_turntable
 from engine.scene import Camera, PosedView, Viewpoints
 from engine.shading.plain import PLAIN
+from engine.shading.protocol import ShadingModel
 from engine.trace.protocol import Tracer
 
 DEFAULT_FOV_Y_DEGREES = 50.0
@@ -136,6 +137,7 @@ def scene_paint(
     *,
     transparent: bool = False,
     trained_rad: float = 0.0,
+    shading: ShadingModel = PLAIN,
 ) -> Paint:
     """What renders a shot of a scene to a file.
 
@@ -148,11 +150,12 @@ def scene_paint(
         transparent: PNG get straight colours and alpha; the background should be black.
         trained_rad: angle of a pixel of the training views; larger pixels get several rays, so that what is
             smaller than they neither sparkles nor breaks up. 0 where it is not known: one ray each.
+        shading: what develops the rays: a learnt background, say.
     """
 
     def paint(shot: Shot, path: Path, _part: Callable[[float], None]) -> None:
         rays = shot.rays()
-        image = render_averaged(tracer, rays, background, PLAIN, rays_across(rays, trained_rad))
+        image = render_averaged(tracer, rays, background, shading, rays_across(rays, trained_rad))
         if path.suffix.lower() == ".exr":
             layers = exr_layers(
                 image.rgb_srgb, alpha=image.alpha, depth=image.depth, normals_world=image.normal_world

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from engine.errors import DatasetError
 from engine.scene.binary import check_binary_model
@@ -31,12 +31,19 @@ TOLD_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """A registered image of the model: its name, its camera's id and its pose."""
+    """A registered image of the model: its name, its camera's id, its pose, and the points it shows.
+
+    Attributes:
+        observed_px: where it shows points, at the size COLMAP worked with.
+        observed_points: COLMAP's numbers of these.
+    """
 
     name: str
     camera_id: int
     rotation_cam_from_world: Float64[np.ndarray, "3 3"]
     translation_cam_from_world: Float64[np.ndarray, "3"]
+    observed_px: Float64[np.ndarray, "k 2"]
+    observed_points: Int64[np.ndarray, " k"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +193,12 @@ def _posed_images(reconstruction: Any, folder: Path, warnings: list[str]) -> tup
             raise DatasetError(
                 f"The pose of {image.name} in {folder} is not a finite rigid motion; run COLMAP again."
             )
-        images.append(PosedImage(image.name, int(image.camera_id), matrix[:, :3].copy(), matrix[:, 3].copy()))
+        shown = image.get_observation_points2D()
+        observed_px = np.array([point.xy for point in shown], np.float64).reshape(-1, 2)
+        # Beyond what a signed number holds lies only COLMAP's mark for none.
+        observed_points = np.array([point.point3D_id for point in shown], np.uint64).astype(np.int64)
+        pose = matrix[:, :3].copy(), matrix[:, 3].copy()
+        images.append(PosedImage(image.name, int(image.camera_id), *pose, observed_px, observed_points))
     if unposed:
         warnings.append(f"{unposed} images of the model in {folder} have no pose and are left out.")
     return tuple(sorted(images, key=lambda image: image.name))

@@ -21,7 +21,7 @@ from engine.scene.directions import (
     rows_at_once,
 )
 from engine.scene.load import load_scene
-from engine.scene.model import SceneModel, SparsePoints, View, Viewpoints
+from engine.scene.model import Observations, SceneModel, SparsePoints, View, Viewpoints
 from engine.scene.split import measured_views, split_views
 from engine.scene.views_file import ViewsRecord, views_record
 
@@ -39,6 +39,7 @@ class Dataset:
         views: all views, sorted by name.
         cameras: cameras at the working size.
         points: sparse point cloud.
+        observations: of the points.
         train_indices: views to train on.
         test_indices: views held out.
         record: what the photographs and their model are, to be compared with those of another time.
@@ -66,6 +67,7 @@ class Dataset:
         self.views: tuple[View, ...] = scene.views
         self.cameras: tuple[Camera, ...] = scene.cameras
         self.points: SparsePoints = scene.points
+        self.observations: Observations = scene.observations
         self.warnings: list[str] = [*scene.warnings, *cache.warnings]
         self.train_indices: Int64[np.ndarray, " train"]
         self.test_indices: Int64[np.ndarray, " test"]

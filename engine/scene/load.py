@@ -4,12 +4,15 @@ import os
 import unicodedata
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float64
+
 from engine.errors import ConfigError, DatasetError
 from engine.scene.cameras import Camera
 from engine.scene.colmap import ColmapModel, PosedImage, read_colmap_model
 from engine.scene.image_info import ImageInfo
 from engine.scene.images import read_image_info
-from engine.scene.model import SceneModel, View
+from engine.scene.model import Observations, SceneModel, View
 from engine.scene.views_file import capped_size
 
 MIN_VIEWS = 3
@@ -85,6 +88,7 @@ def load_scene(
 
     views: list[View] = []
     infos: list[ImageInfo] = []
+    observed_px: list[Float64[np.ndarray, "k 2"]] = []
     camera_indices: dict[Camera, int] = {}
     for image, path, mask in zip(model.images, paths, masks, strict=True):
         info = read_image_info(path)
@@ -92,6 +96,7 @@ def load_scene(
         _check_size(original, info, image, path)
         width, height = capped_size(info.width_px, info.height_px, max_side)
         camera = original.scaled_to(width, height)
+        observed_px.append(image.observed_px * (width / original.width_px, height / original.height_px))
         views.append(
             View(
                 name=image.name,
@@ -112,6 +117,11 @@ def load_scene(
         model_folder=model.folder,
         image_infos=tuple(infos),
         points=model.points,
+        observations=Observations(
+            np.repeat(np.arange(len(views)), [len(shown) for shown in observed_px]),
+            np.concatenate([image.observed_points for image in model.images]),
+            np.concatenate(observed_px),
+        ),
         warnings=tuple(warnings),
     )
 

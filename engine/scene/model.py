@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 
 from engine.scene.cameras import Camera
 from engine.scene.image_info import ImageInfo
@@ -70,6 +70,24 @@ class SparsePoints:
 
 
 @dataclass(frozen=True, eq=False)
+class Observations:
+    """Which photograph shows which sparse point, and where.
+
+    Attributes:
+        view: index of the view.
+        point: a number that all observations of one point share.
+        xy_px: where in the picture, at its working size.
+    """
+
+    view: Int64[np.ndarray, " k"]
+    point: Int64[np.ndarray, " k"]
+    xy_px: Float64[np.ndarray, "k 2"]
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+
+@dataclass(frozen=True, eq=False)
 class Viewpoints:
     """Where photographs were taken from, and through which lenses.
 
@@ -92,6 +110,7 @@ class SceneModel(Viewpoints):
         model_folder: folder of the COLMAP model in use.
         image_infos: headers of the photographs, in the order of ``views``.
         points: sparse point cloud.
+        observations: of the points.
         warnings: one sentence each on what is odd but usable.
     """
 
@@ -100,6 +119,7 @@ class SceneModel(Viewpoints):
     model_folder: Path
     image_infos: tuple[ImageInfo, ...]
     points: SparsePoints
+    observations: Observations
     warnings: tuple[str, ...]
 
 

@@ -3,10 +3,12 @@
 A phone sets its exposure anew for every photograph. Without a model of that, Gaussians learn to look
 different from where each photograph was taken. The scene keeps the exposure that is the mean of all.
 
-Not done: held-out views are measured as they are, nothing is fitted to them.
+Nothing is fitted to views that were not trained on. Where photographs that follow each other by name are
+exposed alike, the exposure of one that was held out is guessed from those beside it.
 """
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -17,14 +19,15 @@ from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
 from engine.trace.protocol import GaussianGradients, Tracer
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+LEAST_VIEWS = 4
+"""From fewer nothing is guessed."""
 _STATE = ("log_gains", "offsets", "first", "second", "steps")
 
 
 class Exposures:
     """Of each view and channel: shown colour = exp(log_gain) * developed colour + offset.
 
-    Follows :class:`engine.shading.protocol.ShadingModel`. Views that were not trained on have the mean
-    exposure.
+    Follows :class:`engine.shading.protocol.ShadingModel`. What is seen by no view has the mean exposure.
 
     Args:
         views: how many there are, whether they are trained on or not.
@@ -50,6 +53,7 @@ class Exposures:
         self.steps: Int64[np.ndarray, " v"] = np.zeros(views, np.int64)
         self._rate = rate
         self._decay = decay
+        self._shown_as: int | None = None
         self.inner = inner
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
@@ -61,13 +65,41 @@ class Exposures:
         self.inner.settle(gaussians, tracer, progress=progress)
 
     def develop(self, sight: Sight) -> Developed:
-        """Colours as the rays' views show them; exposures say nothing about other views."""
+        """Colours as the rays' views show them; others have the mean exposure, or that of one view."""
         inner = self.inner.develop(sight)
-        if sight.view is None:
+        view = sight.view if self._shown_as is None else self._shown_as
+        if view is None:
             return inner
-        gains, offsets = np.exp(self.log_gains)[sight.view], self.offsets[sight.view]
+        gains, offsets = np.exp(self.log_gains)[view], self.offsets[view]
         alpha = np.float32(1) - inner.transmittance
-        return Developed(gains * inner.rgb_srgb + offsets * alpha[:, None], inner.transmittance, inner)
+        rgb = gains * inner.rgb_srgb + offsets * alpha[:, None]
+        return Developed(rgb, inner.transmittance, inner, inner.layers)
+
+    def shown_as(self, view: int) -> "Exposures":
+        """The same model, which exposes everything as a view is; it shares the arrays and is not trained."""
+        other = copy.copy(self)
+        other._shown_as = view
+        return other
+
+    def guess_others(self) -> None:
+        """Give views that were not trained on the exposures that those beside them, by number, suggest.
+
+        The mean of the trained views before and after, by how near they are, is taken as far as such means
+        tell the exposures of trained views themselves: not at all where each photograph is exposed anew.
+        """
+        trained = np.flatnonzero(self.steps > 0)
+        others = np.flatnonzero(self.steps == 0)
+        if len(trained) < LEAST_VIEWS:
+            return
+        for values in (self.log_gains, self.offsets):
+            known = values[trained].astype(np.float64)
+            places, inner = trained.astype(np.float64), np.arange(1, len(trained) - 1)
+            share = (places[inner] - places[inner - 1]) / (places[inner + 1] - places[inner - 1])
+            beside = known[inner - 1] + share[:, None] * (known[inner + 1] - known[inner - 1])
+            scale = float((beside**2).sum())
+            trust = min(max(float((beside * known[inner]).sum()) / scale, 0.0), 1.0) if scale > 0 else 0.0
+            for channel in range(3):
+                values[others, channel] = trust * np.interp(others, trained, known[:, channel])
 
     def reverse(
         self,
@@ -112,6 +144,18 @@ class Exposures:
         seen = self.steps > 0
         for values in (self.log_gains, self.offsets):
             values[seen] -= values[seen].mean(axis=0, dtype=np.float64).astype(np.float32)
+
+    def as_dict(self, names: Sequence[str]) -> dict[str, dict[str, list[float]]]:
+        """JSON-ready, by the names of all views; :meth:`take` takes it back."""
+        rows = zip(names, self.log_gains.tolist(), self.offsets.tolist(), strict=True)
+        return {name: {"log_gains": gains, "offsets": offsets} for name, gains, offsets in rows}
+
+    def take(self, names: Sequence[str], known: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
+        """Take the exposures of the views that are known by their names."""
+        for number, name in enumerate(names):
+            if name in known:
+                self.log_gains[number] = known[name]["log_gains"]
+                self.offsets[number] = known[name]["offsets"]
 
     def state(self) -> dict[str, np.ndarray]:
         """Gains, offsets and moments, and what the model inside keeps."""

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from engine.shading.environment_levels import LightLevels, prefilter, resampled, solid_angles
+from engine.shading.map_steps import adam_change, unevenness
 from engine.shading.material_settings import MaterialSettings
 
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12
 FIRST_RADIANCE = 0.5
 _DARKEST, _BRIGHTEST = np.log(1e-4), np.log(1e4)
 _STATE = ("log_radiance", "first", "second", "sums", "steps")
@@ -76,14 +76,10 @@ class LearntLight:
         gradient = self._prefilter.transposed(self.sums) * self.radiance_linear + self._priors()
         self.sums[:] = 0
         count = self.steps[0] // self._settings.environment_every
-        self.first = (BETA1 * self.first + (1 - BETA1) * gradient).astype(np.float32)
-        self.second = (BETA2 * self.second + (1 - BETA2) * gradient**2).astype(np.float32)
-        mean = self.first / (1 - BETA1**count)
-        size = np.sqrt(self.second / (1 - BETA2**count)) + EPSILON
+        self.first, self.second, change = adam_change(self.first, self.second, gradient, int(count))
         brightest = _BRIGHTEST if self._settings.hdr and self._settings.recipe != "seed" else 0.0
-        self.log_radiance = np.clip(self.log_radiance - rate * mean / size, _DARKEST, brightest).astype(
-            np.float32
-        )
+        radiance = np.clip(self.log_radiance - rate * change, _DARKEST, brightest)
+        self.log_radiance = radiance.astype(np.float32)
         self._levels = None
 
     def _priors(self) -> Float64[np.ndarray, "h w 3"]:
@@ -91,10 +87,8 @@ class LearntLight:
         x = self.log_radiance.astype(np.float64)
         angles = solid_angles(len(x))[:, None, None] / (4 * np.pi)
         white = x - x.mean(axis=2, keepdims=True)
-        padded = np.pad(x, ((1, 1), (0, 0), (0, 0)), mode="edge")
-        around = np.roll(x, 1, axis=1) + np.roll(x, -1, axis=1) + padded[:-2] + padded[2:]
         weights = self._settings
-        return angles * (weights.white_weight * white + weights.even_weight * (4 * x - around))
+        return angles * (weights.white_weight * white + weights.even_weight * unevenness(x))
 
     def state(self) -> dict[str, np.ndarray]:
         """Radiance, moments and sums."""

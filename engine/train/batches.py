@@ -182,10 +182,14 @@ class BatchSource:
         config: sizes and shares.
 
     Raises:
-        ConfigError: the SSIM term would have no patch.
+        ConfigError: the SSIM term would have no patch, or a background is to be learnt where none is shown.
     """
 
     def __init__(self, dataset: TrainingData, config: TrainConfig) -> None:
+        if config.background == "learnt" and dataset.has_alpha:
+            raise ConfigError(
+                "These photographs have alpha, so that they show no background; leave background=learnt out."
+            )
         self._dataset = dataset
         self._config = config
         self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))

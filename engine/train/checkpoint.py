@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from engine.errors import CheckpointError, DamagedCheckpoint
+from engine.events import Listener, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.rows import from_row_arrays, row_arrays
 from engine.train.averaging import RunningMean
@@ -119,6 +120,21 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         taken_near=meta["taken_near"],
         average=RunningMean(mean, meta["averaged"]),
     )
+
+
+def newest_state(folder: Path, fingerprint: str, tell: Listener) -> TrainState | None:
+    """The newest checkpoint, if there is any; a damaged one is passed over for the one before.
+
+    Raises:
+        CheckpointError: it belongs to another configuration or other photographs.
+    """
+    while (path := latest_checkpoint(folder)) is not None:
+        try:
+            return load_checkpoint(path, fingerprint)
+        except DamagedCheckpoint as error:
+            tell(Warned(str(error)))
+            path.unlink()
+    return None
 
 
 def save_best(gaussians: FlatGaussians, shading: Mapping[str, np.ndarray], folder: Path) -> None:

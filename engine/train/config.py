@@ -47,6 +47,7 @@ class LearningRates(_Frozen):
     colour: float = Field(1e-2, ge=0, description="of the display colour; harmonics get it over C0")
     sh_rest_ratio: float = Field(0.05, ge=0, description="of the constant harmonic's step")
     exposure: float = Field(2e-3, ge=0, description="of the views' log gains and offsets, where learnt")
+    background: float = Field(0.01, ge=0, description="of a learnt background's display colours")
     albedo: float = Field(0.03, ge=0, description="of the logit, as for the two below")
     metallic: float = Field(0.03, ge=0)
     roughness: float = Field(0.03, ge=0)
@@ -151,8 +152,16 @@ class TrainConfig(_Frozen):
         True, description="where the sparse model has fewer points, lift pixels of the photographs"
     )
     initial_opacity: float = Field(0.5, gt=0, lt=1)
-    background: Literal["auto", "black", "white", "random"] = Field(
-        "auto", description="behind everything; auto is random for photographs with alpha, else black"
+    background: Literal["auto", "black", "white", "random", "learnt"] = Field(
+        "auto",
+        description="behind everything; auto is random for photographs with alpha, else black; learnt is a "
+        "map of what is infinitely far away, such as the sky",
+    )
+    background_height: int = Field(
+        256, ge=16, le=2048, multiple_of=2, description="texels of a learnt background from up to down"
+    )
+    background_even: float = Field(
+        0.1, ge=0, description="weight of the differences between its neighbouring texels"
     )
     exposure: bool = Field(
         False, description="learn a gain and an offset for each channel of each training view"
@@ -204,12 +213,17 @@ class TrainConfig(_Frozen):
         return value
 
     @model_validator(mode="after")
-    def _has_neighbouring_rays(self) -> "TrainConfig":
+    def _fits_together(self) -> "TrainConfig":
         alone = self.window_rays == 1 or self.loss.ssim > 0
         if self.loss.depth_normal > 0 and not self.materials.learn and alone:
             raise ValueError(
                 "loss.depth_normal compares neighbouring rays of windows: set window_rays to 64 and "
                 "loss.ssim to 0"
+            )
+        if self.background == "learnt" and self.materials.learn:
+            raise ValueError(
+                "background=learnt is for scenes without materials, which learn the light around them: leave "
+                "one of the two out"
             )
         return self
 

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
 from engine.scene import Dataset
+from engine.train.first_background import FirstBackground
 
 GUESSES = 6
 """Depths tried for a pixel: those of the nearest points in the image."""
@@ -27,6 +28,10 @@ STEP_PX = 2
 OFFSETS_PX = STEP_PX * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]], np.int64)
 MAX_COST = 0.06
 """Mean difference of colour, in display values, above which no guess counts as right."""
+AS_WELL = 0.005
+"""A pixel that matches infinitely far away about as well as at any guess shows the sky."""
+INFINITY = 1e6
+"""So many times the largest depth."""
 LEVEL_WEIGHT = 0.3
 """Weight of a difference in brightness against one in texture."""
 LEAST_COSINE = 0.5
@@ -55,12 +60,17 @@ class _Patches:
 
 
 def dense_points(
-    dataset: Dataset, count: int, rng: np.random.Generator, *, threads: int = 1
+    dataset: Dataset,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    threads: int = 1,
+    behind: FirstBackground | None = None,
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """About ``count`` points or fewer, and their display colours, beside those of the sparse model.
 
-    The sparse model must have points. Masked and transparent pixels give none. ``threads`` work on the views
-    side by side, which changes no point.
+    The sparse model must have points. Masked and transparent pixels, and those that show what is ``behind``
+    everything, give none. ``threads`` work on the views side by side, which changes no point.
     """
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
@@ -76,7 +86,7 @@ def dense_points(
             job: tuple[int, int, np.random.Generator], known: np.ndarray = known
         ) -> tuple[np.ndarray, ...]:
             index, samples, generator = job
-            return _lift(dataset, index, samples, known, neighbours[index], generator)
+            return _lift(dataset, index, samples, known, neighbours[index], generator, behind)
 
         with ThreadPoolExecutor(threads) as pool:
             found, seen = map(np.concatenate, zip(*pool.map(lift, jobs), strict=True))
@@ -122,6 +132,7 @@ def _lift(
     points: Float64[np.ndarray, "k 3"],
     neighbours: list[int],
     rng: np.random.Generator,
+    behind: FirstBackground | None,
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """Points for random pixels of one view."""
     nothing = np.empty((0, 3), np.float32)
@@ -139,6 +150,10 @@ def _lift(
     best = np.argmin(costs, axis=1)
     rows = np.arange(len(best))
     good = costs[rows, best] < MAX_COST
+    if behind is not None:
+        at_infinity = _cost(dataset, patches, np.full(len(rows), INFINITY * guesses.max()), neighbours)
+        as_well = at_infinity < costs[rows, best] + AS_WELL
+        good &= ~(as_well & behind.may_show(patches.directions_world[:, 0]))
     distance = guesses[rows, best] * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
     return xyz[good].astype(np.float32), patches.rgb_srgb[good, 0]

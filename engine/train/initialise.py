@@ -17,6 +17,7 @@ from engine.scene import Dataset
 from engine.shading.material_settings import MaterialSettings
 from engine.train.config import TrainConfig, most_gaussians
 from engine.train.dense_points import dense_points
+from engine.train.first_background import FirstBackground
 
 MIN_POINTS = 50
 """Fewer sparse points than this are no use to begin from; random ones are taken."""
@@ -27,8 +28,13 @@ FARTHEST = 50.0
 """Points farther from the cameras than this many extents are matching errors."""
 
 
-def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> FlatGaussians:
-    """The first Gaussians: on the sparse points, or on random rays where there are too few of them."""
+def initial_gaussians(
+    dataset: Dataset, config: TrainConfig, *, threads: int = 1, behind: FirstBackground | None = None
+) -> FlatGaussians:
+    """The first Gaussians: on the sparse points, or on random rays where there are too few of them.
+
+    Pixels that show what is ``behind`` everything are not lifted.
+    """
     rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
     points = dataset.points
     limit = min(config.initial_points, most_gaussians(config, dataset.train_pixel_count))
@@ -36,7 +42,7 @@ def initial_gaussians(dataset: Dataset, config: TrainConfig, *, threads: int = 1
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
         xyz, rgb = points.xyz_world, points.rgb_srgb
         if config.lift_pixels and len(xyz) < limit:
-            more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng, threads=threads)
+            more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng, threads=threads, behind=behind)
             xyz, rgb = np.concatenate([xyz, more_xyz]), np.concatenate([rgb, more_rgb])
         return from_points(
             xyz,

@@ -34,7 +34,7 @@ MOST_LEFT_OUT = 0.25
 
 @dataclass(frozen=True, eq=False)
 class ViewFits:
-    """How well views are rendered, each on a fixed grid of its pixels, as new views are.
+    """How well views are rendered, each on a fixed grid of its pixels.
 
     Attributes:
         indices: the views.
@@ -62,7 +62,7 @@ def view_fits(
         rays = dataset.rays(view, y, x)
         rgb, alpha, weight = dataset.pixels(view, y, x)
         background = still_background(config)
-        developed = shading.develop(Sight(rays, tracer.trace(rays), tracer))
+        developed = shading.develop(Sight(rays, tracer.trace(rays), tracer, view))
         render = np.clip(developed.over(background), 0, 1)
         target = composited(rgb, alpha, background)
         shape, counts = (len(some), -1, 3), (weight > 0).astype(np.float32)

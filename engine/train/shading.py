@@ -3,6 +3,7 @@
 from engine.shading.deferred import Deferred
 from engine.shading.exposure import Exposures
 from engine.shading.flattening import Flattening
+from engine.shading.learnt_background import LearntBackground
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import ShadingModel
 from engine.train.config import TrainConfig
@@ -15,6 +16,14 @@ def make_shading(config: TrainConfig, views: int, extent_world: float) -> Shadin
         inner = make_deferred(config, extent_world)
     elif config.loss.depth_normal > 0:
         inner = Flattening(config.loss.depth_normal, window_rays=config.window_rays)
+    if config.background == "learnt":
+        inner = LearntBackground(
+            config.background_height,
+            rate=config.rates.background,
+            decay=config.rates.decay,
+            even_weight=config.background_even,
+            inner=inner,
+        )
     if config.exposure:
         return Exposures(views, rate=config.rates.exposure, decay=config.rates.decay, inner=inner)
     return inner
@@ -23,6 +32,24 @@ def make_shading(config: TrainConfig, views: int, extent_world: float) -> Shadin
 def make_deferred(config: TrainConfig, extent_world: float) -> Deferred:
     """The model of materials, with an environment of which nothing is known yet."""
     return Deferred(config.materials, extent_world=extent_world, window_rays=config.window_rays)
+
+
+def exposures_of(shading: ShadingModel) -> Exposures | None:
+    """The exposures that a shading model learns."""
+    return shading if isinstance(shading, Exposures) else None
+
+
+def exposed_as(shading: ShadingModel, view: int) -> ShadingModel:
+    """What develops a view of the dataset, trained on or held out, as exposed as that is known to be."""
+    exposures = exposures_of(shading)
+    return shading if exposures is None else exposures.shown_as(view)
+
+
+def background_of(shading: ShadingModel) -> LearntBackground | None:
+    """The learnt background that a shading model is, or has inside."""
+    if isinstance(shading, Exposures):
+        return background_of(shading.inner)
+    return shading if isinstance(shading, LearntBackground) else None
 
 
 def deferred_of(shading: ShadingModel) -> Deferred | None:

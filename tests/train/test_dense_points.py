@@ -1,15 +1,19 @@
 """Pixels lifted to points: they lie on the surfaces that the photographs show, in the colours shown there."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from engine.render.images import write_png
 from engine.scene import Dataset
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.scene.generated.arrangement import still_life
 from engine.train.dense_points import dense_points
+from engine.train.first_background import first_background
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +78,26 @@ def test_threads_change_nothing(dataset: Dataset) -> None:
     assert len(one[0]) > 300
     for a, b in zip(one, three, strict=True):
         assert np.array_equal(a, b)
+
+
+def test_what_is_infinitely_far_away_is_not_lifted(dataset: Dataset, tmp_path: Path) -> None:
+    """Photographs that show the same colour in a direction from wherever they are: all sky."""
+    shutil.copytree(dataset.root, tmp_path / "scene")
+    for index, view in enumerate(dataset.views):
+        ways = dataset.view_rays(index).directions_world.astype(np.float64)
+        colours = 0.5 + 0.3 * np.sin(3 * ways)
+        write_png(tmp_path / "scene" / "images" / view.name, colours.astype(np.float32))
+    under_sky = Dataset.open(tmp_path / "scene", tmp_path / "cache")
+    # As if up were where the cameras look, so that nearly all that they see is above the horizon.
+    ahead = np.mean([view.rotation_cam_from_world[2] for view in dataset.views], axis=0)
+    over = replace(first_background(under_sky), up_world=ahead)
+    rng = np.random.default_rng
+    lifted = [len(dense_points(under_sky, 500, rng(0), behind=behind)[0]) for behind in (None, over)]
+    # What the neighbouring views do not show at infinity, as they look inwards, may still be near.
+    assert lifted[0] == 500 and lifted[1] < 400
+
+
+def test_what_is_near_is_lifted_although_a_background_is_learnt(dataset: Dataset) -> None:
+    plain, _ = dense_points(dataset, 1000, np.random.default_rng(0))
+    before, _ = dense_points(dataset, 1000, np.random.default_rng(0), behind=first_background(dataset))
+    assert len(before) > 0.9 * len(plain)

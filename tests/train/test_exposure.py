@@ -10,12 +10,14 @@ from flat_world import FlatWorld, small_config
 from engine.errors import Cancelled
 from engine.events import Event, HeldOutMeasured
 from engine.rays import RayBatch
+from engine.scene.model import Observations
 from engine.shading.exposure import Exposures
 from engine.shading.protocol import Sight
 from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceResult
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig
+from engine.train.exposure_changes import complaint, log_brightness
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 
@@ -176,6 +178,59 @@ def test_a_resumed_run_has_the_same_exposures(tmp_path: Path) -> None:
     for name, values in whole.state.shading.items():
         assert values.tobytes() == parts.state.shading[name].tobytes(), name
     assert whole.state.gaussians.sh.tobytes() == parts.state.gaussians.sh.tobytes()
+
+
+def test_a_held_out_view_is_guessed_from_those_beside_it_where_they_tell() -> None:
+    places = np.arange(33)
+    smooth, anew = np.sin(places / 5)[:, None] * np.ones(3), np.random.default_rng(0).normal(size=(33, 3))
+    for known, told in ((smooth, True), (anew, False)):
+        exposures = Exposures(33, rate=0.02)
+        trained = places % 8 != 0
+        exposures.log_gains[trained], exposures.steps[trained] = known[trained], 1
+        exposures.guess_others()
+        np.testing.assert_array_equal(exposures.log_gains[trained], known[trained].astype(np.float32))
+        off = np.abs(exposures.log_gains[~trained] - known[~trained])
+        if told:
+            assert off[1:-1].max() < 0.05
+        else:
+            assert np.abs(exposures.log_gains[~trained]).max() < 0.4 * np.abs(known).max()
+        assert (exposures.offsets == 0).all()
+
+
+def test_a_view_is_shown_as_exposed_when_it_is_named() -> None:
+    rng = np.random.default_rng(0)
+    exposures = made_exposures(3, rng)
+    views = np.array([1, 1, 1])
+    seen = sight(views, rng.random((3, 3), dtype=np.float32), rng.random(3, dtype=np.float32))
+    shown = exposures.shown_as(1).develop(replace(seen, view=None)).rgb_srgb
+    np.testing.assert_array_equal(shown, exposures.develop(seen).rgb_srgb)
+    again = Exposures(3, rate=0.02)
+    again.take(["a", "b", "c"], {**exposures.as_dict(["a", "b", "x"]), "d": {}})
+    np.testing.assert_array_equal(again.log_gains[:2], exposures.log_gains[:2])
+    assert (again.log_gains[2] == 0).all()
+
+
+def test_changing_brightness_is_noticed() -> None:
+    world = UnevenWorld()
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1, 1, (400, 2))
+    parts = []
+    for index, origin in enumerate(world.origins):
+        # A point of the plane in the pixels of a view, two units before it.
+        xy = (points - origin[:2]) / 2 * world.side_px + world.side_px / 2
+        inside = np.flatnonzero(((xy > 0) & (xy < world.side_px)).all(axis=1))
+        parts.append((np.full(len(inside), index), inside, xy[inside]))
+    world.observations = Observations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    found = log_brightness(world)
+    assert np.isnan(found[world.test_indices]).all()
+    true = world.log_gains[world.train_indices]
+    np.testing.assert_allclose(found[world.train_indices], true - np.median(true), atol=0.08)
+    text = complaint(found)
+    assert text is not None and "exposure=true" in text and "1.9 times" in text
+    world.log_gains[:] = 0
+    assert complaint(log_brightness(world)) is None
+    world.observations = Observations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
+    assert complaint(log_brightness(world)) is None
 
 
 def test_without_the_setting_nothing_is_learnt(tmp_path: Path) -> None:

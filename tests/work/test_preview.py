@@ -16,6 +16,8 @@ from engine.pipeline import Watcher, reconstruct
 from engine.rays import ImageRays, RayBatch
 from engine.scene import Dataset
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from engine.shading.plain import PLAIN
+from engine.shading.protocol import ShadingModel
 from engine.trace.protocol import Tracer
 from workers.work import preview
 from workers.work.kinds.options import resolve_reconstruction
@@ -60,9 +62,9 @@ def config() -> ReconstructionConfig:
 def watched(clock: Clock, previews: Previews, seconds: float) -> Watcher:
     """Every iteration takes so many seconds."""
 
-    def watch(iteration: int, dataset: Dataset, tracer: Tracer) -> None:
+    def watch(iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel) -> None:
         clock.now += seconds
-        previews(iteration, dataset, tracer)
+        previews(iteration, dataset, tracer, shading)
 
     return watch
 
@@ -102,7 +104,7 @@ def test_pictures_become_smaller_where_they_take_long(
     def rays(view: np.ndarray, _y: np.ndarray, _x: np.ndarray) -> RayBatch:
         return RayBatch(np.zeros((1, 3), np.float32), np.zeros((len(view), 3), np.float32))
 
-    def render(_tracer: None, image: ImageRays, _background: np.ndarray) -> Any:
+    def render(_tracer: None, image: ImageRays, _background: np.ndarray, _shading: object) -> Any:
         clock.now += seconds_per_ray * image.height_px * image.width_px
         return SimpleNamespace(rgb_srgb=image.directions_world)
 
@@ -111,7 +113,7 @@ def test_pictures_become_smaller_where_they_take_long(
     dataset = SimpleNamespace(views=(view,), test_indices=np.array([0]), rays=rays, near_world=0.0)
     draw: Callable[..., None] = Previews(tmp_path, "black", lambda _event: None)
     for iteration in range(4):
-        draw(iteration, dataset, None)
+        draw(iteration, dataset, None, PLAIN)
         clock.now += 1000
     with Image.open(tmp_path / preview.FILE) as picture:
         width, height = picture.size

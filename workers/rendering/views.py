@@ -24,9 +24,11 @@ from engine.render.names import names_by_number
 from engine.render.path_file import read_camera_path
 from engine.render.renderer import background_colour
 from engine.render.series import Kept, render_film, render_series
-from engine.run_folder import CONFIG, SCENE, is_run, run_viewpoints
+from engine.run_folder import CONFIG, SCENE, is_run, run_background, run_viewpoints
 from engine.scene.model import Viewpoints
 from engine.scene.views_file import SplitViewpoints
+from engine.shading.learnt_background import LearntBackground
+from engine.shading.plain import PLAIN
 from engine.stages import counted_stage
 from engine.trace.make import make_tracer
 from engine.trace.protocol import TraceSettings
@@ -36,6 +38,10 @@ from workers.telling.losses import open_scene
 
 ANY_SIDE_PX = 1 << 30
 """A cap that no photograph reaches."""
+STAGE_LACKS_BACKGROUND = (
+    "The background that was learnt is left out on a stage; to show it, and to be lit by it, name the run's "
+    "background.exr as the stage's environment."
+)
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,7 @@ class Source:
     viewpoints: SplitViewpoints | None = None
     max_side: int | None = None
     trained_rad: float = 0.0
+    learnt: LearntBackground | None = None
 
     @property
     def extent_world(self) -> float:
@@ -129,11 +136,14 @@ def render_files(
     check_one_file(output, 1 if options.get("preview") else len(shots))
     transparent = options["background"] == "transparent"
     background = background_colour("black" if transparent else options["background"] or source.background)
+    learnt = None if options["background"] else source.learnt  # another colour was asked for, or alpha
     exr = options["exr"] or (stage is not None and stage.stage.integrator.layers)
     series = Series(output, shots, fps, exr, keeping)
     what = source.gaussians, source.settings, background, transparent, cameras, stage and stage.identity()
     of_views = None if cameras is not None else (source.viewpoints, source.near_world)
     if stage is not None:
+        if learnt is not None and stage.stage.environment is None:
+            say(STAGE_LACKS_BACKGROUND)
         place = StagePlace(
             source.gaussians, source.settings, _full_size(options), stage.folder,
             lambda path: open_scene(path, say), background, options["threads"], say,
@@ -143,10 +153,13 @@ def render_files(
             return preview_stage(set_up(), shots[0], output, listener)
         kept = series.kept(identity_of(*what, of_views, place.photographs))
         return series.render(set_up().paint, kept, listener)
-    kept = series.kept(identity_of(*what, of_views, source.trained_rad))
+    shown = None if learnt is None else learnt.rgb_srgb
+    kept = series.kept(identity_of(*what, of_views, source.trained_rad, shown))
     tracer = make_tracer(source.settings, threads=options["threads"], build_quality=2)
     tracer.build(source.gaussians)
-    paint = scene_paint(tracer, background, transparent=transparent, trained_rad=source.trained_rad)
+    paint = scene_paint(
+        tracer, background, transparent=transparent, trained_rad=source.trained_rad, shading=learnt or PLAIN
+    )
     return series.render(paint, kept, listener)
 
 
@@ -249,6 +262,7 @@ def _read_run(options: dict[str, Any]) -> Source:
         viewpoints,
         config.max_side,
         read_pixel_rad(run / SCENE),
+        run_background(run),
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from engine.files import read_scene
 from engine.gaussians.flattening import ImportReport
 from engine.gaussians.model import FlatGaussians
+from engine.run_folder import is_run, not_exported
 
 
 def open_scene(path: Path, say: Callable[[str], None], *, drop_invalid: bool = False) -> FlatGaussians:
@@ -13,7 +14,8 @@ def open_scene(path: Path, say: Callable[[str], None], *, drop_invalid: bool = F
 
     Args:
         path: the file or folder.
-        say: told in a sentence what was lost; one that changes the look begins with ``Warning:``.
+        say: told in a sentence what was lost, or is left behind; one that changes the look begins with
+            ``Warning:``.
         drop_invalid: leave out Gaussians with values that are not finite.
 
     Raises:
@@ -22,6 +24,8 @@ def open_scene(path: Path, say: Callable[[str], None], *, drop_invalid: bool = F
     gaussians, report = read_scene(path, drop_invalid=drop_invalid)
     for line in losses(path, report):
         say(line)
+    if is_run(path) and (left_out := not_exported(path)) is not None:
+        say(f"Warning: {left_out}")
     return gaussians
 
 

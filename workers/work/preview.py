@@ -13,7 +13,10 @@ from engine.rays import ImageRays
 from engine.render.images import write_png
 from engine.render.renderer import background_colour, render_rays
 from engine.scene import Dataset
+from engine.shading.plain import PLAIN
+from engine.shading.protocol import ShadingModel
 from engine.trace.protocol import Tracer
+from engine.train.shading import background_of
 
 SIDE_PX = 320
 LEAST_SIDE_PX = 96
@@ -55,13 +58,15 @@ class Previews:
         self._due = -math.inf
         self._drawn = 0
 
-    def __call__(self, iteration: int, dataset: Dataset, tracer: Tracer) -> None:
+    def __call__(self, iteration: int, dataset: Dataset, tracer: Tracer, shading: ShadingModel) -> None:
         """Draw a picture if it is time."""
         began = time.monotonic()
         if began < self._due:
             return
         chosen = int((dataset.test_indices if len(dataset.test_indices) else dataset.train_indices)[0])
-        image = render_rays(tracer, grid_rays(dataset, chosen, self._side_px), self._background)
+        rays = grid_rays(dataset, chosen, self._side_px)
+        # A learnt background alone: materials would send rays of their own, which takes time.
+        image = render_rays(tracer, rays, self._background, background_of(shading) or PLAIN)
         write_png(self._run / FILE, image.rgb_srgb)
         self._listener(PreviewWritten(FILE, iteration, dataset.views[chosen].name))
         spent = time.monotonic() - began

@@ -18,7 +18,7 @@ from engine.files.several import export_files
 from engine.light.stage_file import named_files
 from engine.pipeline import reconstruct as reconstruct_scene
 from engine.plain_colours import PlainScene
-from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
+from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE, not_exported
 from engine.stages import counted_stage, stopping
 from engine.writing import write_json
 from workers.store.names import check_name
@@ -120,6 +120,8 @@ def export(task: Task) -> None:
     q = options.q if options.q is not None else read_config(task.run / CONFIG).train.trace.q
     settings = ExportOptions(q=q, min_opacity=options.min_opacity, sh_pad_degree=options.sh_pad_degree)
     tell = stopping(task.listener, task.should_stop)
+    if (left_out := not_exported(task.run)) is not None:
+        tell(Warned(left_out))
     count = len(options.files)
     plain = PlainScene(
         gaussians,

@@ -33,6 +33,8 @@ from workers.work.kinds.table import JobKind, register, validated
 _RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl")
 _LIGHT = "environment.hdr"
 """What results with materials have, and no others."""
+_BACKGROUND = "background.exr"
+"""What results with a learnt background have, and no others."""
 
 
 def register_all() -> None:
@@ -67,7 +69,7 @@ def register_all() -> None:
             program="workers.work.programs:evaluate",
             stages=lambda _options: ("evaluate",),
             resolve=validated(EvaluateOptions),
-            source_files=(*_RUN_FILES, _LIGHT, "edits.json"),
+            source_files=(*_RUN_FILES, _LIGHT, _BACKGROUND, "edits.json"),
             needs_photographs=lambda _options: True,
             on_others=lambda options: options.model_copy(update={"all_views": True}),
         )
@@ -103,7 +105,7 @@ def register_all() -> None:
                 cast(RenderJobOptions, options), sizes, cores
             ),
             names_files=_files_of_stage,
-            source_files=_RUN_FILES[:4],
+            source_files=(*_RUN_FILES[:4], _BACKGROUND),
         )
     )
     register(

@@ -19,8 +19,8 @@ from engine.train.preset_names import PRESETS
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _TAKEN = frozenset(
     {"scene.ply", "config.json", "held_out.json", "views.json", "events.jsonl", "metrics.json", "report.html"}
-    | {"training.json", "plan.json", "environment.hdr", "edits.json", "renders", "layers", "checkpoints"}
-    | {"cache", "poses"}
+    | {"training.json", "plan.json", "environment.hdr", "background.exr", "edits.json", "renders", "layers"}
+    | {"cache", "checkpoints", "poses"}
 )  # fmt: skip
 
 

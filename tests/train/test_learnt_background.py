@@ -1,0 +1,207 @@
+"""A sky behind everything: its gradients, that a known one is recovered, and where it is kept."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flat_world import FlatWorld, paint, small_config
+
+from engine.errors import Cancelled, ConfigError
+from engine.gaussians.model import FlatGaussians
+from engine.rays import RayBatch
+from engine.render.environment_map import read_background, write_background
+from engine.scene import Camera
+from engine.scene.model import SparsePoints
+from engine.shading.exposure import Exposures
+from engine.shading.learnt_background import LearntBackground
+from engine.shading.protocol import Sight
+from engine.trace.cpu.tracer import CpuTracer
+from engine.trace.protocol import TraceResult
+from engine.train.batches import BatchSource
+from engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from engine.train.first_background import first_background
+from engine.train.shading import background_of
+from engine.train.state import TrainState, fresh_state
+from engine.train.trainer import Trainer
+
+
+def sky(directions: np.ndarray) -> np.ndarray:
+    """The true colour of a direction: brighter up (-y), redder to the right."""
+    return np.stack(
+        [0.5 + 0.3 * directions[:, 0], 0.5 - 0.3 * directions[:, 1], 0.6 + 0 * directions[:, 2]], axis=1
+    ).astype(np.float32)
+
+
+class UnderTheSky(FlatWorld):
+    """The painted plane is a disc; around it the photographs show the sky."""
+
+    def pixels(
+        self, view: np.ndarray, y: np.ndarray, x: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rgb, alpha, weight = super().pixels(view, y, x)
+        rays = self.rays(view, y, x)
+        points = rays.origins_world - rays.directions_world * (
+            rays.origins_world[:, 2:] / rays.directions_world[:, 2:]
+        )
+        beside = np.hypot(points[:, 0], points[:, 1]) > 0.6
+        rgb[beside] = sky(rays.directions_world[beside])
+        return rgb, alpha, weight
+
+    def start(self, count: int = 300, opacity: float = 0.1) -> FlatGaussians:
+        """Grey Gaussians on the disc."""
+        first = super().start(3 * count, opacity)
+        return first.select(np.flatnonzero(np.hypot(*first.means_world[:, :2].T) < 0.6))
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        side = float(self.side_px)
+        return (Camera("SIMPLE_PINHOLE", (side, side / 2, side / 2), self.side_px, self.side_px),)
+
+    @property
+    def points(self) -> SparsePoints:
+        """Points of the disc."""
+        rng = np.random.default_rng(2)
+        radius, turn = 0.6 * np.sqrt(rng.random(3000)), rng.uniform(0, 2 * np.pi, 3000)
+        xyz = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn], axis=1).astype(np.float32)
+        counts = np.full(len(xyz), 3, np.int32)
+        return SparsePoints(xyz, paint(xyz[:, 0], xyz[:, 1]), counts, np.zeros(len(xyz), np.float32))
+
+
+def sight(directions: np.ndarray, rgb: np.ndarray, transmittance: np.ndarray) -> Sight:
+    """A sight of given colours and transmittances."""
+    zeros, three = np.zeros(len(rgb), np.float32), np.zeros((len(rgb), 3), np.float32)
+    seen = TraceResult(
+        rgb_srgb=rgb, transmittance=transmittance, depth_sum=zeros, depth_median=zeros, normal_world=three,
+        features=three[:, :0], hit_counts=np.zeros(len(rgb), np.int32),
+    )  # fmt: skip
+    return Sight(RayBatch(three, directions), seen, CpuTracer(), np.zeros(len(rgb), np.int64))
+
+
+def some_sight(rng: np.random.Generator, count: int = 5) -> Sight:
+    directions = rng.normal(size=(count, 3))
+    directions[0] = (0.0, -1.0, 0.0)  # straight up, where all columns meet
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    rgb = rng.random((count, 3), dtype=np.float32)
+    return sight(directions.astype(np.float32), rgb, rng.random(count, dtype=np.float32))
+
+
+def train(
+    folder: Path, *, threads: int = 1, stop_after: int | None = None, **changes: object
+) -> tuple[Trainer, UnderTheSky]:
+    """Train on the disc under the sky; with ``stop_after``, stop there and go on from the checkpoint."""
+    world = UnderTheSky()
+    config = small_config(background="learnt", background_height=16, rates={"background": 0.05}, **changes)
+    state = fresh_state(world.start(), config.seed)
+
+    def trainer(state: TrainState, last: float) -> Trainer:
+        return Trainer(
+            world, config, state, folder=folder, fingerprint="test", listener=lambda _event: None,
+            threads=threads, should_stop=lambda: state.iteration >= last,
+        )  # fmt: skip
+
+    if stop_after is not None:
+        with pytest.raises(Cancelled):
+            trainer(state, stop_after).run()
+        path = latest_checkpoint(folder)
+        assert path is not None
+        state = load_checkpoint(path, "test")
+    last = trainer(state, np.inf)
+    last.run()
+    return last, world
+
+
+def test_gradients_agree_with_finite_differences() -> None:
+    rng = np.random.default_rng(0)
+    background = LearntBackground(16)
+    background.put(rng.random((16, 32, 3), dtype=np.float32))
+    before = some_sight(rng)
+    by_rgb = rng.normal(size=(5, 3)).astype(np.float32)
+    nothing = np.zeros(5, np.float32)
+    found = background.reverse(before, background.develop(before), by_rgb, nothing)
+
+    def loss(seen: Sight = before) -> float:
+        developed = background.develop(seen)
+        assert (developed.transmittance == 0).all()
+        return float((developed.rgb_srgb.astype(np.float64) * by_rgb).sum())
+
+    step = np.float32(0.25)  # the map is linear in all of these, so that a large step is exact
+    assert found.seen.transmittance is not None and found.seen.rgb_srgb is not None
+    np.testing.assert_array_equal(found.seen.rgb_srgb, by_rgb)
+    for ray in range(5):
+        more = before.seen.transmittance.copy()
+        more[ray] += step
+        moved = (loss(replace(before, seen=replace(before.seen, transmittance=more))) - loss()) / step
+        assert found.seen.transmittance[ray] == pytest.approx(moved, abs=1e-5)
+    background.add(found.parameters)
+    sums = background.sums
+    assert (np.abs(sums).sum(axis=2) > 0).sum() <= 4 * 5
+    for row, column, channel in [*np.argwhere(sums != 0)[::7].tolist(), [8, 3, 1]]:
+        background.rgb_srgb[row, column, channel] += step
+        above = loss()
+        background.rgb_srgb[row, column, channel] -= step
+        assert sums[row, column, channel] == pytest.approx((above - loss()) / step, abs=1e-5)
+
+
+def test_a_known_sky_is_recovered_behind_what_stands_before_it(tmp_path: Path) -> None:
+    trainer, world = train(tmp_path, iterations=240)
+    background = background_of(trainer.shading)
+    assert background is not None
+    view = np.repeat(world.train_indices, 40)
+    row = np.tile(np.arange(40), len(world.train_indices))
+    edge = world.rays(view, row, np.full(len(row), 1)).directions_world
+    np.testing.assert_allclose(background.colours(edge), sky(edge), atol=0.05)
+    assert trainer.views is not None and trainer.views.as_dict()["psnr"] > 27
+
+
+def test_it_begins_with_what_photographs_show_where_no_points_are() -> None:
+    world = UnderTheSky()
+    first = first_background(world)
+    view = np.repeat(world.train_indices, 40)
+    column = np.tile(np.arange(40), len(world.train_indices))
+    above = world.rays(view, np.full(len(view), 2), column).directions_world
+    shown, _, _ = world.pixels(view, np.full(len(view), 2), column)
+    open_sky = (shown == sky(above)).all(axis=1)
+    above, shown = above[open_sky], shown[open_sky]
+    assert np.abs(first.map.colours(above) - shown).mean() < 0.02
+    below = world.rays(view, np.full(len(view), 37), column).directions_world
+    assert first.may_show(above.astype(np.float64)).all()
+    assert not first.may_show(below.astype(np.float64)).any()
+    enlarged = first.enlarged(128)
+    assert enlarged.shape == (128, 256, 3)
+    again = LearntBackground.of(enlarged).colours(above)
+    np.testing.assert_allclose(again, first.map.colours(above), atol=0.02)
+
+
+def test_the_bytes_do_not_depend_on_threads_or_stops(tmp_path: Path) -> None:
+    whole, _ = train(tmp_path / "whole", threads=1)
+    two, _ = train(tmp_path / "two", threads=2)
+    parts, _ = train(tmp_path / "parts", stop_after=50)
+    assert {"background.rgb_srgb", "background.sums", "background.steps"} <= whole.state.shading.keys()
+    for other in (two, parts):
+        assert whole.state.gaussians.sh.tobytes() == other.state.gaussians.sh.tobytes()
+        for name, values in whole.state.shading.items():
+            assert values.tobytes() == other.state.shading[name].tobytes(), name
+
+
+def test_exposed_with_what_stands_before_it(tmp_path: Path) -> None:
+    trainer, _ = train(tmp_path, exposure=True)
+    assert isinstance(trainer.shading, Exposures) and background_of(trainer.shading) is not None
+
+
+def test_files_keep_the_colours(tmp_path: Path) -> None:
+    colours = np.random.default_rng(0).random((16, 32, 3)).astype(np.float32)
+    write_background(tmp_path / "background.exr", colours)
+    np.testing.assert_allclose(read_background(tmp_path / "background.exr"), colours, atol=1e-6)
+
+
+def test_photographs_with_alpha_show_no_background() -> None:
+    world = UnderTheSky()
+    world.has_alpha = True
+    with pytest.raises(ConfigError, match="alpha"):
+        BatchSource(world, small_config(background="learnt"))
+
+
+def test_materials_have_a_light_of_their_own() -> None:
+    with pytest.raises(ValueError, match="materials"):
+        small_config(background="learnt", materials={"learn": True})
