@@ -89,14 +89,13 @@ def test_cores_hide_what_lies_behind_whatever_the_order(cameras: Path, tmp_path:
         np.array([[[1.5, -1.5, -1.5]], [[-1.5, -1.5, 1.5]]], np.float32),
     )
     ours = to_bytes(our_view(scene, camera))
-    middle = (101, 120)
+    middle = (101, 120)  # what the camera looks at
     shown = []
     for cores in (None, 0.3):
         export_scene(scene, tmp_path / "scene.glb", ExportOptions(chunks=1, cores=cores))
         shown.append(draw_glb(tmp_path / "scene.glb", cameras, 0, sort=False).image)
     red, blue = ours[middle][0], ours[middle][2]
     assert red > 200 > 40 > blue
-    assert (
-        shown[0][middle][2] > 200 > 40 > shown[0][middle][0]
-    )  # without cores the far disc is before the near
+    # Without cores the far disc lies before the near one.
+    assert shown[0][middle][2] > 200 > 40 > shown[0][middle][0]
     assert np.abs(shown[1][middle].astype(int) - ours[middle]).max() <= 3
