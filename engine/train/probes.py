@@ -16,6 +16,7 @@ from engine.trace.protocol import Tracer
 from engine.train.batches import PixelSampler, TrainingData, still_background, view_sizes_px
 from engine.train.checkpoint import load_best, save_best
 from engine.train.config import TrainConfig
+from engine.train.shading import exposures_of
 from engine.train.state import TrainState
 
 EMPTY_ALPHA = 0.01
@@ -43,9 +44,13 @@ def draw_probe(
 
 
 def measure(probe: Probe, tracer: Tracer, shading: ShadingModel) -> tuple[float, float]:
-    """PSNR averaged over the views, dB, and the mean accumulated alpha, all seen as new views are."""
+    """PSNR averaged over the views, dB, and the mean accumulated alpha.
+
+    All are seen as new views are, but exposed as each is known or guessed to be where exposures are learnt.
+    """
     seen = tracer.trace(probe.rays)
-    developed = shading.develop(Sight(probe.rays, seen, tracer))
+    view = probe.view if exposures_of(shading) is not None else None
+    developed = shading.develop(Sight(probe.rays, seen, tracer, view))
     render = np.clip(developed.over(probe.background_srgb), 0, 1)
     error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
     views, inverse = np.unique(probe.view, return_inverse=True)
@@ -93,6 +98,8 @@ class Judge:
                 f"Parameters became not-a-number by iteration {state.iteration}; nothing is exported. "
                 "The last checkpoint is kept."
             )
+        if (exposures := exposures_of(shading)) is not None:
+            exposures.guess_others()
         psnr, alpha = measure(self._probe, tracer, shading)
         if alpha < EMPTY_ALPHA and state.iteration > 0:
             raise TrainingFailure(
