@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.settings import ServiceSettings
-from service.web.results import Measured
+from service.web.results import CONFIG, HELD_OUT, SCENE, Measured
 from workers.records.rows import Artifact, DatasetFile
-from workers.work.kinds import kind_named
 
+NEEDED = (SCENE, CONFIG, HELD_OUT, "views.json")
 MAX_VIEWS = 60
 PREVIEW_PRIORITY = 10
 
@@ -52,8 +52,7 @@ def light_form(
 ) -> LightForm | None:
     """The form for a job's result; None where it has no scene or no picture to place things in."""
     names = {row.name for row in artifacts}
-    needed = kind_named("render").source_files
-    if measured is None or not names.issuperset(needed):
+    if measured is None or not names.issuperset(NEEDED):
         return None
     facts = {file.path.removeprefix("images/"): file.facts for file in photographs}
     views = [
