@@ -124,7 +124,7 @@ class TrainConfig(_Frozen):
         ge=0,
         description="0: rays_a_pixel rays for each pixel of the training views, in thousands",
     )
-    rays_a_pixel: int = Field(4, ge=1, description="where iterations is 0; 5,000 to 12,000 iterations for 4")
+    rays_a_pixel: int = Field(3, ge=1, description="where iterations is 0; 5,000 to 10,000 iterations for 3")
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
     window_side: int = Field(
@@ -145,8 +145,8 @@ class TrainConfig(_Frozen):
         description="0: one for each 50 pixels of the training views or, of up to 10,000, for each 10",
     )
     pixels_a_gaussian: int = Field(50, ge=10, description="where max_gaussians is 0")
-    max_gaussians_auto: int = Field(200_000, ge=1, description="the most that 0 comes to in max_gaussians")
-    initial_points: int = Field(100_000, ge=1, description="most points to begin from")
+    max_gaussians_auto: int = Field(400_000, ge=1, description="the most that 0 comes to in max_gaussians")
+    initial_points: int = Field(200_000, ge=1, description="most points to begin from")
     plane_points: int = Field(8, ge=3, description="points around one whose plane gives its first normal")
     lift_pixels: bool = Field(
         True, description="where the sparse model has fewer points, lift pixels of the photographs"
@@ -231,12 +231,12 @@ class TrainConfig(_Frozen):
 def iteration_count(config: TrainConfig, training_pixels: int) -> int:
     """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
-    Large scenes learn as long as there is something to see; small ones are done after 5,000 with 4 rays a
+    Large scenes learn as long as there is something to see; small ones are done after 5,000 with 3 rays a
     pixel.
     """
     each = config.rays_a_pixel
     wanted = round(each * training_pixels / config.rays / 1000)
-    return config.iterations or min(max(wanted, 5 * each // 4), 3 * each) * 1000
+    return config.iterations or min(max(wanted, 5 * max(1, each // 3)), 10 * each // 3) * 1000
 
 
 def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
@@ -290,6 +290,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "sh_degree": min(config.sh_degree, 1),
             "sh_every": 400,
             "rays": 8192,
+            "rays_a_pixel": 4,
             "step_back_db": 0.3,
             "average_after": 1.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
@@ -314,7 +315,7 @@ def preset(name: str) -> TrainConfig:
     if name == "standard":
         return TrainConfig()
     if name == "high":
-        return TrainConfig(rays_a_pixel=12, pixels_a_gaussian=30, max_gaussians_auto=400_000)
+        return TrainConfig(rays_a_pixel=9, pixels_a_gaussian=30, max_gaussians_auto=600_000)
     if name == "paper":
         return TrainConfig(
             iterations=10_000,

@@ -28,7 +28,7 @@ USED_SHARE = 0.8
 COST_POWER = 0.8
 """Power of the number of Gaussians by which an iteration takes longer, see ``docs/experiments.md``."""
 ITERATIONS_A_GAUSSIAN = 1 / 30
-"""About as in the presets: 1,400 iterations for 40,000 Gaussians, 5,000 to 11,000 for 200,000."""
+"""About as in the presets: 1,400 iterations for 40,000 Gaussians, 9,000 for 400,000."""
 LEAST_ITERATIONS, LEAST_GAUSSIANS = 100, 2_000
 
 
