@@ -58,7 +58,7 @@ def test_a_front_end_that_vanishes_mid_upload(
                         writer.write(b"named by nobody")
                         writer.commit()
                     assert (await http.delete(dataset)).status_code == 204
-                    while list(service.storage.blobs()):
+                    while list(service.storage.blobs()) or await _note(service) is not None:
                         await collecting.collect_at_once(service.pool, service.storage, every_seconds=0.0)
                         assert time.monotonic() < deadline
                         await asyncio.sleep(0.1)
