@@ -93,8 +93,9 @@ def _word(value):
 @lean(fastmath={"contract"})
 def own_axes_of(i, quats, room):
     """The axes of Gaussian ``i`` as rows of ``room``: the normal and the two in its plane."""
-    w, x, y, z = quats[i]
-    w, x, y, z = np.float64(w), np.float64(x), np.float64(y), np.float64(z)
+    w, x, y, z = (
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+    )  # fmt: skip
     s = 2.0 / (w * w + x * x + y * y + z * z)
     room[0, 0], room[0, 1], room[0, 2] = 1.0 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)
     room[1, 0], room[1, 1], room[1, 2] = s * (x * y - w * z), 1.0 - s * (x * x + z * z), s * (y * z + w * x)

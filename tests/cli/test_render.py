@@ -193,17 +193,17 @@ def test_contradictions_are_usage_errors(run, octasplat, arguments):
 def test_one_camera_makes_one_file(run, octasplat, tmp_path, bare):
     source = run.output / "scene.ply" if bare else run.output
     result = octasplat(
-        "render", source, "-o", tmp_path / "still.png", "--camera", 3, 3, 2, "--look-at", 0, 0, 0,
+        "render", source, "-o", tmp_path / "still.png", "--camera", 12, 12, 8, "--look-at", 0, 0, 0,
         "--up", "z", "--background", "transparent", *SIZE,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert [path.name for path in tmp_path.iterdir()] == ["still.png"]
     image = read_image(tmp_path / "still.png")
     assert image.shape == (24, 32, 4)
-    assert image[..., 3].min() < 0.5 < 0.9 < image[..., 3].max()
+    assert image[..., 3].min() < 0.1 < 0.9 < image[..., 3].max()
     # Over black it is the picture with a black background.
     result = octasplat(
-        "render", source, "-o", tmp_path / "%d.exr", "--camera", 3, 3, 2, "--look-at", 0, 0, 0, "--up", "z",
+        "render", source, "-o", tmp_path / "%d.exr", "--camera", 12, 12, 8, "--look-at", 0, 0, 0, "--up", "z",
         "--background", "black", *SIZE,
     )  # fmt: skip
     assert result.exit_code == 0, result.output

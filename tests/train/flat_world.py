@@ -71,6 +71,19 @@ class FlatWorld:
         )
 
 
+def random_gaussians(count: int, seed: int, degree: int = 0) -> FlatGaussians:
+    """Gaussians whose every parameter is drawn from a normal distribution."""
+    rng = np.random.default_rng(seed)
+    shapes = {
+        "means_world": (3,),
+        "quats_wxyz": (4,),
+        "log_scales": (2,),
+        "opacity_logits": (),
+        "sh": ((degree + 1) ** 2, 3),
+    }
+    return FlatGaussians(**{k: rng.normal(size=(count, *s)).astype(np.float32) for k, s in shapes.items()})
+
+
 def small_config(**changes: object) -> TrainConfig:
     """A run of seconds in which everything happens: growth, a higher degree, checkpoints."""
     values: dict[str, object] = {

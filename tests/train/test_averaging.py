@@ -3,26 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+from flat_world import random_gaussians
 
-from engine.gaussians.model import FlatGaussians
 from engine.gaussians.rows import row_arrays
 from engine.train.averaging import AVERAGE_EVERY, RunningMean
 from engine.train.checkpoint import load_checkpoint, save_checkpoint
 from engine.train.config import TrainConfig
 from engine.train.schedule import Schedule
 from engine.train.state import fresh_state
-
-
-def random_gaussians(count: int, seed: int, degree: int = 0) -> FlatGaussians:
-    rng = np.random.default_rng(seed)
-    shapes = {
-        "means_world": (3,),
-        "quats_wxyz": (4,),
-        "log_scales": (2,),
-        "opacity_logits": (),
-        "sh": ((degree + 1) ** 2, 3),
-    }
-    return FlatGaussians(**{k: rng.normal(size=(count, *s)).astype(np.float32) for k, s in shapes.items()})
 
 
 def test_mean_of_the_states_that_were_added() -> None:

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
+from flat_world import random_gaussians
 
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import SH_C0, FlatGaussians
@@ -20,15 +21,7 @@ NO_LOSS = LossWeights(opacity=0.0, scale=0.0)
 
 
 def gaussians(count: int, degree: int = 1) -> FlatGaussians:
-    rng = np.random.default_rng(0)
-    shapes = {
-        "means_world": (3,),
-        "quats_wxyz": (4,),
-        "log_scales": (2,),
-        "opacity_logits": (),
-        "sh": ((degree + 1) ** 2, 3),
-    }
-    return FlatGaussians(**{k: rng.normal(size=(count, *s)).astype(np.float32) for k, s in shapes.items()})
+    return random_gaussians(count, seed=0, degree=degree)
 
 
 def quat_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
