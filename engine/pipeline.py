@@ -72,7 +72,7 @@ from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import newest_state
 from engine.train.config import TrainConfig, iteration_count
-from engine.train.exposure_changes import complaint, log_brightness
+from engine.train.exposure_changes import with_exposure_decided
 from engine.train.fingerprint import run_fingerprint
 from engine.train.first_state import first_state
 from engine.train.floors import ScaleFloor
@@ -283,15 +283,13 @@ def _train(
 ) -> FlatGaussians:
     folder = output / CHECKPOINTS
     config = _planned(dataset, output, settings, threads, should_stop, clock)
+    config, exposure_changes = with_exposure_decided(config, dataset)
     fingerprint = run_fingerprint(dataset, config)
     state = newest_state(folder, fingerprint, tell)
     if state is None:
         state = first_state(dataset, config, threads=use_threads(threads))
-        if not (config.exposure or config.materials.learn or dataset.has_alpha):
-            # What shines, or was cut out, looks brighter from here than from there by itself.
-            advice = complaint(log_brightness(dataset))
-            if advice is not None:
-                tell(Warned(advice))
+        if exposure_changes is not None:
+            tell(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
         state.seconds = clock.seconds()
     else:
         clock.add(state.seconds)

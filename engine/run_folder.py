@@ -13,6 +13,7 @@ from engine.render.environment_map import read_background
 from engine.scene import Dataset, load_scene
 from engine.scene.near import NearZones
 from engine.scene.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
+from engine.shading.exposure import ExposuresByName
 from engine.shading.learnt_background import LearntBackground
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
@@ -102,6 +103,15 @@ def run_near_zones(output: Path, share: float) -> NearZones | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
         return None
     return NearZones.of(scene, depths, scene.train_indices)
+
+
+def run_exposures(output: Path) -> ExposuresByName | None:
+    """The exposures of the views that a finished run has learnt, if it has."""
+    try:
+        known: ExposuresByName | None = json.loads((output / TRAINING).read_text("utf-8")).get("exposures")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return known
 
 
 def run_background(output: Path) -> LearntBackground | None:

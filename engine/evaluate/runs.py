@@ -32,6 +32,7 @@ from engine.run_folder import (
     found_model,
     open_photographs,
     photographs_folder,
+    run_exposures,
 )
 from engine.scene import Dataset
 from engine.scene.views_file import read_views, write_views
@@ -202,7 +203,7 @@ def measure_run(
             "versions": versions(),
             **{key: training[key] for key in ("training_views", "taken_near") if key in training},
             **_placed(output),
-            **({"exposure": GUESSED} if config.train.exposure and into is None else {}),
+            **({"exposure": GUESSED} if "exposures" in training and into is None else {}),
         },
         config=json.loads((output / CONFIG).read_text(encoding="utf-8")),
         threads=threads,
@@ -239,13 +240,14 @@ def finished_shading(
     Raises:
         ConfigError: the run learnt one of these and its file is missing or damaged.
     """
-    shading = make_shading(config, len(dataset.views), extent_world)
+    known = run_exposures(output)
+    decided = config.model_copy(update={"exposure": known is not None})
+    shading = make_shading(decided, len(dataset.views), extent_world)
     if (deferred := deferred_of(shading)) is not None:
         deferred.light.put(read_environment(output / ENVIRONMENT))
     if (background := background_of(shading)) is not None:
         background.put(read_background(output / BACKGROUND))
-    if exposed and (exposures := exposures_of(shading)) is not None:
-        known = json.loads((output / TRAINING).read_text(encoding="utf-8")).get("exposures", {})
+    if exposed and known is not None and (exposures := exposures_of(shading)) is not None:
         exposures.take([view.name for view in dataset.views], known)
     return shading
 

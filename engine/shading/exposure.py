@@ -21,6 +21,8 @@ from engine.trace.protocol import GaussianGradients, Tracer
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 LEAST_VIEWS = 4
 """From fewer nothing is guessed."""
+ExposuresByName = Mapping[str, Mapping[str, Sequence[float]]]
+"""Log gains and offsets of views, by their names."""
 _STATE = ("log_gains", "offsets", "first", "second", "steps")
 
 
@@ -56,6 +58,13 @@ class Exposures:
         self._shown_as: int | None = None
         self.inner = inner
 
+    @classmethod
+    def known(cls, names: Sequence[str], known: ExposuresByName) -> "Exposures":
+        """Those of views with these names that a finished training has left; not to be trained."""
+        exposures = cls(len(names), rate=0.0)
+        exposures.take(names, known)
+        return exposures
+
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"] | None:
         """Those of the model inside."""
         return self.inner.features(gaussians)
@@ -80,6 +89,11 @@ class Exposures:
         other = copy.copy(self)
         other._shown_as = view
         return other
+
+    def undone(self, rgb_srgb: Float32[np.ndarray, "h w 3"], view: int) -> Float32[np.ndarray, "h w 3"]:
+        """Straight display colours of a view's photograph as the mean exposure shows them, within [0, 1]."""
+        shown = (rgb_srgb - self.offsets[view]) / np.exp(self.log_gains[view])
+        return np.asarray(np.clip(shown, 0, 1), np.float32)
 
     def guess_others(self) -> None:
         """Give views that were not trained on the exposures that those beside them, by number, suggest.
@@ -150,7 +164,7 @@ class Exposures:
         rows = zip(names, self.log_gains.tolist(), self.offsets.tolist(), strict=True)
         return {name: {"log_gains": gains, "offsets": offsets} for name, gains, offsets in rows}
 
-    def take(self, names: Sequence[str], known: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
+    def take(self, names: Sequence[str], known: ExposuresByName) -> None:
         """Take the exposures of the views that are known by their names."""
         for number, name in enumerate(names):
             if name in known:

@@ -163,8 +163,10 @@ class TrainConfig(_Frozen):
     background_even: float = Field(
         0.1, ge=0, description="weight of the differences between its neighbouring texels"
     )
-    exposure: bool = Field(
-        False, description="learn a gain and an offset for each channel of each training view"
+    exposure: bool | Literal["auto"] = Field(
+        "auto",
+        description="learn a gain and an offset for each channel of each training view; auto does so where "
+        "the photographs show that the exposure changes",
     )
     leave_out_misfits: bool = Field(
         False, description="train without the views that do not fit the others, as it becomes clear which"

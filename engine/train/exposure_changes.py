@@ -7,6 +7,7 @@ from jaxtyping import Float64, Int64
 
 from engine.scene.model import Observations
 from engine.train.batches import TrainingData
+from engine.train.config import TrainConfig
 
 DARKEST, BRIGHTEST = 0.1, 0.95
 """Display values beyond which a brightness says little."""
@@ -54,15 +55,28 @@ def log_brightness(dataset: TrackedPhotographs) -> Float64[np.ndarray, " v"]:
     return brightness
 
 
-def complaint(brightness: Float64[np.ndarray, " v"]) -> str | None:
-    """What the user should know of it."""
+def exposure_changes(brightness: Float64[np.ndarray, " v"]) -> str | None:
+    """That the exposure changes so much that it makes a difference, in a sentence; None if it does not."""
     known = brightness[np.isfinite(brightness)]
     if len(known) < 2 or float(known.std()) < CHANGES:
         return None
     return (
         f"The exposure changes from photograph to photograph: the same things are shown up to "
-        f"{np.exp(known.max() - known.min()):.1f} times as bright. The setting exposure=true learns that."
+        f"{np.exp(known.max() - known.min()):.1f} times as bright."
     )
+
+
+def with_exposure_decided(config: TrainConfig, dataset: TrackedPhotographs) -> tuple[TrainConfig, str | None]:
+    """The configuration with ``exposure`` no longer ``auto``, and why it is learnt where that decided so.
+
+    Materials learn one light for all photographs, and what shines, or was cut out, looks brighter from here
+    than from there by itself: for these, ``auto`` learns no exposure.
+    """
+    if config.exposure != "auto":
+        return config, None
+    steady = config.materials.learn or dataset.has_alpha
+    reason = None if steady else exposure_changes(log_brightness(dataset))
+    return config.model_copy(update={"exposure": reason is not None}), reason
 
 
 def _medians(

@@ -24,7 +24,7 @@ def make_shading(config: TrainConfig, views: int, extent_world: float) -> Shadin
             even_weight=config.background_even,
             inner=inner,
         )
-    if config.exposure:
+    if config.exposure is True:
         return Exposures(views, rate=config.rates.exposure, decay=config.rates.decay, inner=inner)
     return inner
 

@@ -17,7 +17,7 @@ from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceResult
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.config import TrainConfig
-from engine.train.exposure_changes import complaint, log_brightness
+from engine.train.exposure_changes import exposure_changes, log_brightness, with_exposure_decided
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
 
@@ -225,14 +225,34 @@ def test_changing_brightness_is_noticed() -> None:
     assert np.isnan(found[world.test_indices]).all()
     true = world.log_gains[world.train_indices]
     np.testing.assert_allclose(found[world.train_indices], true - np.median(true), atol=0.08)
-    text = complaint(found)
-    assert text is not None and "exposure=true" in text and "1.9 times" in text
+    config = small_config()
+    decided, why = with_exposure_decided(config, world)
+    assert decided.exposure is True and why is not None and "1.9 times" in why
+    told = small_config(exposure=False)
+    assert with_exposure_decided(told, world) == (told, None)
+    materials = config.materials.model_copy(update={"learn": True})
+    decided, why = with_exposure_decided(config.model_copy(update={"materials": materials}), world)
+    assert decided.exposure is False and why is None
     world.log_gains[:] = 0
-    assert complaint(log_brightness(world)) is None
+    assert exposure_changes(log_brightness(world)) is None
+    assert with_exposure_decided(config, world)[0].exposure is False
     world.observations = Observations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
-    assert complaint(log_brightness(world)) is None
+    assert exposure_changes(log_brightness(world)) is None
 
 
 def test_without_the_setting_nothing_is_learnt(tmp_path: Path) -> None:
-    trainer, _ = run(tmp_path, small_config())
+    trainer, _ = run(tmp_path, small_config(exposure=False))
     assert trainer.state.shading == {}
+
+
+def test_a_photograph_is_shown_as_the_mean_exposure_has_it() -> None:
+    rng = np.random.default_rng(8)
+    exposures = Exposures.known(
+        ["a", "b"], {"b": {"log_gains": [0.1, -0.2, 0.3], "offsets": [0.02, 0, -0.05]}}
+    )
+    scene = rng.uniform(0.2, 0.6, (4, 5, 3)).astype(np.float32)
+    seen = sight(np.ones(20, np.int64), scene.reshape(-1, 3), np.ones(20, np.float32))
+    photograph = exposures.develop(seen).rgb_srgb.reshape(scene.shape)
+    assert np.abs(photograph - scene).max() > 0.02
+    np.testing.assert_allclose(exposures.undone(photograph, 1), scene, atol=1e-6)
+    np.testing.assert_array_equal(exposures.undone(scene, 0), scene)

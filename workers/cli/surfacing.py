@@ -30,10 +30,12 @@ from engine.run_folder import (
     is_run,
     open_photographs,
     photographs_folder,
+    run_exposures,
     run_viewpoints,
 )
 from engine.scene import Dataset, load_scene
 from engine.shading.environment_frame import environment_frame
+from engine.shading.exposure import Exposures
 from engine.surface.cameras import cameras_around, photograph_cameras
 from engine.surface.extract import ExtractedSurface, extract_levels
 from engine.surface.fitting import Picture
@@ -204,22 +206,29 @@ def _cameras(
 
 
 def _photographs(source: Path, scene: Path | None, threads: int, listener: Listener) -> tuple[Picture, ...]:
-    """The training photographs of a run, if they are on this machine and were all taken alike."""
+    """The training photographs of a run, all as exposed as the scene, if they are on this machine."""
     if not (is_run(source) and (source / CONFIG).exists()):
         return ()
     config = read_config(source / CONFIG)
-    if config.train.exposure or config.train.materials.learn:
+    if config.train.materials.learn:
         return ()
     try:
         folder, model = photographs_folder(source, scene), found_model(source)
         dataset = open_photographs(folder, source, config, threads, listener, model_folder=model)
     except (DatasetError, OutputError):
         return ()
-    return tuple(partial(_photograph, dataset, int(index)) for index in dataset.train_indices)
+    exposures = None
+    if (known := run_exposures(source)) is not None:
+        exposures = Exposures.known([view.name for view in dataset.views], known)
+    return tuple(partial(_photograph, dataset, exposures, index) for index in dataset.train_indices.tolist())
 
 
-def _photograph(dataset: Dataset, index: int) -> tuple[ImageRays, UInt8[np.ndarray, "h w 4"]]:
+def _photograph(
+    dataset: Dataset, exposures: Exposures | None, index: int
+) -> tuple[ImageRays, UInt8[np.ndarray, "h w 4"]]:
     rgb, alpha, weight = dataset.view_image(index)
+    if exposures is not None:
+        rgb = exposures.undone(rgb, index)
     solid = (alpha * weight)[..., None]
     return dataset.view_rays(index), to_bytes(np.concatenate([rgb * solid, solid], axis=2))
 
