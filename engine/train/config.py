@@ -278,8 +278,8 @@ def with_materials(config: TrainConfig) -> TrainConfig:
         "quat": 1e-3,
         "mean": 0.016,
         "mean_final": 1e-3,
-        "log_scale": 0.01,
-        "opacity": 0.08,
+        "log_scale": 0.02,
+        "opacity": 0.1,
     }
     return config.model_copy(
         update={
