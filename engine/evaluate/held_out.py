@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numba
@@ -29,7 +30,7 @@ from engine.light.relighting import Relighter
 from engine.render.images import write_png
 from engine.render.names import render_names
 from engine.render.oversampling import render_filtered
-from engine.render.renderer import background_colour
+from engine.render.renderer import background_colour, front_normals
 from engine.scene import Dataset
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
@@ -132,6 +133,7 @@ def _rendered(
         rays = dataset.view_rays(int(index))
         image = render_filtered(tracer, rays, colour, exposed_as(shading, int(index)), SIDE)
         if measures is not None:
+            image = replace(image, normal_world=front_normals(tracer, rays, image.depth_median))
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
         reference = composited(rgb, alpha, colour)
