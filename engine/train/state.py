@@ -27,6 +27,8 @@ class TrainState:
         best_iteration: when that was.
         left_out: training views that are left out from here on.
         average: the mean of the last states, where they are averaged.
+        probed: iterations and training rays' probe after them, dB.
+        hastened_after: where it was decided to end early, None where it was not.
         taken_near: Gaussians taken away so far for being too near to a camera.
     """
 
@@ -41,6 +43,8 @@ class TrainState:
     best_psnr: float = -np.inf
     best_iteration: int = 0
     left_out: Int64[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    probed: list[tuple[int, float]] = field(default_factory=list)
+    hastened_after: int | None = None
     taken_near: int = 0
     average: RunningMean = field(default_factory=RunningMean)
 
