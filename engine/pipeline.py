@@ -327,6 +327,8 @@ def _train(
     record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
     if trainer.views is not None:
         record["training_views"] = trainer.views.as_dict()
+    if trainer.poses is not None:
+        record["poses"] = trainer.poses.as_dict()
     if (exposures := exposures_of(trainer.shading)) is not None:
         exposures.guess_others()
         record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
