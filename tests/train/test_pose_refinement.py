@@ -139,7 +139,7 @@ def test_wrong_poses_come_right_and_new_views_with_them(tmp_path: Path) -> None:
 
 
 def test_stopped_and_on_other_threads_the_same_bits_come_out(tmp_path: Path) -> None:
-    whole, _ = train(tmp_path / "whole", refine_poses=True, rebuild_every=20)
+    whole, _ = train(tmp_path / "whole", refine_poses=True, iterations=80)
     asked = 0
 
     def stop_now_and_then() -> bool:
@@ -152,7 +152,7 @@ def test_stopped_and_on_other_threads_the_same_bits_come_out(tmp_path: Path) -> 
         try:
             parts, _ = train(
                 tmp_path / "parts", state=state, threads=2, should_stop=stop_now_and_then,
-                refine_poses=True, rebuild_every=20,
+                refine_poses=True, iterations=80,
             )  # fmt: skip
             break
         except Cancelled:
