@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from engine.rays import RayBatch
@@ -53,7 +53,7 @@ class CorrectedViews:
             for view, numbers in zip(self.given.views, corrections, strict=True)
         )
         pairs = list(zip(self.views, self.given.views, strict=True))
-        self._moved = corrections.any(axis=1)
+        self._moved: Bool[np.ndarray, " v"] = np.asarray(corrections.any(axis=1))
         self._turns_world = np.stack(
             [now.rotation_cam_from_world.T @ given.rotation_cam_from_world for now, given in pairs]
         )
