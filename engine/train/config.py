@@ -283,13 +283,11 @@ def with_materials(config: TrainConfig) -> TrainConfig:
     show reflections lie behind the surface, so there are none.
     """
     rates = {
-        "axes": "world",
-        "quat": 2e-3,
-        "mean": 0.008,
+        "quat": 1e-3,
+        "mean": 0.016,
         "mean_final": 1e-3,
-        "log_scale": 0.004,
-        "opacity": 0.03,
-        "decay": 0.1,
+        "log_scale": 0.02,
+        "opacity": 0.1,
     }
     return config.model_copy(
         update={
@@ -300,12 +298,12 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "sh_degree": min(config.sh_degree, 1),
             "sh_every": 400,
             "rays": 8192,
-            "rays_a_pixel": 4,
+            "rays_a_pixel": 8,
             "step_back_db": 0.3,
-            "average_after": 1.0,
+            "average_after": 0.8,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
-            "max_gaussians_auto": min(config.max_gaussians_auto, 40_000),
+            "max_gaussians_auto": min(config.max_gaussians_auto, 80_000),
         }
     )
 
