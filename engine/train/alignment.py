@@ -26,6 +26,8 @@ DAMPING = 1e-3
 """Of the mean curvature, added to that of each of the six numbers: what hardly shows is left as it is."""
 LEAST_POINTS = 200
 """From fewer points nothing is said."""
+FAR_PX = 1e6
+"""Image points farther off are none."""
 LEAST_NOISE = 0.005
 """Display values; no smaller difference counts as usual."""
 DEPTH_SHARE = 1e-4
@@ -111,7 +113,7 @@ def photograph_of(dataset: Pixels, view: int, size_px: tuple[int, int], config: 
     background = still_background(config)
 
     def look(xy_px: Float64[np.ndarray, "n 2"]) -> Shown:
-        known = np.isfinite(xy_px).all(axis=1)
+        known = (np.abs(xy_px) < FAR_PX).all(axis=1)
         within = np.where(known[:, None], xy_px, 0.0) - 0.5
         first = np.floor(within).astype(np.int64) - 1
         inside = known & (first >= 0).all(axis=1) & (first + 3 < (width, height)).all(axis=1)

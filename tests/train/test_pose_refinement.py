@@ -15,7 +15,11 @@ from engine.events import Event, HeldOutMeasured, Warned, ignore
 from engine.gaussians.rows import row_arrays
 from engine.rays import RayBatch
 from engine.scene import Camera, View
+from engine.scene.seen import points_in_cam
+from engine.train.alignment import Motion, Rendered, aligned, photograph_of
+from engine.train.batches import grid_pixels, view_sizes_px
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from engine.train.corrected_views import corrected, without_common
 from engine.train.pose_refinement import RefinedPose
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
@@ -136,6 +140,43 @@ def test_wrong_poses_come_right_and_new_views_with_them(tmp_path: Path) -> None:
     told = [event.message for event in events if isinstance(event, Warned)][-1]
     assert told.startswith("The poses of 10 of 10 training views were corrected, by ")
     assert told.endswith(f" px at most ({largest}).")
+
+
+def test_a_render_that_is_right_tells_the_pose_in_whatever_exposure() -> None:
+    world = WrongWorld()
+    found = {}
+    for index in world.train_indices.tolist():
+        view, y, x = grid_pixels(np.array([index]), view_sizes_px(world), 5)
+        rays = world.rays(view, y, x)
+        origins, ways = rays.origins_world.astype(np.float64), rays.directions_world.astype(np.float64)
+        plane = origins - ways * (origins[:, 2:] / ways[:, 2:])
+        given = world.views[index]
+        shown = 0.7 * world.shown(rays)[0].astype(np.float64) + 0.1
+        look = photograph_of(world, index, (SIDE_PX, SIDE_PX), small_config())
+        motion = aligned(Rendered(points_in_cam(plane, given), shown), look, world.cameras[0])
+        assert motion is not None
+        found[given.name] = corrected(given, motion)
+    assert misplaced_px(found).max() < 0.1
+
+
+def test_what_moves_the_whole_scene_is_taken_out() -> None:
+    world = WrongWorld()
+    corrections = np.zeros((len(world.views), 6))
+    turn = Rotation.from_rotvec([0.01, -0.02, 0.015]).as_matrix()
+    moving = world.train_indices[1:]
+    for index in moving:
+        view = world.views[index]
+        origin = turn @ view.origin_world * 1.02 + [0.03, 0.01, -0.02]
+        rotation = view.rotation_cam_from_world @ turn.T
+        relative = rotation @ view.rotation_cam_from_world.T
+        shift = -rotation @ origin - relative @ view.translation_cam_from_world
+        corrections[index] = Motion(relative, shift).numbers
+    left = without_common(corrections, world, moving)
+    assert np.abs(corrections[moving]).max(axis=1).min() > 1e-2
+    assert np.abs(left).max() < 1e-6
+    # One that stays has a say, and stays.
+    left = without_common(corrections, world, world.train_indices)
+    assert (left[world.train_indices[0]] == 0).all() and (left[world.test_indices] == 0).all()
 
 
 def test_stopped_and_on_other_threads_the_same_bits_come_out(tmp_path: Path) -> None:
