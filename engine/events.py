@@ -147,6 +147,18 @@ def broadcast(listeners: Iterable[Listener]) -> Listener:
     return send
 
 
+def read_events(path: Path) -> list[dict[str, object]]:
+    """Rows of an event file, none where there is no file; a last line that a kill cut short is left out."""
+    rows = []
+    if path.exists():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                rows.append(json.loads(line))
+            except ValueError:
+                continue
+    return rows
+
+
 class JsonLinesListener:
     """Appends each event, stamped with Unix time in seconds, as one line to a file.
 

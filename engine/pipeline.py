@@ -325,6 +325,8 @@ def _train(
     if (background := background_of(trainer.shading)) is not None:
         write_background(output / BACKGROUND, background.rgb_srgb)
     record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
+    if trainer.schedule.hastened_after is not None:
+        record["planned_iterations"] = trainer.schedule.planned
     if trainer.views is not None:
         record["training_views"] = trainer.views.as_dict()
     if trainer.poses is not None:

@@ -98,11 +98,39 @@ def training_charts(events: Sequence[Row]) -> list[Chart]:
     charts = []
     for x_key, x_label in (("iteration", "iteration"), ("seconds", "training time")):
         for title, unit, logarithmic, sources in _CHARTS:
-            lines = [(source, _values(events, source, x_key)) for source in sources]
+            lines = [
+                (source, _thinned(training_values(events, source.kind, source.key, x_key)))
+                for source in sources
+            ]
             lines = [(source, values) for source, values in lines if values]
             if lines:
                 charts.append(_chart(title, x_key, x_label, unit, logarithmic, lines))
     return charts
+
+
+def training_values(
+    events: Sequence[Row], kind: str, key: str, x_key: str = "seconds"
+) -> list[tuple[float, float]]:
+    """What the events of one kind say of a training.
+
+    Args:
+        events: Rows of ``events.jsonl``. Where a resumed run repeats an iteration, the later row counts.
+        kind: ``training_progress`` or ``held_out_measured``.
+        key: Of the value.
+        x_key: ``iteration`` or ``seconds``.
+
+    Returns:
+        Pairs of finite numbers, one per iteration, in order of iteration.
+    """
+    latest: dict[float, tuple[float, float]] = {}
+    for row in events:
+        if row.get("kind") != kind:
+            continue
+        numbers = [row.get("iteration"), row.get(x_key), row.get(key)]
+        if all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
+            iteration, x, y = (float(n) for n in numbers)  # type: ignore[arg-type]
+            latest[iteration] = (x, y)
+    return [latest[iteration] for iteration in sorted(latest)]
 
 
 def duration(seconds: float) -> str:
@@ -123,19 +151,9 @@ def short_number(value: float) -> str:
     return f"{value:.4g}"
 
 
-def _values(events: Sequence[Row], source: _Source, x_key: str) -> list[tuple[float, float]]:
-    """Finite (x, y) of a source, one per iteration, in order of iteration and thinned."""
-    latest: dict[float, tuple[float, float]] = {}
-    for row in events:
-        if row.get("kind") != source.kind:
-            continue
-        numbers = [row.get("iteration"), row.get(x_key), row.get(source.key)]
-        if all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
-            iteration, x, y = (float(n) for n in numbers)  # type: ignore[arg-type]
-            latest[iteration] = (x, y)
-    ordered = [latest[iteration] for iteration in sorted(latest)]
-    step = max(1, math.ceil(len(ordered) / MAX_POINTS))
-    return ordered[::step] + ([ordered[-1]] if ordered and (len(ordered) - 1) % step else [])
+def _thinned(values: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    step = max(1, math.ceil(len(values) / MAX_POINTS))
+    return values[::step] + ([values[-1]] if values and (len(values) - 1) % step else [])
 
 
 def _chart(

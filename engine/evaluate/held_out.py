@@ -1,8 +1,8 @@
 """Renders the held-out views, measures them, and writes their pictures, ``metrics.json`` and the report."""
 
-import json
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numba
@@ -21,7 +21,7 @@ from engine.evaluate.views import (
     measure_view,
     summarise,
 )
-from engine.events import Listener, StageProgress
+from engine.events import Listener, StageProgress, read_events
 from engine.gaussians.materials import ALBEDO
 from engine.gaussians.model import FlatGaussians
 from engine.light.environment import EnvironmentMap
@@ -29,7 +29,7 @@ from engine.light.relighting import Relighter
 from engine.render.images import write_png
 from engine.render.names import render_names
 from engine.render.oversampling import render_filtered
-from engine.render.renderer import background_colour
+from engine.render.renderer import background_colour, front_normals
 from engine.scene import Dataset
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
@@ -111,7 +111,7 @@ def evaluate_held_out(
         output / REPORT,
         title=dataset.root.name,
         metrics=metrics,
-        events=_read_events(output / "events.jsonl"),
+        events=read_events(output / "events.jsonl"),
         config=config,
         images=images,
         environment_linear=None if environment is None else environment.radiance_linear,
@@ -132,6 +132,7 @@ def _rendered(
         rays = dataset.view_rays(int(index))
         image = render_filtered(tracer, rays, colour, exposed_as(shading, int(index)), SIDE)
         if measures is not None:
+            image = replace(image, normal_world=front_normals(tracer, rays, image.depth_median))
             view = dataset.views[index]
             measures.add(view.name, image, rays, view.rotation_cam_from_world[2])
         reference = composited(rgb, alpha, colour)
@@ -160,15 +161,3 @@ def _measured(views: Iterator[RenderedView], workers: int) -> Iterator[tuple[Ren
                 yield first, future.result()
         for view, future in waiting:
             yield view, future.result()
-
-
-def _read_events(path: Path) -> list[dict[str, object]]:
-    """Rows of an event file; a last line that a kill cut short is left out."""
-    rows = []
-    if path.exists():
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
-                rows.append(json.loads(line))
-            except ValueError:
-                continue
-    return rows

@@ -212,8 +212,10 @@ def _tiles(
         tiles.append({"label": "Gaussians", "value": _thousands(gaussians), "unit": "", "note": ""})
     seconds = metrics.get("seconds")
     if isinstance(seconds, int | float):
-        iterations = metrics.get("iterations")
+        iterations, planned = metrics.get("iterations"), metrics.get("planned_iterations")
         note = f"{_thousands(iterations)} iterations" if isinstance(iterations, int) else ""
+        if note and isinstance(planned, int):
+            note += f" of {_thousands(planned)}, as no more was gained"
         tiles.append({"label": "Time", "value": duration(float(seconds)), "unit": "", "note": note})
     return tiles
 

@@ -47,6 +47,7 @@ from engine.writing import write_json
 
 SCALES = "scales.json"
 GUESSED = "held-out views are shown as exposed as the training views beside them by name suggest"
+NOTED_BY_TRAINING = ("planned_iterations", "training_views", "taken_near")
 RAYS_ACROSS = (1, 2, 4)
 """Rays across a pixel with which smaller sizes are measured."""
 
@@ -201,7 +202,7 @@ def measure_run(
             "resolution": {"max_side": config.max_side},
             "background": config.evaluate_background,
             "versions": versions(),
-            **{key: training[key] for key in ("training_views", "taken_near") if key in training},
+            **{key: training[key] for key in NOTED_BY_TRAINING if key in training},
             **_placed(output),
             **({"exposure": GUESSED} if "exposures" in training and into is None else {}),
         },

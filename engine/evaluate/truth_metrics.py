@@ -18,7 +18,8 @@ MOST_FITTED = 200_000
 Curve = Callable[[Float64[np.ndarray, "*shape"]], Float64[np.ndarray, "*shape"]]
 
 TRUTH_DEFINITIONS: dict[str, str] = {
-    "normal_mae": "degrees; mean angle between the rendered and the true normal over the true mask; where "
+    "normal_mae": "degrees; mean angle between the rendered normal, that of the surface in front (what lies "
+    "behind half of the light does not count), and the true one over the true mask; where "
     "nothing is rendered it counts 90",
     "depth_mae": "world units; mean distance of the rendered expected depth (along the camera's axis) from "
     "the true one, over the pixels of the true mask of which at least half is covered",

@@ -1,7 +1,7 @@
 """Whole images from a tracer, a band of rows at a time."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -12,6 +12,8 @@ from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
 
 RAYS_AT_ONCE = 1 << 18
+FRONT = 0.005
+"""What lies farther behind the median depth than this share of it is another surface."""
 TILE = 8
 """Rays go to the tracer in tiles of this side, so that neighbours are traced together."""
 
@@ -77,6 +79,34 @@ def render_rays(
             *((layers[name], values) for name, values in developed.layers.items()),
         ):
             part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
+    return out
+
+
+def front_normals(
+    tracer: Tracer, image: ImageRays, depth_median: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w 3"]:
+    """Unit normals of the surface in front, turned to the viewer; 0 where nothing was met.
+
+    Where a thing ends before another, the mean normal along a ray is of both. Here rays end just behind the
+    depth at which half of their light is gone, so that it is of the first.
+
+    Args:
+        tracer: as it was for :func:`render_rays`.
+        image: the rays, with unit directions.
+        depth_median: that which :func:`render_rays` found along them.
+    """
+    height, width = image.height_px, image.width_px
+    out = np.empty((height, width, 3), np.float32)
+    rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
+    for top in range(0, height, rows):
+        band = slice(top, min(top + rows, height))
+        order = tile_order(min(rows, height - top), width)
+        rays = image.rays[top * width + order]
+        depth = depth_median[band].reshape(-1)[order]
+        ends = np.where(depth > 0, depth * np.float32(1 + FRONT), np.inf).astype(np.float32)
+        seen = tracer.trace(replace(rays, t_max=np.minimum(rays.t_max, ends).astype(np.float32)))
+        length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
+        out[band].reshape(-1, 3)[order] = seen.normal_world / np.maximum(length, 1e-12)
     return out
 
 

@@ -57,6 +57,8 @@ class Developed:
 
     def over(self, background_srgb: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "r 3"]:
         """Display colours in front of a background."""
+        if not background_srgb.any():
+            return self.rgb_srgb.copy()
         return self.rgb_srgb + self.transmittance[:, None] * background_srgb
 
 

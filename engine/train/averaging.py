@@ -11,6 +11,7 @@ import numpy as np
 
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.rows import row_arrays
+from engine.train.kernels_averaging import move_towards
 
 AVERAGE_EVERY = 10
 """Iterations between two of the states that are averaged."""
@@ -31,13 +32,14 @@ class RunningMean:
     def add(self, now: FlatGaussians) -> None:
         """Take in one more state; begin anew where there are other parameters than before."""
         if self.gaussians is None or _shapes(self.gaussians) != _shapes(now):
+            # Rows one after the other, so that flat views of them can be written to.
             self.gaussians, self.count = now.copy(), 1
             return
         self.count += 1
         share = np.float32(1.0 / self.count)
         values = row_arrays(now)
         for name, mean in row_arrays(self.gaussians).items():
-            mean += (values[name] - mean) * share
+            move_towards(mean.reshape(-1), np.ascontiguousarray(values[name]).reshape(-1), share)
 
     def clear(self) -> None:
         """Forget all states, as rows now belong to other Gaussians."""

@@ -3,6 +3,7 @@
 import math
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -64,7 +65,7 @@ class Batch:
     side: int
     background_srgb: Float32[np.ndarray, "3"]
 
-    @property
+    @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
         """The photographs' colours over the background."""
         return composited(self.rgb_srgb, self.alpha, self.background_srgb)
@@ -218,7 +219,9 @@ class BatchSource:
         rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
         background = self._background(rng)
-        return Batch(rays, rgb, alpha, weight, view, self._patches, side, background)
+        batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background)
+        _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
+        return batch
 
     def _patch_count(self) -> int:
         config, side = self._config, self._config.patch_side

@@ -19,7 +19,7 @@ from engine.train.optimiser import Adam
 from engine.train.state import TrainState
 from engine.writing import replacing
 
-FORMAT = 5
+FORMAT = 6
 KEEP = 2
 _PREFIX = "iteration_"
 _GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses")
@@ -59,6 +59,8 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         "best_psnr": state.best_psnr if np.isfinite(state.best_psnr) else None,
         "best_iteration": state.best_iteration,
         "left_out": state.left_out.tolist(),
+        "probed": state.probed,
+        "hastened_after": state.hastened_after,
         "taken_near": state.taken_near,
         "averaged": state.average.count,
     }
@@ -119,6 +121,8 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         best_psnr=-np.inf if meta["best_psnr"] is None else meta["best_psnr"],
         best_iteration=meta["best_iteration"],
         left_out=np.array(meta["left_out"], np.int64),
+        probed=[(iteration, psnr) for iteration, psnr in meta["probed"]],
+        hastened_after=meta["hastened_after"],
         taken_near=meta["taken_near"],
         pose_corrections=groups["poses"].get("corrections", np.zeros((0, 6))),
         average=RunningMean(mean, meta["averaged"]),

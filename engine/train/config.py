@@ -124,6 +124,12 @@ class TrainConfig(_Frozen):
         ge=0,
         description="0: rays_a_pixel rays for each pixel of the training views, in thousands",
     )
+    stop_early: float = Field(
+        0.05,
+        ge=0,
+        description="end sooner where the training rays gain less than so many dB in a fifth of the "
+        "iterations; 0 never does",
+    )
     rays_a_pixel: int = Field(3, ge=1, description="where iterations is 0; 5,000 to 10,000 iterations for 3")
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
@@ -301,6 +307,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "rays_a_pixel": 8,
             "step_back_db": 0.3,
             "average_after": 0.8,
+            "stop_early": 0.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
             "max_gaussians_auto": min(config.max_gaussians_auto, 80_000),
@@ -329,6 +336,7 @@ def preset(name: str) -> TrainConfig:
             iterations=10_000,
             sh_degree=0,
             rays=8192,
+            stop_early=0.0,
             window_rays=1,
             max_gaussians_auto=350_000,
             initial_points=30_000,

@@ -92,7 +92,7 @@ class Judge:
         self._tell = listener
 
     def inspect(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> None:
-        """Measure a state, keep it if it is the best, and tell of the held-out views.
+        """Measure a state, note that in it, keep it if it is the best, and tell of the held-out views.
 
         Raises:
             TrainingFailure: parameters are no numbers, or nothing is left to see.
@@ -110,6 +110,7 @@ class Judge:
                 f"After iteration {state.iteration} the scene covers only {100 * alpha:.2f} % of the "
                 "photographs; nothing is exported. Check that poses and photographs belong together."
             )
+        state.probed.append((state.iteration, psnr))
         if psnr > state.best_psnr:
             state.best_psnr, state.best_iteration = psnr, state.iteration
             save_best(state.gaussians, shading.state(), self._folder)

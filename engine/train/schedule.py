@@ -3,10 +3,11 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from engine.train.averaging import AVERAGE_EVERY
 from engine.train.config import TrainConfig, iteration_count, rebuild_interval
+from engine.train.early_end import last_iteration
 
 EVENT_EVERY = 10
 POSES_FROM, POSES_UNTIL, POSE_ROUNDS = 0.3, 0.8, 12
@@ -19,15 +20,31 @@ class Schedule:
 
     A run may stop, and goes on, only where its hierarchy is built anew in any case: so a resumed run traces
     the same boxes as one that was never stopped.
+
+    Attributes:
+        config: the settings.
+        iterations: of the whole training.
+        hastened_after: where it was decided to end early, None where it was not.
+        planned: iterations that there were to be before that.
     """
 
     config: TrainConfig
     iterations: int
+    hastened_after: int | None = None
+    planned: int = 0
 
     @classmethod
     def of(cls, config: TrainConfig, training_pixels: int) -> "Schedule":
         """The schedule for so many pixels in the training views."""
         return cls(config, iteration_count(config, training_pixels))
+
+    def hastened(self, done: int) -> "Schedule":
+        """The schedule of a training for which it is decided after ``done`` iterations to end early.
+
+        Nothing is added any more, and what depends on the progress goes on from where it is, only faster.
+        """
+        sooner = last_iteration(done, self.iterations)
+        return replace(self, iterations=sooner, hastened_after=done, planned=self.iterations)
 
     def ends(self, done: int) -> bool:
         """Whether all iterations are done."""
@@ -54,7 +71,7 @@ class Schedule:
 
     def averages(self, done: int) -> bool:
         """Whether the state after ``done`` iterations counts in the mean that is exported."""
-        since = self.config.average_after * self.iterations
+        since = max(self.config.average_after * self.iterations, self.hastened_after or 0)
         return since < done and (done % AVERAGE_EVERY == 0 or self.ends(done))
 
     def rebuilds(self, done: int, gaussians: int) -> bool:
@@ -71,12 +88,15 @@ class Schedule:
         return min(self.config.sh_degree, done // self.config.sh_every)
 
     def may_densify(self, done: int) -> bool:
-        """Whether the fitting of the first Gaussians is over."""
-        return done >= self.config.fit_iterations
+        """Whether the fitting of the first Gaussians is over, and the last phase of a short one not begun."""
+        return done >= self.config.fit_iterations and self.hastened_after is None
 
     def progress(self, done: int) -> float:
-        """Share of the iterations that are done."""
-        return done / self.iterations
+        """Share of the training that is done, which is that of the iterations unless it ends early."""
+        if self.hastened_after is None:
+            return done / self.iterations
+        before = self.hastened_after / self.planned
+        return before + (1 - before) * (done - self.hastened_after) / (self.iterations - self.hastened_after)
 
 
 class Stopwatch:

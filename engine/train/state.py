@@ -29,6 +29,8 @@ class TrainState:
         average: the mean of the last states, where they are averaged.
         pose_corrections: of all views, where poses are refined: the rotation vectors (rad) and shifts (world
             units) by which the points of their cameras move.
+        probed: iterations and training rays' probe after them, dB.
+        hastened_after: where it was decided to end early, None where it was not.
         taken_near: Gaussians taken away so far for being too near to a camera.
     """
 
@@ -43,6 +45,8 @@ class TrainState:
     best_psnr: float = -np.inf
     best_iteration: int = 0
     left_out: Int64[np.ndarray, " m"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    probed: list[tuple[int, float]] = field(default_factory=list)
+    hastened_after: int | None = None
     taken_near: int = 0
     pose_corrections: Float64[np.ndarray, "v 6"] = field(default_factory=lambda: np.zeros((0, 6)))
     average: RunningMean = field(default_factory=RunningMean)

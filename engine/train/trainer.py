@@ -21,6 +21,7 @@ from engine.train.config import TrainConfig, most_gaussians
 from engine.train.corrected_views import PosedPhotographs
 from engine.train.densify import make_densifier
 from engine.train.densify.propagating import Propagating
+from engine.train.early_end import gains_no_more
 from engine.train.floors import ScaleFloor
 from engine.train.iteration import Differentiated, Machinery, iterate
 from engine.train.misfits import TrainingViews, ViewJudge
@@ -56,7 +57,7 @@ class Trainer:
 
     Attributes:
         state: where the training stands.
-        schedule: when what happens.
+        schedule: when what happens; another one from where it is decided to end early.
         shading: the shading model.
         views: how well the exported Gaussians show the training views, once they are there.
         poses: those of the training views then, where they are refined.
@@ -112,6 +113,8 @@ class Trainer:
         )
         if config.materials.learn and config.materials.propagation:
             densifier = Propagating(densifier, config.materials, iterations=self.schedule.iterations)
+        if state.hastened_after is not None:
+            self.schedule = self.schedule.hastened(state.hastened_after)
         self.shading = shading or make_shading(config, len(dataset.views), dataset.extent)
         if state.densifier:
             densifier.restore(state.densifier)
@@ -139,10 +142,11 @@ class Trainer:
             return self._run(batches)
 
     def _run(self, batches: DrawnAhead) -> FlatGaussians:
-        state, schedule, machinery = self.state, self.schedule, self._machinery
+        state, machinery = self.state, self._machinery
         watch, began_at = Stopwatch(state.seconds), state.iteration
         stale = True  # whether the hierarchy is of other Gaussians
         while True:
+            schedule = self.schedule
             if schedule.ends(state.iteration) and state.average.gaussians is not None:
                 state.gaussians = state.average.gaussians
                 state.average.clear()
@@ -152,6 +156,7 @@ class Trainer:
                     self._scale_floor.hold(state.gaussians)
                 self._build()
                 self._pause(watch, resumed=0 < state.iteration == began_at)
+                schedule = self.schedule
             elif stale:
                 self._build()
             if schedule.ends(state.iteration):
@@ -221,10 +226,11 @@ class Trainer:
                 if measuring:
                     self._judge.inspect(state, self._machinery.tracer, self._machinery.shading)
                     self._leave_out()
+                    self._hasten()
                 self._save()
         if stopping:
             raise Cancelled(
-                f"Stopped after iteration {state.iteration} of {schedule.iterations}; "
+                f"Stopped after iteration {state.iteration} of {self.schedule.iterations}; "
                 "the same command with --resume goes on."
             )
 
@@ -250,6 +256,24 @@ class Trainer:
                 Warned(
                     f"From iteration {done} on these photographs are left out of the training, "
                     f"since they do not fit the others: {names}."
+                )
+            )
+
+    def _hasten(self) -> None:
+        """Bring the end forward where the training hardly gains any more."""
+        state, schedule, least_db = self.state, self.schedule, self._config.stop_early
+        if schedule.hastened_after is not None or not gains_no_more(
+            state.probed, schedule.iterations, least_db
+        ):
+            return
+        sooner = schedule.hastened(state.iteration)
+        if sooner.iterations < schedule.iterations:
+            state.hastened_after, self.schedule = state.iteration, sooner
+            self._tell(
+                Warned(
+                    f"The training rays gained less than {least_db:g} dB in a fifth of all iterations, so "
+                    f"that the training ends after {sooner.iterations} of {schedule.iterations}; "
+                    "stop_early=0 lets it go on."
                 )
             )
 

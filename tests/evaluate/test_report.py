@@ -205,6 +205,13 @@ def test_psnr_without_the_exposure_is_shown_where_it_differs(report, corrected, 
     assert ("PSNR cc" in page.text) == (f"{corrected:.2f}" in page.text) == shown
 
 
+def test_an_early_end_is_told_beside_the_time(report):
+    metrics = metrics_of({"a.jpg": 25.0}) | {"iterations": 3500, "seconds": 60.0}
+    assert "as no more was gained" not in report(metrics=metrics).text
+    early = report(metrics=metrics | {"planned_iterations": 5000})
+    assert "3\u202f500 iterations of 5\u202f000, as no more was gained" in early.text
+
+
 def test_curves_are_drawn_over_iterations_and_time(report):
     page = report()
     assert len(page.all("svg")) == 6

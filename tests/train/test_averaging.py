@@ -24,6 +24,16 @@ def test_mean_of_the_states_that_were_added() -> None:
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+def test_the_mean_is_that_of_plain_float32_arithmetic() -> None:
+    states = [random_gaussians(500, seed=seed, degree=2) for seed in range(4)]
+    mean, expected = RunningMean(), states[0].sh.copy()
+    for count, state in enumerate(states, start=1):
+        mean.add(state)
+        expected += (state.sh - expected) * np.float32(1.0 / count)
+    assert mean.gaussians is not None
+    np.testing.assert_array_equal(mean.gaussians.sh, expected)
+
+
 def test_other_parameters_begin_a_new_mean() -> None:
     mean = RunningMean()
     mean.add(random_gaussians(12, seed=0))

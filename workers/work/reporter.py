@@ -117,10 +117,11 @@ class Reporter:
         elif kind == "stage_progress":
             self._count(event)
         elif kind == "training_progress":
+            self._steps = int(event["total_iterations"])  # which a time decides, and an early end changes
             self._progress = {
                 "stage": self._stage,
                 "step": event["iteration"],
-                "total_steps": event["total_iterations"],
+                "total_steps": self._steps,
                 "seconds_left": event["seconds_left"],
                 "training_psnr": event["psnr"],
                 "event": journal_progress(event),

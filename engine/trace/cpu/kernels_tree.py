@@ -25,6 +25,7 @@ ROUNDING = 4e-6
 """Boxes are this much larger, as a fraction of what they are computed from: room for float32."""
 LEFT_OUT = np.uint64(0xFFFFFFFFFFFFFFFF)
 """Key of a Gaussian that is not finite."""
+KEY_BITS = 64
 _CURVE_BITS = 19
 TOP_CELL = (1 << _CURVE_BITS) - 1
 _CLASSES = 32
@@ -165,3 +166,11 @@ def refit_blocks(blocks, touched, nodes):
         if touched[b]:
             write_block_box(blocks, b, nodes)
             touched[b] = False
+
+
+@njit(cache=True, error_model="numpy")
+def refit(blocks, slots, records, ids, touched, nodes, level_starts):
+    """Take changed records over, and make the boxes around them anew."""
+    refresh_leaves(blocks, slots, records, ids, touched)
+    refit_blocks(blocks, touched, nodes)
+    write_upper_levels(nodes, level_starts)

@@ -1,6 +1,8 @@
 """Memory that the tracer's kernels fill."""
 
+import math
 import weakref
+from itertools import accumulate
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -35,9 +37,15 @@ class Pool:
     def __init__(self) -> None:
         self._free: list[np.ndarray] = []
 
-    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
-        """An uninitialised array from a cache line on; pages are only taken when they are written to."""
-        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    def empty(self, *wanted: tuple[tuple[int, ...], DTypeLike]) -> list[np.ndarray]:
+        """Uninitialised arrays of such shapes and types, each from a cache line on.
+
+        They lie in one block, which returns when the last of them is gone; pages are only taken when they are
+        written to.
+        """
+        sizes = [math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in wanted]
+        ends = list(accumulate(-(-size // LINE) * LINE for size in sizes))
+        size = ends[-1]
         fitting = [block for block in self._free if size <= block.nbytes <= 4 * size]
         if fitting:
             block = min(fitting, key=lambda block: block.nbytes)
@@ -46,7 +54,11 @@ class Pool:
             block = _aligned_bytes(size + size // 4)
         lease = _Lease(block)
         weakref.finalize(lease, _give_back, weakref.ref(self), block).atexit = False
-        return np.asarray(lease)[:size].view(dtype).reshape(shape)
+        held = np.asarray(lease)
+        return [
+            held[begin : begin + size].view(dtype).reshape(shape)
+            for begin, size, (shape, dtype) in zip([0, *ends], sizes, wanted, strict=False)
+        ]
 
     def _take_back(self, block: np.ndarray) -> None:
         self._free.append(block)

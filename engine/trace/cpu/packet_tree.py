@@ -4,15 +4,16 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from engine.trace.cpu.kernels_packet import Tree
+from engine.trace.cpu.kernels_sort import stable_order
 from engine.trace.cpu.kernels_tree import (
     BOX_ROWS,
+    KEY_BITS,
     LEAF_ROWS,
     LEFT_OUT,
     TOP_CELL,
     WIDTH,
     curve_keys,
-    refit_blocks,
-    refresh_leaves,
+    refit,
     write_leaves,
     write_upper_levels,
 )
@@ -26,6 +27,7 @@ class PacketTree:
 
     Args:
         records: of all Gaussians; those that are not finite are left out.
+        threads: how many to take at most; the hierarchy is the same on any number.
 
     Attributes:
         arrays: the hierarchy as kernels take it.
@@ -33,13 +35,13 @@ class PacketTree:
 
     arrays: Tree
 
-    def __init__(self, records: Float32[np.ndarray, "n 16"]) -> None:
+    def __init__(self, records: Float32[np.ndarray, "n 16"], threads: int = 1) -> None:
         count = len(records)
         keys = np.empty(count, np.uint64)
         low, cell = _grid(records[:, :3])
         curve_keys(records, low, 1.0 / cell, keys)
-        order = np.argsort(keys, kind="stable").astype(np.int32)
-        order = order[: int(np.count_nonzero(keys != LEFT_OUT))]
+        order, sorted_keys = stable_order(keys, KEY_BITS, threads)
+        order = order[: int(np.searchsorted(sorted_keys, LEFT_OUT))]
         blocks = -(-len(order) // WIDTH)
         sizes = [max(1, -(-blocks // WIDTH))]
         while sizes[-1] > 1:
@@ -60,9 +62,7 @@ class PacketTree:
         The boxes are then those of a new build along the old curve.
         """
         nodes, level_starts, blocks, _order = self.arrays
-        refresh_leaves(blocks, self._slots, records, ids, self._touched)
-        refit_blocks(blocks, self._touched, nodes)
-        write_upper_levels(nodes, level_starts)
+        refit(blocks, self._slots, records, ids, self._touched, nodes, level_starts)
 
 
 def _grid(means_world: Float32[np.ndarray, "n 3"]) -> tuple[np.ndarray, float]:

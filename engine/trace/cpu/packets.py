@@ -94,7 +94,7 @@ class PacketTracer:
 
     def build(self, records: Float32[np.ndarray, "n 16"]) -> None:
         """Build the hierarchy."""
-        self._tree = PacketTree(records)
+        self._tree = PacketTree(records, self._threads)
 
     def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
         """Take changed records over, and refit the hierarchy."""
@@ -104,14 +104,11 @@ class PacketTracer:
     def room(self, packets: Int64[np.ndarray, "p 2"], rays: int, *, recording: bool) -> PacketHits:
         """Memory for what packets keep of their hits."""
         places = rays * (self._limits.max_hits + SPARE) if recording and len(packets) else 0
-        return PacketHits(
-            us=self._pool.empty((places,), np.float32),
-            vs=self._pool.empty((places,), np.float32),
-            slots=self._pool.empty((places,), np.int32),
-            slot_ids=self._pool.empty((places,), np.int32),
-            slot_rgb=self._pool.empty((places, 3), np.float32),
-            slot_counts=np.zeros(len(packets), np.int32),
+        numbers, whole = ((places,), np.float32), ((places,), np.int32)
+        us, vs, slots, slot_ids, slot_rgb = self._pool.empty(
+            numbers, numbers, whole, whole, ((places, 3), np.float32)
         )
+        return PacketHits(us, vs, slots, slot_ids, slot_rgb, slot_counts=np.zeros(len(packets), np.int32))
 
     def trace(self, forward: Forward, packets: Int64[np.ndarray, "p 2"], kept: PacketHits) -> None:
         """Follow the rays of the packets."""
@@ -139,13 +136,13 @@ class PacketTracer:
         firsts = np.concatenate([[0], np.cumsum(recording.kept.slot_counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
         geometry = GEOMETRY_WORDS if gradients.with_geometry else 0
-        rows = Rows(
-            firsts=firsts,
-            ids=self._pool.empty((count,), np.int32),
-            sums=self._pool.empty((count, ROW_WORDS), np.float32),
-            geometry=self._pool.empty((count, geometry), np.float32),
-            features=np.empty((count, feature_count), np.float32),
+        ids, sums, by_geometry, features = self._pool.empty(
+            ((count,), np.int32),
+            ((count, ROW_WORDS), np.float32),
+            ((count, geometry), np.float32),
+            ((count, feature_count), np.float32),
         )
+        rows = Rows(firsts, ids, sums, by_geometry, features)
         rays, packets = Rays.of(recording.rays), recording.packets
         replay_packets(
             rays, packets, recording.hits, recording.kept, recording.counts, parameters, scene.features,

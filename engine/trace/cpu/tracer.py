@@ -160,10 +160,8 @@ class CpuTracer:
     def _room(self, rays: int) -> Hits:
         """Memory for the hits of so many recorded rays."""
         places = rays * (self._limits.max_hits + SPARE)
-        return Hits(
-            starts=np.empty(rays, np.int64),
-            ids=self._pool.empty((places,), np.int32),
-            alphas=self._pool.empty((places,), np.float32),
-            distances=self._pool.empty((places,), np.float32),
-            rgb=self._pool.empty((places, 3), np.float32),
+        numbers = ((places,), np.float32)
+        ids, alphas, distances, rgb = self._pool.empty(
+            ((places,), np.int32), numbers, numbers, ((places, 3), np.float32)
         )
+        return Hits(np.empty(rays, np.int64), ids, alphas, distances, rgb)
