@@ -329,6 +329,8 @@ def _train(
         record["planned_iterations"] = trainer.schedule.planned
     if trainer.views is not None:
         record["training_views"] = trainer.views.as_dict()
+    if trainer.poses is not None:
+        record["poses"] = trainer.poses.as_dict()
     if (exposures := exposures_of(trainer.shading)) is not None:
         exposures.guess_others()
         record["exposures"] = exposures.as_dict([view.name for view in dataset.views])

@@ -40,10 +40,15 @@ class SeenSpace:
 
 
 def points_in_cam(xyz_world: Float64[np.ndarray, "n 3"], view: PosedView) -> Float64[np.ndarray, "n 3"]:
-    """Camera coordinates, added up column by column: the same bits on any number of threads."""
-    columns = view.rotation_cam_from_world.T
-    parts = (xyz_world[:, k, None] * columns[k] for k in range(3))
-    return np.asarray(sum(parts) + view.translation_cam_from_world)
+    """Camera coordinates."""
+    return turned(xyz_world, view.rotation_cam_from_world) + view.translation_cam_from_world
+
+
+def turned(
+    vectors: Float64[np.ndarray, "n 3"], rotation: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "n 3"]:
+    """``rotation @ vector``, added up column by column: the same bits on any number of threads."""
+    return np.asarray(sum(vectors[:, k, None] * rotation[:, k] for k in range(3)))
 
 
 def is_shown(in_cam: Float64[np.ndarray, "n 3"], camera: Camera) -> Bool[np.ndarray, " n"]:

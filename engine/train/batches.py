@@ -15,6 +15,7 @@ from engine.rays import RayBatch
 from engine.scene import View
 from engine.train.config import TrainConfig, window_side_px
 
+TILE_PX = 8
 GOLDEN = (math.sqrt(5) - 1) / 2
 """Its multiples fill the unit interval evenly, however many there are."""
 
@@ -288,3 +289,18 @@ def still_background(config: TrainConfig) -> Float32[np.ndarray, "3"]:
 def view_sizes_px(dataset: TrainingData) -> Int64[np.ndarray, "n 2"]:
     """Width and height of every view."""
     return np.array([[view.width_px, view.height_px] for view in dataset.views], np.int64)
+
+
+def grid_pixels(
+    indices: Int64[np.ndarray, " v"], sizes_px: Int64[np.ndarray, "n 2"], tiles: int
+) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
+    """Pixels (view, y, x) evenly over each view, ``tiles * TILE_PX`` each way, in tiles of neighbours."""
+    side = tiles * TILE_PX
+    shape = (tiles, tiles, TILE_PX, TILE_PX)
+    tile_y, tile_x, y, x = np.unravel_index(np.arange(side * side), shape)
+    down, across = tile_y * TILE_PX + y + 0.5, tile_x * TILE_PX + x + 0.5
+    width, height = sizes_px[indices].T
+    rows = (down * height[:, None] / side).astype(np.int64)
+    columns = (across * width[:, None] / side).astype(np.int64)
+    view = np.broadcast_to(indices[:, None], rows.shape)
+    return view.reshape(-1), rows.reshape(-1), columns.reshape(-1)

@@ -22,7 +22,7 @@ from engine.writing import replacing
 FORMAT = 6
 KEEP = 2
 _PREFIX = "iteration_"
-_GROUPS = ("gaussians", "adam", "average", "densifier", "shading")
+_GROUPS = ("gaussians", "adam", "average", "densifier", "shading", "poses")
 # What reading a damaged archive may raise; a flipped bit can ask for encryption or a lengthy array.
 _DAMAGE = (
     OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
@@ -72,6 +72,8 @@ def save_checkpoint(state: TrainState, folder: Path, fingerprint: str) -> Path:
         arrays |= {f"average.{name}": array for name, array in row_arrays(state.average.gaussians).items()}
     arrays |= {f"densifier.{name}": value for name, value in state.densifier.items()}
     arrays |= {f"shading.{name}": value for name, value in state.shading.items()}
+    if len(state.pose_corrections):
+        arrays["poses.corrections"] = state.pose_corrections
     meta["arrays"] = sorted(arrays)
     with replacing(path) as temporary:
         np.savez(temporary, meta=np.array(json.dumps(meta)), **arrays)
@@ -122,6 +124,7 @@ def load_checkpoint(path: Path, fingerprint: str) -> TrainState:
         probed=[(iteration, psnr) for iteration, psnr in meta["probed"]],
         hastened_after=meta["hastened_after"],
         taken_near=meta["taken_near"],
+        pose_corrections=groups["poses"].get("corrections", np.zeros((0, 6))),
         average=RunningMean(mean, meta["averaged"]),
     )
 

@@ -180,6 +180,9 @@ class TrainConfig(_Frozen):
     misfits_after: float = Field(
         0.3, ge=0, le=1, description="share of the iterations after which checkpoints look for them"
     )
+    refine_poses: bool = Field(
+        False, description="learn a small correction of the pose of each training view; not with materials"
+    )
     average_after: float = Field(
         0.85,
         ge=0,
@@ -232,6 +235,11 @@ class TrainConfig(_Frozen):
             raise ValueError(
                 "background=learnt is for scenes without materials, which learn the light around them: leave "
                 "one of the two out"
+            )
+        if self.refine_poses and self.materials.learn:
+            raise ValueError(
+                "refine_poses aligns photographs by what keeps its place, which reflections do not: leave it "
+                "or the materials out"
             )
         return self
 

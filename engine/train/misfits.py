@@ -15,11 +15,11 @@ from engine.psnr import colour_corrected, psnr
 from engine.scene import View
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
-from engine.train.batches import TrainingData, still_background, view_sizes_px
+from engine.train.batches import TrainingData, grid_pixels, still_background, view_sizes_px
 from engine.train.config import TrainConfig
 
-TILES, TILE_PX = 3, 8
-"""A view is measured on a grid of ``TILES * TILE_PX`` pixels each way, traced in tiles of neighbours."""
+TILES = 3
+"""So many tiles each way of a view are measured, see :func:`engine.train.batches.grid_pixels`."""
 VIEWS_AT_ONCE = 64
 LEAST_VIEWS = 6
 """Among fewer views nobody can say which of them is odd."""
@@ -58,7 +58,7 @@ def view_fits(
     plain, corrected = [], []
     for start in range(0, len(indices), VIEWS_AT_ONCE):
         some = indices[start : start + VIEWS_AT_ONCE]
-        view, y, x = _grid(some, view_sizes_px(dataset))
+        view, y, x = grid_pixels(some, view_sizes_px(dataset), TILES)
         rays = dataset.rays(view, y, x)
         rgb, alpha, weight = dataset.pixels(view, y, x)
         background = still_background(config)
@@ -126,21 +126,6 @@ def _around(
     others = min(NEIGHBOURS, int(counts.sum()) - 1)
     nearest = np.argsort(away, axis=1, kind="stable")[:, :others]
     return np.asarray(np.median(psnr[nearest], axis=1))
-
-
-def _grid(
-    indices: Int64[np.ndarray, " v"], sizes_px: Int64[np.ndarray, "n 2"]
-) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-    """The measured pixels (view, y, x) of views, tile by tile."""
-    side = TILES * TILE_PX
-    order = np.arange(side * side).reshape(TILES, TILES, TILE_PX, TILE_PX)
-    tile_y, tile_x, y, x = np.unravel_index(np.arange(order.size), order.shape)
-    down, across = tile_y * TILE_PX + y + 0.5, tile_x * TILE_PX + x + 0.5
-    width, height = sizes_px[indices].T
-    rows = (down * height[:, None] / side).astype(np.int64)
-    columns = (across * width[:, None] / side).astype(np.int64)
-    view = np.broadcast_to(indices[:, None], rows.shape)
-    return view.reshape(-1), rows.reshape(-1), columns.reshape(-1)
 
 
 @dataclass(frozen=True)

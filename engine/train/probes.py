@@ -10,7 +10,6 @@ from engine.colour import composited
 from engine.errors import TrainingFailure
 from engine.events import HeldOutMeasured, Listener, Warned
 from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
 from engine.train.batches import PixelSampler, TrainingData, still_background, view_sizes_px
@@ -26,10 +25,11 @@ EMPTY_ALPHA = 0.01
 class Probe:
     """Random pixels of some views, over a background."""
 
-    rays: RayBatch
+    view: Int64[np.ndarray, " r"]
+    y: Int64[np.ndarray, " r"]
+    x: Int64[np.ndarray, " r"]
     rgb_srgb: Float32[np.ndarray, "r 3"]
     weight: Float32[np.ndarray, " r"]
-    view: Int64[np.ndarray, " r"]
     background_srgb: Float32[np.ndarray, "3"]
 
 
@@ -40,17 +40,20 @@ def draw_probe(
     view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, config.probe_rays)
     rgb, alpha, weight = dataset.pixels(view, y, x)
     background = still_background(config)
-    return Probe(dataset.rays(view, y, x), composited(rgb, alpha, background), weight, view, background)
+    return Probe(view, y, x, composited(rgb, alpha, background), weight, background)
 
 
-def measure(probe: Probe, tracer: Tracer, shading: ShadingModel) -> tuple[float, float]:
+def measure(
+    probe: Probe, dataset: TrainingData, tracer: Tracer, shading: ShadingModel
+) -> tuple[float, float]:
     """PSNR averaged over the views, dB, and the mean accumulated alpha.
 
     All are seen as new views are, but exposed as each is known or guessed to be where exposures are learnt.
     """
-    seen = tracer.trace(probe.rays)
+    rays = dataset.rays(probe.view, probe.y, probe.x)
+    seen = tracer.trace(rays)
     view = probe.view if exposures_of(shading) is not None else None
-    developed = shading.develop(Sight(probe.rays, seen, tracer, view))
+    developed = shading.develop(Sight(rays, seen, tracer, view))
     render = np.clip(developed.over(probe.background_srgb), 0, 1)
     error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
     views, inverse = np.unique(probe.view, return_inverse=True)
@@ -83,6 +86,7 @@ class Judge:
         self._held_out = None
         if len(dataset.test_indices):
             self._held_out = draw_probe(dataset, dataset.test_indices, config, rng)
+        self._dataset = dataset
         self._folder = folder
         self._step_back_db = config.step_back_db
         self._tell = listener
@@ -100,7 +104,7 @@ class Judge:
             )
         if (exposures := exposures_of(shading)) is not None:
             exposures.guess_others()
-        psnr, alpha = measure(self._probe, tracer, shading)
+        psnr, alpha = measure(self._probe, self._dataset, tracer, shading)
         if alpha < EMPTY_ALPHA and state.iteration > 0:
             raise TrainingFailure(
                 f"After iteration {state.iteration} the scene covers only {100 * alpha:.2f} % of the "
@@ -111,12 +115,12 @@ class Judge:
             state.best_psnr, state.best_iteration = psnr, state.iteration
             save_best(state.gaussians, shading.state(), self._folder)
         if self._held_out is not None:
-            held_out, _ = measure(self._held_out, tracer, shading)
+            held_out, _ = measure(self._held_out, self._dataset, tracer, shading)
             self._tell(HeldOutMeasured(state.iteration, held_out, len(state.gaussians), state.seconds))
 
     def choose(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> FlatGaussians:
         """The last Gaussians, or the best if those are much worse; the shading becomes theirs too."""
-        last, _ = measure(self._probe, tracer, shading)
+        last, _ = measure(self._probe, self._dataset, tracer, shading)
         if last >= state.best_psnr - self._step_back_db:
             return state.gaussians
         self._tell(

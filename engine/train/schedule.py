@@ -10,6 +10,8 @@ from engine.train.config import TrainConfig, iteration_count, rebuild_interval
 from engine.train.early_end import last_iteration
 
 EVENT_EVERY = 10
+POSES_FROM, POSES_UNTIL, POSE_ROUNDS = 0.3, 0.8, 12
+"""Shares of the iterations between which poses are refined, and about how often."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,14 @@ class Schedule:
         since = self.config.misfits_after * self.iterations
         return self.measures(done) and since <= done < self.iterations
 
+    def refines_poses(self, done: int) -> bool:
+        """Whether the poses of training views are refined after ``done`` iterations."""
+        if not self.config.refine_poses or not POSES_FROM <= done / self.iterations <= POSES_UNTIL:
+            return False
+        every = self.config.rebuild_every
+        rebuilds = self.iterations * (POSES_UNTIL - POSES_FROM) / POSE_ROUNDS / every
+        return done % (every * max(1, round(rebuilds))) == 0
+
     def averages(self, done: int) -> bool:
         """Whether the state after ``done`` iterations counts in the mean that is exported."""
         since = max(self.config.average_after * self.iterations, self.hastened_after or 0)
@@ -66,7 +76,8 @@ class Schedule:
 
     def rebuilds(self, done: int, gaussians: int) -> bool:
         """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
-        return self.measures(done) or done % rebuild_interval(self.config, gaussians) == 0
+        due = done % rebuild_interval(self.config, gaussians) == 0
+        return due or self.measures(done) or self.refines_poses(done)
 
     def tells(self, done: int) -> bool:
         """Whether listeners hear of the progress."""

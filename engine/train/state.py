@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from engine.gaussians.model import FlatGaussians
 from engine.train.averaging import RunningMean
@@ -27,6 +27,8 @@ class TrainState:
         best_iteration: when that was.
         left_out: training views that are left out from here on.
         average: the mean of the last states, where they are averaged.
+        pose_corrections: of all views, where poses are refined: the rotation vectors (rad) and shifts (world
+            units) by which the points of their cameras move.
         probed: iterations and training rays' probe after them, dB.
         hastened_after: where it was decided to end early, None where it was not.
         taken_near: Gaussians taken away so far for being too near to a camera.
@@ -46,6 +48,7 @@ class TrainState:
     probed: list[tuple[int, float]] = field(default_factory=list)
     hastened_after: int | None = None
     taken_near: int = 0
+    pose_corrections: Float64[np.ndarray, "v 6"] = field(default_factory=lambda: np.zeros((0, 6)))
     average: RunningMean = field(default_factory=RunningMean)
 
     def raise_degree(self, degree: int) -> None:

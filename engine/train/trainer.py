@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from engine.errors import Cancelled, TrainingFailure
+from engine.errors import Cancelled, ConfigError, TrainingFailure
 from engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
@@ -18,12 +18,14 @@ from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource, DrawnAhead, TrainingData
 from engine.train.checkpoint import save_checkpoint
 from engine.train.config import TrainConfig, most_gaussians
+from engine.train.corrected_views import PosedPhotographs
 from engine.train.densify import make_densifier
 from engine.train.densify.propagating import Propagating
 from engine.train.early_end import gains_no_more
 from engine.train.floors import ScaleFloor
 from engine.train.iteration import Differentiated, Machinery, iterate
 from engine.train.misfits import TrainingViews, ViewJudge
+from engine.train.pose_refinement import PoseRefiner, RefinedPoses
 from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
 from engine.train.shading import make_shading
@@ -58,6 +60,7 @@ class Trainer:
         schedule: when what happens; another one from where it is decided to end early.
         shading: the shading model.
         views: how well the exported Gaussians show the training views, once they are there.
+        poses: those of the training views then, where they are refined.
 
     Raises:
         ConfigError: the settings do not suit the photographs.
@@ -93,6 +96,13 @@ class Trainer:
         self._should_stop = should_stop
         self._extent = dataset.extent
         self._threads = threads
+        self._refiner = _refiner(dataset, config)
+        if self._refiner is not None:
+            dataset = self._refiner.dataset
+            if len(state.pose_corrections):
+                self._refiner.dataset.put(state.pose_corrections)
+            else:
+                state.pose_corrections = np.zeros((len(dataset.views), 6))
         self._batches = BatchSource(dataset, config)
         pixels = self._batches.sampler.pixel_count
         self.schedule = Schedule.of(config, pixels)
@@ -117,6 +127,7 @@ class Trainer:
         self._names = [view.name for view in dataset.views]
         self._view_judge = ViewJudge(dataset, config)
         self.views: TrainingViews | None = None
+        self.poses: RefinedPoses | None = None
         if len(state.left_out):
             self._batches.leave_out(state.left_out)
 
@@ -179,6 +190,11 @@ class Trainer:
         self.views = self._view_judge.conclude(machinery.tracer, machinery.shading, state.left_out)
         if (complaint := self.views.complaint()) is not None:
             self._tell(Warned(complaint))
+        if self._refiner is not None:
+            self.poses = self._refiner.conclude(
+                state.pose_corrections, machinery.tracer, machinery.shading, state.left_out
+            )
+            self._tell(Warned(self.poses.sentence()))
         return chosen
 
     def _draws_or_stops(self, done: int) -> bool:
@@ -202,6 +218,8 @@ class Trainer:
         state, schedule = self.state, self.schedule
         stopping = self._should_stop() and not schedule.ends(state.iteration)
         measuring = schedule.measures(state.iteration)
+        if not resumed:  # else done before the checkpoint was written
+            self._refine_poses()
         if (stopping or measuring) and not resumed:
             with watch.held() as seconds:
                 state.seconds = seconds
@@ -214,6 +232,14 @@ class Trainer:
             raise Cancelled(
                 f"Stopped after iteration {state.iteration} of {self.schedule.iterations}; "
                 "the same command with --resume goes on."
+            )
+
+    def _refine_poses(self) -> None:
+        """Align the training views with what the Gaussians show, where that is due."""
+        state, machinery = self.state, self._machinery
+        if self._refiner is not None and self.schedule.refines_poses(state.iteration):
+            state.pose_corrections = self._refiner.refine(
+                state.pose_corrections, machinery.tracer, machinery.shading, state.left_out
             )
 
     def _leave_out(self) -> None:
@@ -319,3 +345,11 @@ class Trainer:
                 seconds_left=pace_s * (total - state.iteration),
             )
         )
+
+
+def _refiner(dataset: TrainingData, config: TrainConfig) -> PoseRefiner | None:
+    if not config.refine_poses:
+        return None
+    if not isinstance(dataset, PosedPhotographs):
+        raise ConfigError("refine_poses projects into the photographs, but these come without cameras.")
+    return PoseRefiner(dataset, config)

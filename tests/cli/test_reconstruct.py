@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 FILES = (
@@ -62,6 +63,29 @@ def test_the_training_time_is_told_once_and_the_same(run):
     assert finished["seconds"] == training["seconds"] == run.metrics()["seconds"]
     told = re.findall(r"[Tt]rained (?:60 iterations )?in (\S+ (?:s|min))", run.stdout)
     assert len(told) == 2 and len(set(told)) == 1, run.stdout
+
+
+def test_corrected_poses_are_written_where_that_is_asked_for(run, octasplat, tiny, tmp_path):
+    assert "poses" not in json.loads((run.output / "training.json").read_text())
+    output = tmp_path / "run"
+    asked = ("--set", "refine_poses=true", "--exports", "")
+    result = octasplat("reconstruct", run.scene, "-o", output, *tiny, *asked)
+    assert result.exit_code == 0, result.output
+    poses = json.loads((output / "training.json").read_text())["poses"]
+    given = {view["name"]: view for view in json.loads((output / "views.json").read_text())["views"]}
+    trained = given.keys() - set(json.loads((output / "held_out.json").read_text()))
+    assert poses and poses.keys() <= trained
+    largest = max(poses, key=lambda name: poses[name]["moved_px"])
+    assert (
+        f"The poses of {len(poses)} of {len(trained)} training views were corrected" in result.output
+        and f"{poses[largest]['moved_px']:.2f} px at most ({largest})" in result.output
+    )
+    for name, pose in poses.items():
+        turned = (
+            np.array(pose["rotation_cam_from_world"]) @ np.array(given[name]["rotation_cam_from_world"]).T
+        )
+        degrees = np.degrees(np.arccos((np.trace(turned) - 1) / 2))
+        assert 0 < degrees < 3 and abs(degrees - pose["turned_deg"]) < 1e-3
 
 
 def test_resume_of_a_finished_run_needs_no_settings(run, octasplat):

@@ -22,6 +22,9 @@ def paint(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 class FlatWorld:
     """Pinhole cameras in the plane z = -2 that look straight at the painted plane; follows TrainingData."""
 
+    detail = 1.0
+    """Waves are so many times as short."""
+
     def __init__(self, count: int = 7, side_px: int = 40, held_out: int = 1) -> None:
         rng = np.random.default_rng(0)
         self.origins = np.concatenate([rng.uniform(-0.5, 0.5, (count, 2)), np.full((count, 1), -2.0)], axis=1)
@@ -47,22 +50,26 @@ class FlatWorld:
     def pixels(
         self, view: np.ndarray, y: np.ndarray, x: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rays = self.rays(view, y, x)
+        return self.shown(self.rays(view, y, x))
+
+    def shown(self, rays: RayBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Colour, alpha and weight of the plane where rays meet it."""
         origins, directions = rays.origins_world, rays.directions_world
         points = origins - directions * (origins[:, 2:] / directions[:, 2:])
-        rgb = paint(points[:, 0], points[:, 1])
+        rgb = paint(self.detail * points[:, 0], self.detail * points[:, 1])
         if self.poison:
             rgb[:] = np.nan
-        ones = np.ones(len(view), np.float32)
+        ones = np.ones(len(rays), np.float32)
         return rgb, ones, ones.copy()
 
-    def start(self, count: int = 300, opacity: float = 0.1) -> FlatGaussians:
-        """Grey Gaussians on random points of the plane."""
+    def start(self, count: int = 300, opacity: float = 0.1, *, painted: bool = False) -> FlatGaussians:
+        """Gaussians on random points of the plane, grey or in its colours."""
         rng = np.random.default_rng(1)
         xyz = np.concatenate([rng.uniform(-1.6, 1.6, (count, 2)), np.zeros((count, 1))], axis=1)
+        painting = paint(self.detail * xyz[:, 0], self.detail * xyz[:, 1])
         return from_points(
             xyz.astype(np.float32),
-            np.full((count, 3), 0.5, np.float32),
+            painting if painted else np.full((count, 3), 0.5, np.float32),
             self.origins,
             extent=self.extent,
             limit=count,
