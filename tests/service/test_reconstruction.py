@@ -30,7 +30,7 @@ pytestmark = pytest.mark.heavy
 ROOT = Path(__file__).parents[2]
 TRAIN = {
     "iterations": 500, "rays": 512, "sh_degree": 1, "max_gaussians": 500, "initial_points": 400,
-    "fit_iterations": 20, "rebuild_every": 25, "checkpoint_every": 25, "probe_rays": 256,
+    "fit_iterations": 20, "rebuild_every": 25, "checkpoint_every": 25, "probe_rays": 256, "stop_early": 0,
 }  # fmt: skip
 OPTIONS: dict[str, Any] = {"preset": "fast", "train": TRAIN}
 
