@@ -1,15 +1,15 @@
 """Whole images from a tracer, a band of rows at a time."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from engine.rays import ImageRays
+from engine.rays import ImageRays, RayBatch
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import ShadingModel, Sight
-from engine.trace.protocol import Tracer
+from engine.trace.protocol import Tracer, TraceResult
 
 RAYS_AT_ONCE = 1 << 18
 FRONT = 0.005
@@ -59,23 +59,18 @@ def render_rays(
         np.empty((height, width, 3), np.float32),
         layers,
     )
-    rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
-    for top in range(0, height, rows):
-        band = slice(top, min(top + rows, height))
-        order = tile_order(min(rows, height - top), width)
-        rays = image.rays[top * width + order]
+    for band, order, rays in _bands(image):
         seen = tracer.trace(rays)
         developed = shading.develop(Sight(rays, seen, tracer))
         rgb = developed.over(background)
         for name, values in developed.layers.items():
             layers.setdefault(name, np.empty((height, width, values.shape[1]), np.float32))
-        length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
         for part, values in (
             (out.rgb_srgb, np.clip(rgb, 0, 1)),
             (out.alpha, seen.alpha),
             (out.depth, seen.expected_depth),
             (out.depth_median, seen.depth_median),
-            (out.normal_world, seen.normal_world / np.maximum(length, 1e-12)),
+            (out.normal_world, _unit_normals(seen)),
             *((layers[name], values) for name, values in developed.layers.items()),
         ):
             part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
@@ -95,19 +90,28 @@ def front_normals(
         image: the rays, with unit directions.
         depth_median: that which :func:`render_rays` found along them.
     """
-    height, width = image.height_px, image.width_px
-    out = np.empty((height, width, 3), np.float32)
-    rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
-    for top in range(0, height, rows):
-        band = slice(top, min(top + rows, height))
-        order = tile_order(min(rows, height - top), width)
-        rays = image.rays[top * width + order]
+    out = np.empty((image.height_px, image.width_px, 3), np.float32)
+    for band, order, rays in _bands(image):
         depth = depth_median[band].reshape(-1)[order]
         ends = np.where(depth > 0, depth * np.float32(1 + FRONT), np.inf).astype(np.float32)
         seen = tracer.trace(replace(rays, t_max=np.minimum(rays.t_max, ends).astype(np.float32)))
-        length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
-        out[band].reshape(-1, 3)[order] = seen.normal_world / np.maximum(length, 1e-12)
+        out[band].reshape(-1, 3)[order] = _unit_normals(seen)
     return out
+
+
+def _bands(image: ImageRays) -> Iterator[tuple[slice, Int64[np.ndarray, " r"], RayBatch]]:
+    """The rows of an image a band at a time, the numbers of the band's pixels in tiles, and their rays."""
+    height, width = image.height_px, image.width_px
+    rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
+    for top in range(0, height, rows):
+        count = min(rows, height - top)
+        order = tile_order(count, width)
+        yield slice(top, top + count), order, image.rays[top * width + order]
+
+
+def _unit_normals(seen: TraceResult) -> Float32[np.ndarray, "r 3"]:
+    length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
+    return np.asarray(seen.normal_world / np.maximum(length, 1e-12))
 
 
 def tile_order(height: int, width: int) -> Int64[np.ndarray, " r"]:

@@ -8,6 +8,7 @@ nothing is looked for. The first Gaussians, near zones, floors on scales, meshes
 photographs" use the poses that are given, and so do later commands; ``training.json`` has the corrected ones.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,14 +102,12 @@ class PoseRefiner:
         """
         dataset, found = self.dataset, corrections.copy()
         used = np.setdiff1d(dataset.train_indices, left_out)
-        for start in range(0, len(used), VIEWS_AT_ONCE):
-            some = used[start : start + VIEWS_AT_ONCE]
-            for index, rendered in zip(some.tolist(), self._rendered(some, tracer, shading), strict=True):
-                view = dataset.views[index]
-                photograph = photograph_of(dataset, index, (view.width_px, view.height_px), self._config)
-                motion = aligned(rendered, photograph, dataset.cameras[view.camera_index])
-                if motion is not None:
-                    found[index] = motion.share(TAKEN).after(Motion.of(found[index])).numbers
+        for index, rendered in self._rendered(used, tracer, shading):
+            view = dataset.views[index]
+            photograph = photograph_of(dataset, index, (view.width_px, view.height_px), self._config)
+            motion = aligned(rendered, photograph, dataset.cameras[view.camera_index])
+            if motion is not None:
+                found[index] = motion.share(TAKEN).after(Motion.of(found[index])).numbers
         found = without_common(found, dataset.given, used)
         dataset.put(found)
         return found
@@ -124,38 +123,36 @@ class PoseRefiner:
         dataset, found = self.dataset, {}
         used = np.setdiff1d(dataset.train_indices, left_out)
         moved = used[corrections[used].any(axis=1)]
-        for start in range(0, len(moved), VIEWS_AT_ONCE):
-            some = moved[start : start + VIEWS_AT_ONCE]
-            for index, rendered in zip(some.tolist(), self._rendered(some, tracer, shading), strict=True):
-                view, given = dataset.views[index], dataset.given.views[index]
-                camera, motion = dataset.cameras[view.camera_index], Motion.of(corrections[index])
-                points = rendered.points_cam
-                away = np.linalg.norm(camera.project(points) - camera.project(motion.undone(points)), axis=1)
-                away = away[np.isfinite(away)]
-                found[view.name] = RefinedPose(
-                    rotation_cam_from_world=view.rotation_cam_from_world.tolist(),
-                    translation_cam_from_world=view.translation_cam_from_world.tolist(),
-                    turned_deg=float(np.degrees(np.linalg.norm(corrections[index, :3]))),
-                    shifted_world=float(np.linalg.norm(view.origin_world - given.origin_world)),
-                    moved_px=float(np.median(away)) if len(away) else None,
-                )
+        for index, rendered in self._rendered(moved, tracer, shading):
+            view, given = dataset.views[index], dataset.given.views[index]
+            camera, motion = dataset.cameras[view.camera_index], Motion.of(corrections[index])
+            points = rendered.points_cam
+            away = np.linalg.norm(camera.project(points) - camera.project(motion.undone(points)), axis=1)
+            away = away[np.isfinite(away)]
+            found[view.name] = RefinedPose(
+                rotation_cam_from_world=view.rotation_cam_from_world.tolist(),
+                translation_cam_from_world=view.translation_cam_from_world.tolist(),
+                turned_deg=float(np.degrees(np.linalg.norm(corrections[index, :3]))),
+                shifted_world=float(np.linalg.norm(view.origin_world - given.origin_world)),
+                moved_px=float(np.median(away)) if len(away) else None,
+            )
         return RefinedPoses(found, len(used))
 
     def _rendered(
         self, indices: Int64[np.ndarray, " v"], tracer: Tracer, shading: ShadingModel
-    ) -> list[Rendered]:
-        """What the Gaussians show of a grid of pixels of each view, where they show a surface."""
+    ) -> Iterator[tuple[int, Rendered]]:
+        """Each view with what the Gaussians show of a grid of its pixels, where they show a surface."""
         dataset = self.dataset
-        view, y, x = grid_pixels(indices, view_sizes_px(dataset), TILES)
-        rays = dataset.rays(view, y, x)
-        seen = tracer.trace(rays)
-        developed = shading.develop(Sight(rays, seen, tracer, view))
-        rgb = np.clip(developed.over(still_background(self._config)), 0, 1)
-        met = (seen.depth_median > 0) & (seen.alpha >= OPAQUE)
-        points_world = seen.depth_median[:, None].astype(np.float64) * rays.directions_world
-        found = []
-        for index in indices.tolist():
-            chosen = met & (view == index)
-            points = turned(points_world[chosen], dataset.views[index].rotation_cam_from_world)
-            found.append(Rendered(points, rgb[chosen].astype(np.float64)))
-        return found
+        for start in range(0, len(indices), VIEWS_AT_ONCE):
+            some = indices[start : start + VIEWS_AT_ONCE]
+            view, y, x = grid_pixels(some, view_sizes_px(dataset), TILES)
+            rays = dataset.rays(view, y, x)
+            seen = tracer.trace(rays)
+            developed = shading.develop(Sight(rays, seen, tracer, view))
+            rgb = np.clip(developed.over(still_background(self._config)), 0, 1)
+            met = (seen.depth_median > 0) & (seen.alpha >= OPAQUE)
+            points_world = seen.depth_median[:, None].astype(np.float64) * rays.directions_world
+            for index in some.tolist():
+                chosen = met & (view == index)
+                points = turned(points_world[chosen], dataset.views[index].rotation_cam_from_world)
+                yield index, Rendered(points, rgb[chosen].astype(np.float64))
