@@ -28,6 +28,7 @@ from engine.shading.geometry_terms import (
 )
 from engine.shading.learnt_light import LearntLight
 from engine.shading.material_settings import SEED_MATERIAL, SEED_REACH, MaterialSettings
+from engine.shading.parted import Parted, part, whole
 from engine.shading.protocol import Developed, Reversed, Sight
 from engine.shading.reflections import (
     Facets,
@@ -62,6 +63,7 @@ class _Reflection:
 
 @dataclass(frozen=True)
 class _Kept:
+    parted: Parted
     buffer: Buffer
     surface: Surface
     linear: Float64[np.ndarray, "p 3"]
@@ -164,12 +166,13 @@ class Deferred:
         seen = sight.seen
         if share == 0:
             return Developed(seen.rgb_srgb, seen.transmittance)
-        buffer = gather(sight.rays, seen)
-        surface, reflection = self._dimmed(seen, buffer), None
+        parted = self._part(sight)
+        buffer = gather(parted.rays, parted.seen)
+        surface, reflection = self._dimmed(parted.seen, buffer), None
         if sight.progress >= self.settings.secondary_from:
-            surface, reflection = self._reflect(sight, buffer, surface)
+            surface, reflection = self._reflect(sight, parted.rays, buffer, surface)
         linear = shade(surface, self.light.levels, self.frame)
-        rgb = seen.rgb_srgb * np.float32(1 - share)
+        rgb = parted.seen.rgb_srgb * np.float32(1 - share)
         if self.settings.recipe == "seed":
             shown = linear
             if self.settings.is_seed_deferred(sight.progress):
@@ -178,9 +181,16 @@ class Deferred:
         else:
             shown = linear_to_srgb(np.minimum(linear, 1.0))
         rgb[buffer.which] += (share * buffer.alpha[:, None] * shown).astype(np.float32)
-        kept = _Kept(buffer, surface, linear, shown, reflection, share)
-        layers = {} if sight.view is not None else self._layers(rgb, buffer, surface, linear)
-        return Developed(rgb, seen.transmittance, kept, layers)
+        kept = _Kept(parted, buffer, surface, linear, shown, reflection, share)
+        layers = {} if sight.view is not None else self._layers(parted, rgb, buffer, surface, linear)
+        return Developed(parted.joined(rgb), seen.transmittance, kept, layers)
+
+    def _part(self, sight: Sight) -> Parted:
+        """The surfaces that are shaded each by itself."""
+        if self.settings.parted == 0 or self.settings.recipe == "seed":
+            return whole(sight.rays, sight.seen)
+        apart, record = self.settings.parted * self._gap, sight.view is not None
+        return part(sight.rays, sight.seen, sight.tracer, apart_world=apart, record=record)
 
     def reverse(
         self,
@@ -190,51 +200,57 @@ class Deferred:
         by_transmittance: Float32[np.ndarray, " r"],
     ) -> Reversed:
         """Gradients by what was blended, by what reflected rays met, and by the environment."""
-        settings, seen, kept = self.settings, sight.seen, developed.kept
+        settings, kept = self.settings, developed.kept
+        further: tuple[tuple[Recording, TraceGradients], ...] = ()
+        parameters: dict[str, np.ndarray] = {}
+        if not isinstance(kept, _Kept):
+            return Reversed(TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance))
+        parted, seen, buffer = kept.parted, kept.parted.seen, kept.buffer
+        which, harmonics = buffer.which, by_rgb * np.float32(1 - kept.shaded)
         by_alpha = -by_transmittance.astype(np.float64)
         by_normal = np.zeros((len(by_rgb), 3))
         by_features = np.zeros((len(by_rgb), seen.features.shape[1]))
         by_depth = np.zeros(len(by_rgb))
-        further: tuple[tuple[Recording, TraceGradients], ...] = ()
-        parameters: dict[str, np.ndarray] = {}
-        if not isinstance(kept, _Kept):
-            rgb = by_rgb
-        else:
-            buffer, which = kept.buffer, kept.buffer.which
-            by_shown = by_rgb[which] * kept.shaded
-            by_alpha[which] += (by_shown * kept.shown).sum(axis=1)
-            by_linear = by_shown * buffer.alpha[:, None]
-            if settings.recipe != "seed":
-                by_linear *= encoding_slope(kept.linear)
-                by_linear[(kept.linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
-            blur = settings.blurred(sight.progress)
-            back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
-            normal = back.normal
-            if settings.reflected_gradient:
-                led = back.reflected + self._facing_gradient(kept, back)
-                normal = normal + clipped(led, settings.normal_clip)
-            by_material, rgb = back.material, by_rgb * np.float32(1 - kept.shaded)
-            if settings.is_seed_deferred(sight.progress):
-                rgb[which] = by_rgb[which] * (1 - kept.surface.material[:, 3:4])
-                by_material[:, 3] -= (by_rgb[which] * seen.rgb_srgb[which]).sum(axis=1)
-            elif kept.shaded == 1:
-                weight = np.float32(settings.harmonics_weight * 2 / (3 * len(by_rgb)))
-                rgb = weight * (seen.rgb_srgb - developed.rgb_srgb)
-            spread_back(buffer, by_material, normal, by_features, by_alpha, by_normal)
-            by_texels = back.texels(len(self.light.levels.texels))
-            further = self._reflected_back(kept, back, by_texels)
-            parameters = {"materials.texels": by_texels}
-            self._regularise(sight, buffer, by_features, by_alpha, by_normal, by_depth)
+        self._hold(sight, by_features, by_alpha, by_normal, by_depth)
+        if kept.shaded == 1 and not settings.is_seed_deferred(sight.progress):
+            weight = np.float32(settings.harmonics_weight * 2 / (3 * len(by_rgb)))
+            harmonics = weight * (sight.seen.rgb_srgb - developed.rgb_srgb)
+        spread = settings.normal_weight / len(by_rgb)
+        by_rgb, rgb, by_depth = parted.each(by_rgb), parted.each(harmonics), parted.each(by_depth)
+        by_alpha, by_normal = parted.each(by_alpha), parted.each(by_normal)
+        by_features = parted.each(by_features)
+        by_shown = by_rgb[which] * kept.shaded
+        by_alpha[which] += (by_shown * kept.shown).sum(axis=1)
+        by_linear = by_shown * buffer.alpha[:, None]
+        if settings.recipe != "seed":
+            by_linear *= encoding_slope(kept.linear)
+            by_linear[(kept.linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
+        blur = settings.blurred(sight.progress)
+        back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
+        normal = back.normal
+        if settings.reflected_gradient:
+            led = back.reflected + self._facing_gradient(kept, back)
+            normal = normal + clipped(led, settings.normal_clip)
+        by_material = back.material
+        if settings.is_seed_deferred(sight.progress):
+            rgb[which] = by_rgb[which] * (1 - kept.surface.material[:, 3:4])
+            by_material[:, 3] -= (by_rgb[which] * seen.rgb_srgb[which]).sum(axis=1)
+        spread_back(buffer, by_material, normal, by_features, by_alpha, by_normal)
+        spread_term(buffer, spread, by_alpha, by_normal)
+        by_texels = back.texels(len(self.light.levels.texels))
+        further = self._reflected_back(kept, back, by_texels)
+        parameters = {"materials.texels": by_texels}
         narrow = (x.astype(np.float32) for x in (rgb, -by_alpha, by_depth, by_normal, by_features))
         rgb, transmittance, depth, normal, features = narrow
-        back_seen = TraceGradients(
+        by_parts = TraceGradients(
             rgb_srgb=rgb,
             transmittance=transmittance,
             depth_sum=depth,
             normal_world=normal,
             features=features,
         )
-        return Reversed(back_seen, further, parameters)
+        back_seen, fronts = parted.back(by_parts)
+        return Reversed(back_seen, fronts + further, parameters)
 
     def step(
         self,
@@ -298,7 +314,8 @@ class Deferred:
 
     def _layers(
         self,
-        rgb_srgb: Float32[np.ndarray, "r 3"],
+        parted: Parted,
+        rgb_srgb: Float32[np.ndarray, "l 3"],
         buffer: Buffer,
         surface: Surface,
         linear: Float64[np.ndarray, "p 3"],
@@ -314,13 +331,18 @@ class Deferred:
             "visibility": surface.visibility[:, None],
             "indirect": surface.indirect_linear,
         }
-        layers = {name: np.zeros((len(rgb_srgb), part.shape[1]), np.float32) for name, part in parts.items()}
-        for name, part in parts.items():
-            layers[name][buffer.which] = part
+        share = np.zeros((len(rgb_srgb), 1))
+        share[buffer.which] = buffer.alpha[:, None]
+        share /= np.maximum(parted.each(parted.joined(share)), 1e-12)
+        layers = {}
+        for name, values in parts.items():
+            each = np.zeros((len(rgb_srgb), values.shape[1]))
+            each[buffer.which] = values
+            layers[name] = parted.joined(share * each).astype(np.float32)
         return layers
 
     def _reflect(
-        self, sight: Sight, buffer: Buffer, surface: Surface
+        self, sight: Sight, rays: RayBatch, buffer: Buffer, surface: Surface
     ) -> tuple[Surface, "_Reflection | None"]:
         """The surface with what reflected rays say of it."""
         settings = self.settings
@@ -331,17 +353,18 @@ class Deferred:
             salt = int(sight.progress * TURNS)
             facets = facets_of(surface, least_slope=settings.least_slope(sight.progress), salt=salt)
             mirrored = follow(
-                mirrored_pair(sight.rays, buffer, facets, gap_world=self._gap),
+                mirrored_pair(rays, buffer, facets, gap_world=self._gap),
                 sight.tracer, self.light.levels, self.frame, self._dimmed,
-                surfaces=settings.reflections, gap_world=self._gap, record=record,
+                surfaces=settings.reflections, gap_world=self._gap, apart_world=settings.parted * self._gap,
+                record=record,
             )  # fmt: skip
             visibility, indirect = pair_mean(mirrored.seen)
             surface = replace(surface, visibility=visibility, indirect_linear=indirect)
             return surface, _Reflection(mirrored.trace, mirrored, facets)
-        rays = reflected_rays(sight.rays, buffer, self._gap)
+        mirrored_rays = reflected_rays(rays, buffer, self._gap)
         if seed:
-            rays = rays.up_to(SEED_REACH)
-        seen = sight.tracer.trace(rays, record=record)
+            mirrored_rays = mirrored_rays.up_to(SEED_REACH)
+        seen = sight.tracer.trace(mirrored_rays, record=record)
         visibility = (seen.transmittance > HIDDEN if seed else seen.transmittance).astype(np.float64)
         indirect = np.zeros_like(surface.indirect_linear)
         if seed and settings.indirect != "none":
@@ -380,18 +403,16 @@ class Deferred:
             return 0.0
         return pair_slope(reflection.mirrored.seen, reflection.facets, back.around, back.specular)
 
-    def _regularise(
+    def _hold(
         self,
         sight: Sight,
-        buffer: Buffer,
         by_features: Float64[np.ndarray, "r f"],
         by_alpha: Float64[np.ndarray, " r"],
         by_normal: Float64[np.ndarray, "r 3"],
         by_depth: Float64[np.ndarray, " r"],
     ) -> None:
-        """Add the gradients of the terms that hold normals, depths and materials together."""
+        """Add the gradients of the terms that hold neighbouring rays together: normals, depths, materials."""
         settings = self.settings
-        spread_term(buffer, settings.normal_weight / len(by_alpha), by_alpha, by_normal)
         if self._window > 1 and settings.depth_normal_weight > 0:
             depth_normal_term(
                 sight, self._window, settings.depth_normal_weight, by_alpha, by_normal, by_depth

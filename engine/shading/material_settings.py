@@ -28,6 +28,8 @@ class MaterialSettings(BaseModel):
         hand_over: when shading begins to replace the harmonics' colours, and when it has.
         secondary_from: when visibility and indirect light begin.
         visibility: whether what stands in the way of a reflection hides the environment there.
+        parted: rays whose mean depth is farther from the median than so many times the distance at which
+            reflected rays begin show two surfaces, which are shaded each by itself; 0 shades their mean.
         reflections: surfaces on the path of a reflected ray.
         facet_slope: least angle between a normal and the two facets beside it at which rays are reflected, at
             the beginning and from ``blur_until`` on; the rougher the surface, the larger.
@@ -75,6 +77,7 @@ class MaterialSettings(BaseModel):
     hand_over: tuple[float, float] = (0.0, 0.02)
     secondary_from: float = Field(0.05, ge=0, le=1)
     visibility: bool = True
+    parted: float = Field(2.0, ge=0)
     reflections: int = Field(3, ge=1, le=8)
     facet_slope: tuple[float, float] = (0.1, 0.01)
     indirect: Literal["shaded", "harmonics", "none"] = "shaded"

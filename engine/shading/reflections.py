@@ -18,6 +18,7 @@ from jaxtyping import Float64, UInt64
 from engine.rays import AT_INFINITY, RayBatch
 from engine.shading.buffer import Buffer, gather, reflected_rays, spread_back
 from engine.shading.environment_levels import LightLevels
+from engine.shading.parted import Parted, part, whole
 from engine.shading.split_sum import Surface, shade, shade_reverse
 from engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 
@@ -43,6 +44,7 @@ class Mirrored:
 
     Attributes:
         trace: what they met.
+        parted: that, one surface at a time.
         buffer: what was blended along those that met something.
         surface: the points of that, with what further rays say of them.
         linear: their radiance.
@@ -50,6 +52,7 @@ class Mirrored:
     """
 
     trace: TraceResult
+    parted: Parted
     buffer: Buffer
     surface: Surface
     linear: Float64[np.ndarray, "q 3"]
@@ -58,9 +61,9 @@ class Mirrored:
     @property
     def seen(self) -> Seen:
         """What each ray saw."""
-        light = np.zeros((len(self.trace.transmittance), 3))
+        light = np.zeros((len(self.parted.rays), 3))
         light[self.buffer.which] = self.buffer.alpha[:, None] * self.linear
-        return Seen(self.trace.transmittance.astype(np.float64), light)
+        return Seen(self.trace.transmittance.astype(np.float64), self.parted.joined(light))
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,7 @@ def follow(
     *,
     surfaces: int,
     gap_world: float,
+    apart_world: float,
     record: bool,
 ) -> Mirrored:
     """Follow reflected rays over at most so many surfaces.
@@ -130,19 +134,24 @@ def follow(
         dimmed: the surface of a buffer with its ambient visibility.
         surfaces: on a path, at least 1; the last one sees nothing but the environment.
         gap_world: distance from a surface at which rays begin.
+        apart_world: see :func:`engine.shading.parted.part`; 0 parts nothing.
         record: whether there will be a way back.
     """
     trace = tracer.trace(rays, record=record)
-    buffer = gather(rays, trace)
-    surface, further = dimmed(trace, buffer), None
+    parted = whole(rays, trace)
+    if apart_world > 0:
+        parted = part(rays, trace, tracer, apart_world=apart_world, record=record)
+    buffer = gather(parted.rays, parted.seen)
+    surface, further = dimmed(parted.seen, buffer), None
     if surfaces > 1 and len(buffer.which):
-        onward = reflected_rays(rays, buffer, gap_world)
+        onward = reflected_rays(parted.rays, buffer, gap_world)
         further = follow(
-            onward, tracer, light, frame, dimmed, surfaces=surfaces - 1, gap_world=gap_world, record=record
-        )
+            onward, tracer, light, frame, dimmed,
+            surfaces=surfaces - 1, gap_world=gap_world, apart_world=apart_world, record=record,
+        )  # fmt: skip
         seen = further.seen
         surface = replace(surface, visibility=seen.visibility, indirect_linear=seen.light_linear)
-    return Mirrored(trace, buffer, surface, shade(surface, light, frame), further)
+    return Mirrored(trace, parted, buffer, surface, shade(surface, light, frame), further)
 
 
 def follow_back(
@@ -156,16 +165,17 @@ def follow_back(
 
     Those by the texels are added to ``by_texels``. None by visibility, none by the geometry of what was met.
     """
-    buffer, trace = mirrored.buffer, mirrored.trace
+    buffer, trace, parted = mirrored.buffer, mirrored.trace, mirrored.parted
     assert trace.hits is not None
-    by_linear = by_light[buffer.which] * buffer.alpha[:, None]
+    by_linear = parted.each(by_light)[buffer.which] * buffer.alpha[:, None]
     back = shade_reverse(mirrored.surface, light, frame, by_linear)
     by_texels += back.texels(len(by_texels))
-    count = len(trace.transmittance)
+    count = len(parted.rays)
     by_features, nothing = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
     spread_back(buffer, back.material, np.zeros_like(back.normal), by_features, np.zeros(count), nothing)
     own = TraceGradients(rgb_srgb=nothing.astype(np.float32), features=by_features.astype(np.float32))
-    found = ((trace.hits, own),)
+    by_whole, fronts = parted.back(own)
+    found = ((trace.hits, by_whole), *fronts)
     if mirrored.further is None:
         return found
     return found + follow_back(mirrored.further, light, frame, back.indirect, by_texels)
