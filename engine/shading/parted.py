@@ -6,10 +6,10 @@ ray is traced once more as far as the mean, which lies between two surfaces wher
 front; what the whole ray saw beyond it is the back, as all that is blended is a sum over the ray.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
-from jaxtyping import Float, Int64, Shaped
+from jaxtyping import Bool, Float, Int64, Shaped
 
 from engine.rays import RayBatch
 from engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
@@ -31,13 +31,15 @@ class Parted:
         rays: of the parts.
         seen: by each part alone.
         two: numbers of the rays that show two surfaces.
-        front: recording of the fronts; None if there are none, or nothing is recorded.
+        front: recording of what was traced for the fronts; None if nothing was, or nothing is recorded.
+        traced: which of that are fronts; the others turned out to show one surface.
     """
 
     rays: RayBatch
     seen: TraceResult
     two: Int64[np.ndarray, " f"]
     front: Recording | None = None
+    traced: Bool[np.ndarray, " t"] = field(default_factory=lambda: np.zeros(0, bool))
 
     def joined(self, values: Float[np.ndarray, "l c"]) -> Float[np.ndarray, "r c"]:
         """Sums over the parts of each ray."""
@@ -57,14 +59,15 @@ class Parted:
         if not len(self.two):
             return by_parts, ()
         count = len(by_parts.rgb_srgb) - len(self.two)
-        whole, fronts = {}, {}
-        for name in (field.name for field in fields(TraceGradients)):
+        of_rays, of_fronts = {}, {}
+        for name in (entry.name for entry in fields(TraceGradients)):
             value = getattr(by_parts, name)
             if value is not None:
-                whole[name], fronts[name] = value[:count], value[count:] - value[self.two]
-        if self.front is None:
-            return TraceGradients(**whole), ()
-        return TraceGradients(**whole), ((self.front, TraceGradients(**fronts)),)
+                of_rays[name] = value[:count]
+                of_fronts[name] = np.zeros((len(self.traced), *value.shape[1:]), value.dtype)
+                of_fronts[name][self.traced] = value[count:] - value[self.two]
+        fronts = () if self.front is None else ((self.front, TraceGradients(**of_fronts)),)
+        return TraceGradients(**of_rays), fronts
 
 
 def whole(rays: RayBatch, seen: TraceResult) -> Parted:
@@ -90,27 +93,24 @@ def part(rays: RayBatch, seen: TraceResult, tracer: Tracer, *, apart_world: floa
     ends = np.minimum(np.broadcast_to(rays.t_max, len(rays))[two], mean[two])
     front_rays = rays[two].up_to(ends)
     front = tracer.trace(front_rays, record=record)
-    share = front.alpha
-    kept = (share > LEAST_SHARE) & (seen.alpha[two] - share > LEAST_SHARE)
-    if not kept.all():
-        two, front_rays = two[kept], front_rays[np.flatnonzero(kept)]
-        if not len(two):
-            return whole(rays, seen)
-        front = tracer.trace(front_rays, record=record)
+    kept = (front.alpha > LEAST_SHARE) & (seen.alpha[two] - front.alpha > LEAST_SHARE)
+    two = two[kept]
+    if not len(two):
+        return whole(rays, seen)
     sums = {}
     for name in SUMS:
-        ahead, all_of_it = getattr(front, name), getattr(seen, name).copy()
-        all_of_it[two] -= ahead
-        sums[name] = np.concatenate([all_of_it, ahead])
+        ahead, rest = getattr(front, name)[kept], getattr(seen, name).copy()
+        rest[two] -= ahead
+        sums[name] = np.concatenate([rest, ahead])
     behind = seen.transmittance.copy()
-    behind[two] += front.alpha
+    behind[two] += front.alpha[kept]
     parts = TraceResult(
         **sums,
-        transmittance=np.concatenate([behind, front.transmittance]),
-        depth_median=np.concatenate([seen.depth_median, front.depth_median]),
-        hit_counts=np.concatenate([seen.hit_counts, front.hit_counts]),
+        transmittance=np.concatenate([behind, front.transmittance[kept]]),
+        depth_median=np.concatenate([seen.depth_median, front.depth_median[kept]]),
+        hit_counts=np.concatenate([seen.hit_counts, front.hit_counts[kept]]),
     )
-    return Parted(_joined(rays, front_rays), parts, two, front.hits)
+    return Parted(_joined(rays, front_rays[kept]), parts, two, front.hits, kept)
 
 
 def _joined(rays: RayBatch, fronts: RayBatch) -> RayBatch:
