@@ -20,12 +20,7 @@ from engine.rays import RayBatch
 from engine.shading.ambient import OPEN, ambient_visibility, bounced_light
 from engine.shading.buffer import Buffer, gather, reflected_rays, spread_back
 from engine.shading.environment_frame import environment_frame
-from engine.shading.geometry_terms import (
-    depth_normal_term,
-    smooth_normal_term,
-    smoothness_term,
-    spread_term,
-)
+from engine.shading.geometry_terms import neighbour_terms, spread_term
 from engine.shading.learnt_light import LearntLight
 from engine.shading.material_settings import SEED_MATERIAL, SEED_REACH, MaterialSettings
 from engine.shading.parted import Parted, part, whole
@@ -211,7 +206,7 @@ class Deferred:
         by_normal = np.zeros((len(by_rgb), 3))
         by_features = np.zeros((len(by_rgb), seen.features.shape[1]))
         by_depth = np.zeros(len(by_rgb))
-        self._hold(sight, by_features, by_alpha, by_normal, by_depth)
+        neighbour_terms(sight, self._window, settings, by_features, by_alpha, by_normal, by_depth)
         if kept.shaded == 1 and not settings.is_seed_deferred(sight.progress):
             weight = np.float32(settings.harmonics_weight * 2 / (3 * len(by_rgb)))
             harmonics = weight * (sight.seen.rgb_srgb - developed.rgb_srgb)
@@ -402,23 +397,3 @@ class Deferred:
         if reflection is None or reflection.mirrored is None or reflection.facets is None:
             return 0.0
         return pair_slope(reflection.mirrored.seen, reflection.facets, back.around, back.specular)
-
-    def _hold(
-        self,
-        sight: Sight,
-        by_features: Float64[np.ndarray, "r f"],
-        by_alpha: Float64[np.ndarray, " r"],
-        by_normal: Float64[np.ndarray, "r 3"],
-        by_depth: Float64[np.ndarray, " r"],
-    ) -> None:
-        """Add the gradients of the terms that hold neighbouring rays together: normals, depths, materials."""
-        settings = self.settings
-        if self._window > 1 and settings.depth_normal_weight > 0:
-            depth_normal_term(
-                sight, self._window, settings.depth_normal_weight, by_alpha, by_normal, by_depth
-            )
-        if self._window > 1 and settings.smooth_normal_weight > 0:
-            smooth_normal_term(sight, self._window, settings.smooth_normal_weight, by_normal)
-        smooth = settings.smooth_weights
-        if self._window > 1 and max(smooth) > 0:
-            smoothness_term(sight, self._window, smooth, by_features, by_alpha)

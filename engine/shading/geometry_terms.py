@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from engine.shading.buffer import Buffer
+from engine.shading.material_settings import MaterialSettings
 from engine.shading.protocol import Sight
 
 OPAQUE = 0.9
@@ -37,6 +38,26 @@ def spread_term(
     """
     by_alpha[buffer.which] += weight
     by_normal[buffer.which] -= weight * buffer.surface.normal_world
+
+
+def neighbour_terms(
+    sight: Sight,
+    window_rays: int,
+    settings: MaterialSettings,
+    by_features: Float64[np.ndarray, "r f"],
+    by_alpha: Float64[np.ndarray, " r"],
+    by_normal: Float64[np.ndarray, "r 3"],
+    by_depth: Float64[np.ndarray, " r"],
+) -> None:
+    """Add the gradients of all terms that hold neighbouring rays together: normals, depths, materials."""
+    if window_rays <= 1:
+        return
+    if settings.depth_normal_weight > 0:
+        depth_normal_term(sight, window_rays, settings.depth_normal_weight, by_alpha, by_normal, by_depth)
+    if settings.smooth_normal_weight > 0:
+        smooth_normal_term(sight, window_rays, settings.smooth_normal_weight, by_normal)
+    if max(settings.smooth_weights) > 0:
+        smoothness_term(sight, window_rays, settings.smooth_weights, by_features, by_alpha)
 
 
 def depth_normal_term(

@@ -9,15 +9,13 @@ front; what the whole ray saw beyond it is the back, as all that is blended is a
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, Shaped
+from jaxtyping import Bool, Float, Float32, Int64, Shaped
 
 from engine.rays import RayBatch
 from engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 
 LEAST_SHARE = 0.05
 """Of the light of a ray that each of two surfaces takes at least."""
-SUMS = ("rgb_srgb", "depth_sum", "normal_world", "features")
-"""What a trace adds up along a ray, but for the transmittance."""
 
 
 @dataclass(frozen=True)
@@ -97,18 +95,23 @@ def part(rays: RayBatch, seen: TraceResult, tracer: Tracer, *, apart_world: floa
     two = two[kept]
     if not len(two):
         return whole(rays, seen)
-    sums = {}
-    for name in SUMS:
-        ahead, rest = getattr(front, name)[kept], getattr(seen, name).copy()
-        rest[two] -= ahead
-        sums[name] = np.concatenate([rest, ahead])
-    behind = seen.transmittance.copy()
-    behind[two] += front.alpha[kept]
+
+    def divided(sums: Float32[np.ndarray, "r *c"], ahead: Float32[np.ndarray, "t *c"]) -> np.ndarray:
+        rest = sums.copy()
+        rest[two] -= ahead[kept]
+        return np.concatenate([rest, ahead[kept]])
+
+    def listed(values: Shaped[np.ndarray, " r"], ahead: Shaped[np.ndarray, " t"]) -> np.ndarray:
+        return np.concatenate([values, ahead[kept]])
+
     parts = TraceResult(
-        **sums,
-        transmittance=np.concatenate([behind, front.transmittance[kept]]),
-        depth_median=np.concatenate([seen.depth_median, front.depth_median[kept]]),
-        hit_counts=np.concatenate([seen.hit_counts, front.hit_counts[kept]]),
+        rgb_srgb=divided(seen.rgb_srgb, front.rgb_srgb),
+        transmittance=1 - divided(seen.alpha, front.alpha),
+        depth_sum=divided(seen.depth_sum, front.depth_sum),
+        depth_median=listed(seen.depth_median, front.depth_median),
+        normal_world=divided(seen.normal_world, front.normal_world),
+        features=divided(seen.features, front.features),
+        hit_counts=listed(seen.hit_counts, front.hit_counts),
     )
     return Parted(_joined(rays, front_rays[kept]), parts, two, front.hits, kept)
 
