@@ -196,8 +196,6 @@ class Deferred:
     ) -> Reversed:
         """Gradients by what was blended, by what reflected rays met, and by the environment."""
         settings, kept = self.settings, developed.kept
-        further: tuple[tuple[Recording, TraceGradients], ...] = ()
-        parameters: dict[str, np.ndarray] = {}
         if not isinstance(kept, _Kept):
             return Reversed(TraceGradients(rgb_srgb=by_rgb, transmittance=by_transmittance))
         parted, seen, buffer = kept.parted, kept.parted.seen, kept.buffer
@@ -234,7 +232,6 @@ class Deferred:
         spread_term(buffer, spread, by_alpha, by_normal)
         by_texels = back.texels(len(self.light.levels.texels))
         further = self._reflected_back(kept, back, by_texels)
-        parameters = {"materials.texels": by_texels}
         narrow = (x.astype(np.float32) for x in (rgb, -by_alpha, by_depth, by_normal, by_features))
         rgb, transmittance, depth, normal, features = narrow
         by_parts = TraceGradients(
@@ -245,7 +242,7 @@ class Deferred:
             features=features,
         )
         back_seen, fronts = parted.back(by_parts)
-        return Reversed(back_seen, fronts + further, parameters)
+        return Reversed(back_seen, fronts + further, {"materials.texels": by_texels})
 
     def step(
         self,
