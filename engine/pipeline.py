@@ -332,7 +332,6 @@ def _train(
     if trainer.poses is not None:
         record["poses"] = trainer.poses.as_dict()
     if (exposures := exposures_of(trainer.shading)) is not None:
-        exposures.guess_others()
         record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
     if config.near_share > 0:
         record["taken_near"] = trainer.state.taken_near

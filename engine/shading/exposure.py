@@ -3,24 +3,23 @@
 A phone sets its exposure anew for every photograph. Without a model of that, Gaussians learn to look
 different from where each photograph was taken. The scene keeps the exposure that is the mean of all.
 
-Nothing is fitted to views that were not trained on. Where photographs that follow each other by name are
-exposed alike, the exposure of one that was held out is guessed from those beside it.
+Nothing is fitted to views that were not trained on: their exposure is guessed from what they show of the
+scene and from the photographs beside them (:mod:`engine.shading.exposure_guess`).
 """
 
 import copy
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from engine.gaussians.model import FlatGaussians
+from engine.shading.exposure_guess import guessed
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
 from engine.trace.protocol import GaussianGradients, Tracer
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
-LEAST_VIEWS = 4
-"""From fewer nothing is guessed."""
 ExposuresByName = Mapping[str, Mapping[str, Sequence[float]]]
 """Log gains and offsets of views, by their names."""
 _STATE = ("log_gains", "offsets", "first", "second", "steps")
@@ -95,25 +94,17 @@ class Exposures:
         shown = (rgb_srgb - self.offsets[view]) / np.exp(self.log_gains[view])
         return np.asarray(np.clip(shown, 0, 1), np.float32)
 
-    def guess_others(self) -> None:
-        """Give views that were not trained on the exposures that those beside them, by number, suggest.
+    def guess_others(self, brightness: Float64[np.ndarray, " v"] | None = None) -> None:
+        """Give views that were not trained on the exposures that the trained ones suggest.
 
-        The mean of the trained views before and after, by how near they are, is taken as far as such means
-        tell the exposures of trained views themselves: not at all where each photograph is exposed anew.
+        See :mod:`engine.shading.exposure_guess`.
+
+        Args:
+            brightness: of all views, as the mean exposure shows the scene; None where that is not known.
         """
-        trained = np.flatnonzero(self.steps > 0)
-        others = np.flatnonzero(self.steps == 0)
-        if len(trained) < LEAST_VIEWS:
-            return
+        trained, others = np.flatnonzero(self.steps > 0), np.flatnonzero(self.steps == 0)
         for values in (self.log_gains, self.offsets):
-            known = values[trained].astype(np.float64)
-            places, inner = trained.astype(np.float64), np.arange(1, len(trained) - 1)
-            share = (places[inner] - places[inner - 1]) / (places[inner + 1] - places[inner - 1])
-            beside = known[inner - 1] + share[:, None] * (known[inner + 1] - known[inner - 1])
-            scale = float((beside**2).sum())
-            trust = min(max(float((beside * known[inner]).sum()) / scale, 0.0), 1.0) if scale > 0 else 0.0
-            for channel in range(3):
-                values[others, channel] = trust * np.interp(others, trained, known[:, channel])
+            values[others] = guessed(values[trained].astype(np.float64), trained, others, brightness)
 
     def reverse(
         self,

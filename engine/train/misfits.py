@@ -13,14 +13,14 @@ from jaxtyping import Bool, Float64, Int64
 from engine.colour import composited
 from engine.psnr import colour_corrected, psnr
 from engine.scene import View
-from engine.shading.protocol import ShadingModel, Sight
+from engine.shading.protocol import ShadingModel
 from engine.trace.protocol import Tracer
-from engine.train.batches import TrainingData, grid_pixels, still_background, view_sizes_px
+from engine.train.batches import TrainingData, still_background
 from engine.train.config import TrainConfig
+from engine.train.view_grids import shown_on_grids
 
 TILES = 3
 """So many tiles each way of a view are measured, see :func:`engine.train.batches.grid_pixels`."""
-VIEWS_AT_ONCE = 64
 LEAST_VIEWS = 6
 """Among fewer views nobody can say which of them is odd."""
 NEIGHBOURS = 8
@@ -56,19 +56,12 @@ def view_fits(
 ) -> ViewFits:
     """Measure the Gaussians that ``tracer`` holds on the views ``indices``; changes nothing."""
     plain, corrected = [], []
-    for start in range(0, len(indices), VIEWS_AT_ONCE):
-        some = indices[start : start + VIEWS_AT_ONCE]
-        view, y, x = grid_pixels(some, view_sizes_px(dataset), TILES)
-        rays = dataset.rays(view, y, x)
-        rgb, alpha, weight = dataset.pixels(view, y, x)
-        background = still_background(config)
-        developed = shading.develop(Sight(rays, tracer.trace(rays), tracer, view))
-        render = np.clip(developed.over(background), 0, 1)
-        target = composited(rgb, alpha, background)
-        shape, counts = (len(some), -1, 3), (weight > 0).astype(np.float32)
-        for shown, photograph, valid in zip(
-            render.reshape(shape), target.reshape(shape), counts.reshape(len(some), -1), strict=True
-        ):
+    background = still_background(config)
+    for grids in shown_on_grids(dataset, indices, background, tracer, shading, tiles=TILES, exposed=True):
+        rgb, alpha, weight = dataset.pixels(*grids.pixels)
+        target = composited(rgb, alpha, background).reshape(grids.rgb_srgb.shape)
+        counts = (weight > 0).astype(np.float32).reshape(len(target), -1)
+        for shown, photograph, valid in zip(grids.rgb_srgb, target, counts, strict=True):
             plain.append(psnr(shown, photograph, valid))
             corrected.append(psnr(colour_corrected(shown, photograph, valid), photograph, valid))
     return ViewFits(indices, *(np.minimum(values, MOST_DB) for values in (plain, corrected)))

@@ -17,6 +17,7 @@ from engine.train.checkpoint import load_best, save_best
 from engine.train.config import TrainConfig
 from engine.train.shading import exposures_of
 from engine.train.state import TrainState
+from engine.train.view_grids import guess_exposures
 
 EMPTY_ALPHA = 0.01
 
@@ -88,7 +89,7 @@ class Judge:
             self._held_out = draw_probe(dataset, dataset.test_indices, config, rng)
         self._dataset = dataset
         self._folder = folder
-        self._step_back_db = config.step_back_db
+        self._config = config
         self._tell = listener
 
     def inspect(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> None:
@@ -102,8 +103,7 @@ class Judge:
                 f"Parameters became not-a-number by iteration {state.iteration}; nothing is exported. "
                 "The last checkpoint is kept."
             )
-        if (exposures := exposures_of(shading)) is not None:
-            exposures.guess_others()
+        guess_exposures(self._dataset, self._config, tracer, shading)
         psnr, alpha = measure(self._probe, self._dataset, tracer, shading)
         if alpha < EMPTY_ALPHA and state.iteration > 0:
             raise TrainingFailure(
@@ -121,7 +121,7 @@ class Judge:
     def choose(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> FlatGaussians:
         """The last Gaussians, or the best if those are much worse; the shading becomes theirs too."""
         last, _ = measure(self._probe, self._dataset, tracer, shading)
-        if last >= state.best_psnr - self._step_back_db:
+        if last >= state.best_psnr - self._config.step_back_db:
             return state.gaussians
         self._tell(
             Warned(

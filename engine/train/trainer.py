@@ -30,6 +30,7 @@ from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
 from engine.train.shading import make_shading
 from engine.train.state import TrainState
+from engine.train.view_grids import guess_exposures
 
 GONE_LOGIT = np.float32(-12.0)
 """Opacity of what is taken away until its place is used for something else: no ray takes note of it."""
@@ -103,6 +104,7 @@ class Trainer:
                 self._refiner.dataset.put(state.pose_corrections)
             else:
                 state.pose_corrections = np.zeros((len(dataset.views), 6))
+        self._dataset = dataset
         self._batches = BatchSource(dataset, config)
         pixels = self._batches.sampler.pixel_count
         self.schedule = Schedule.of(config, pixels)
@@ -187,6 +189,7 @@ class Trainer:
             chosen = chosen.select(np.flatnonzero(~gone))
         if chosen is not state.gaussians:
             machinery.tracer.build(chosen, machinery.shading.features(chosen))
+        guess_exposures(self._dataset, self._config, machinery.tracer, machinery.shading)
         self.views = self._view_judge.conclude(machinery.tracer, machinery.shading, state.left_out)
         if (complaint := self.views.complaint()) is not None:
             self._tell(Warned(complaint))

@@ -197,6 +197,83 @@ def test_a_held_out_view_is_guessed_from_those_beside_it_where_they_tell() -> No
         assert (exposures.offsets == 0).all()
 
 
+def test_a_held_out_view_is_exposed_by_its_brightness_where_cameras_did_so() -> None:
+    """Log gains that fall with the brightness, and jump once, are found."""
+    rng = np.random.default_rng(4)
+    places, brightness = np.arange(65), rng.uniform(0.2, 0.7, 65)
+    known = (0.4 * (0.45 - brightness) + 0.1 * (places >= 37))[:, None] * np.array([1.0, 0.9, 1.1])
+    trained = places % 8 != 0
+    known -= known[trained].mean(axis=0)
+    off = []
+    for shown in (None, brightness):
+        exposures = Exposures(65, rate=0.02)
+        exposures.log_gains[trained], exposures.steps[trained] = known[trained], 1
+        exposures.guess_others(shown)
+        off.append(np.sqrt(np.mean((exposures.log_gains - known)[~trained] ** 2)))
+    assert off[1] < 0.01 < 0.04 < off[0]
+
+
+def test_a_brightness_that_tells_nothing_is_not_listened_to() -> None:
+    """Where each photograph is exposed anew, whatever it shows, held-out views keep about the mean."""
+    rng = np.random.default_rng(5)
+    places = np.arange(65)
+    trained = places % 8 != 0
+    sizes = []
+    for _ in range(20):
+        exposures = Exposures(65, rate=0.02)
+        exposures.log_gains[trained], exposures.steps[trained] = rng.normal(0, 0.1, (56, 3)), 1
+        exposures.guess_others(rng.uniform(0.2, 0.7, 65))
+        sizes.append(float(np.abs(exposures.log_gains[~trained]).max()))
+    assert np.median(sizes) < 0.04
+
+
+class AutomaticWorld(UnevenWorld):
+    """A camera that exposes by the mean of what it looks at, so that all its photographs are as bright.
+
+    The plane is brighter to the right; the held-out photographs were exposed in the same way.
+    """
+
+    def __init__(self) -> None:
+        FlatWorld.__init__(self, count=16, held_out=3)
+        rng = np.random.default_rng(6)
+        self.origins[:, 0] = rng.permutation(np.linspace(-0.5, 0.5, 16))
+        self.views = tuple(
+            replace(view, translation_cam_from_world=-origin)
+            for view, origin in zip(self.views, self.origins, strict=True)
+        )
+        self.log_gains = np.zeros(16, np.float32)
+        y, x = np.divmod(np.arange(self.side_px**2), self.side_px)
+        means = [float(self.pixels(np.full(len(x), k), y, x)[0].mean()) for k in range(16)]
+        self.log_gains = np.log(np.mean(means) / np.array(means)).astype(np.float32)
+
+    def shown(self, rays: RayBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rgb, alpha, weight = super().shown(rays)
+        points = rays.origins_world - rays.directions_world * (
+            rays.origins_world[:, 2:] / rays.directions_world[:, 2:]
+        )
+        return rgb * (1 + 0.4 * np.clip(points[:, :1], -1.4, 1.4)).astype(np.float32), alpha, weight
+
+
+def test_held_out_photographs_of_an_automatic_camera_are_met(tmp_path: Path) -> None:
+    world = AutomaticWorld()
+    assert world.log_gains.std() > 0.08
+    config = small_config(iterations=400, exposure=True, rates={"exposure": 0.02})
+    trainer = Trainer(
+        world, config, fresh_state(world.start(), config.seed), folder=tmp_path, fingerprint="test",
+        listener=lambda _event: None, threads=1,
+    )  # fmt: skip
+    trainer.run()
+    found = trainer.shading
+    assert isinstance(found, Exposures)
+    mean = world.log_gains[world.train_indices].mean()
+    mid = 0.3
+    shown = (np.exp(found.log_gains) * mid + found.offsets).mean(axis=1)
+    expected = np.exp(world.log_gains - mean) * mid
+    off = np.abs(shown - expected)
+    spread = float(np.abs(expected[world.test_indices] - mid).max())
+    assert off[world.test_indices].max() < 0.4 * spread
+
+
 def test_a_view_is_shown_as_exposed_when_it_is_named() -> None:
     rng = np.random.default_rng(0)
     exposures = made_exposures(3, rng)
