@@ -46,9 +46,7 @@ from engine.versions import versions
 from engine.writing import write_json
 
 SCALES = "scales.json"
-GUESSED = (
-    "held-out views are shown as exposed as their brightness and the training views beside them by name suggest"
-)
+GUESSED = "held-out views are shown as exposed as their brightness and the views beside them suggest"
 NOTED_BY_TRAINING = ("planned_iterations", "training_views", "taken_near")
 RAYS_ACROSS = (1, 2, 4)
 """Rays across a pixel with which smaller sizes are measured."""
