@@ -53,6 +53,8 @@ class MaterialSettings(BaseModel):
         smooth_weight: of differences of albedo between neighbouring rays.
         smooth_gloss_weight: of differences of metallic and roughness between neighbouring rays, which change
             less over a thing than its colour does.
+        smooth_metal: so many times more ``smooth_weight`` counts between metals, which are one colour more
+            often and which have what is reflected wrongly painted on.
         only_seen: whether Gaussians that lie in no photograph are taken away; reflected rays alone see those,
             so that they would become lamps.
         white_weight: of the environment's colours; of their logarithms.
@@ -96,6 +98,7 @@ class MaterialSettings(BaseModel):
     smooth_normal_weight: float = Field(0.1, ge=0)
     smooth_weight: float = Field(0.01, ge=0)
     smooth_gloss_weight: float = Field(0.08, ge=0)
+    smooth_metal: float = Field(10.0, ge=0)
     only_seen: bool = True
     white_weight: float = Field(0.01, ge=0)
     even_weight: float = Field(0.03, ge=0)

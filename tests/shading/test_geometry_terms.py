@@ -1,0 +1,85 @@
+"""Materials of neighbouring rays held together: the gradient against finite differences of the sum."""
+
+import numpy as np
+import pytest
+
+from engine.rays import RayBatch
+from engine.shading.geometry_terms import EDGE, smoothness_term
+from engine.shading.protocol import Sight
+from engine.trace.make import make_tracer
+from engine.trace.protocol import TraceResult, TraceSettings
+
+SIDE, METAL = 3, 10.0
+WEIGHTS = (0.02, 0.03, 0.04, 0.2, 0.3)
+
+
+def sight(features: np.ndarray, alpha: np.ndarray) -> Sight:
+    count = len(alpha)
+    flat, rows = np.zeros(count, np.float32), np.zeros((count, 3), np.float32)
+    seen = TraceResult(
+        rows,
+        (1 - alpha).astype(np.float32),
+        flat,
+        flat,
+        rows,
+        features.astype(np.float32),
+        np.zeros(count, np.int32),
+    )
+    rays = RayBatch(np.zeros((1, 3)), np.tile([0.0, 0.0, 1.0], (count, 1)))
+    return Sight(rays, seen, make_tracer(TraceSettings(), threads=1), np.zeros(count, np.int64))
+
+
+def penalty(features: np.ndarray, alpha: np.ndarray, metallic: np.ndarray) -> float:
+    """The sum whose gradient is asked for; ``metallic`` weighs the albedo and is held."""
+    material = (features / alpha[:, None]).reshape(SIDE, SIDE, 5)
+    metal = metallic.reshape(SIDE, SIDE)
+    total = 0.0
+    for (y, x), (v, u) in [
+        ((y, x), (y + down, x + 1 - down))
+        for down in (0, 1) for y in range(SIDE - down) for x in range(SIDE - 1 + down)
+    ]:  # fmt: skip
+        size = np.sqrt((material[y, x] - material[v, u]) ** 2 + EDGE**2)
+        size[:3] *= 1 + METAL * min(metal[y, x], metal[v, u]) ** 2
+        total += float((size * WEIGHTS).sum())
+    return total / SIDE**2
+
+
+def test_the_gradient_is_that_of_the_sum_with_the_metals_held() -> None:
+    rng = np.random.default_rng(0)
+    alpha = rng.uniform(0.92, 1.0, SIDE**2).astype(np.float32).astype(np.float64)
+    features = (rng.uniform(0, 1, (SIDE**2, 5)) * alpha[:, None]).astype(np.float32).astype(np.float64)
+    metallic = features[:, 3] / alpha
+    by_features, by_alpha = np.zeros_like(features), np.zeros_like(alpha)
+    smoothness_term(sight(features, alpha), SIDE**2, WEIGHTS, METAL, by_features, by_alpha)
+    step = 1e-4
+    for ray in range(SIDE**2):
+        for column in range(5):
+            moved = np.zeros_like(features)
+            moved[ray, column] = step
+            slope = penalty(features + moved, alpha, metallic) - penalty(features - moved, alpha, metallic)
+            assert by_features[ray, column] == pytest.approx(slope / (2 * step), abs=2e-5)
+        moved_alpha = np.zeros_like(alpha)
+        moved_alpha[ray] = step
+        slope = penalty(features, alpha + moved_alpha, metallic) - penalty(
+            features, alpha - moved_alpha, metallic
+        )
+        assert by_alpha[ray] == pytest.approx(slope / (2 * step), abs=2e-5)
+
+
+@pytest.mark.parametrize(("metallic", "times"), [(0.0, 1.0), (0.5, 3.5), (1.0, 11.0)])
+def test_the_albedo_of_metals_is_held_more(metallic: float, times: float) -> None:
+    features = np.full((SIDE**2, 5), 0.5)
+    features[:, 3] = metallic
+    features[4, :3] = 0.7
+    found = np.zeros_like(features)
+    smoothness_term(sight(features, np.ones(SIDE**2)), SIDE**2, WEIGHTS, METAL, found, np.zeros(SIDE**2))
+    slope = 0.2 / np.hypot(0.2, EDGE) / SIDE**2  # by each of its four neighbours
+    np.testing.assert_allclose(found[4, :3], 4 * times * slope * np.array(WEIGHTS[:3]), rtol=1e-5)
+    assert (found[:, 3:] == 0).all()
+
+
+def test_what_is_half_transparent_is_left_alone() -> None:
+    features = np.random.default_rng(1).uniform(0, 0.5, (SIDE**2, 5))
+    found, by_alpha = np.zeros_like(features), np.zeros(SIDE**2)
+    smoothness_term(sight(features, np.full(SIDE**2, 0.5)), SIDE**2, WEIGHTS, METAL, found, by_alpha)
+    assert (found == 0).all() and (by_alpha == 0).all()
