@@ -36,11 +36,18 @@ _FAR_RAY_POWER = 0.45
 """Powers of the number of Gaussians by which it grows: up to the 200,000 of the runs that it was fitted to,
 and beyond, where an iteration was measured with 100,000 and 1,000,000 (``benchmarks/growth.py``)."""
 _FITTED_GAUSSIANS = 200_000
+_MATERIAL_RAY_CPU_SECONDS = 2.1e-5
+"""For a ray with what it reflects, of a training with materials of so many Gaussians."""
+_MATERIAL_GAUSSIANS = 80_000
+_MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 2.9e-5
+"""With four rays a pixel and what they reflect: 60 pictures of 400 x 400 pixels took 275 s."""
 _SINGLE_RAY_CPU_SECONDS = 10.8e-6
 """For a ray that comes alone, as the preset paper has them."""
 _PAPER_GAUSSIANS = 60_000
 """What clone and split comes to, whatever its cap."""
 _START_BYTES = 300 << 20
+_MATERIAL_START_BYTES, _MATERIAL_TRAIN_BYTES = 1_370 << 20, 500 << 20
+"""What materials take whatever the photographs, as they begin and later on."""
 _RAY_BYTES = 21_000
 _PIXEL_BYTES = 290
 """For a pixel of the largest photograph, when a view is measured; what training needed is free by then."""
@@ -99,15 +106,19 @@ def estimate_reconstruction(
     training_cpu_seconds = iterations * train.rays * _ray_cpu_seconds(train, gaussians)
     if options.minutes is not None:
         training_cpu_seconds = 60 * options.minutes * max(1, cores) ** _CORE_POWER
+    materials = train.materials.learn
+    each_pixel = _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL if materials else _EVALUATE_CPU_SECONDS_PER_PIXEL
     full_pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in photographs)
     cpu_seconds = (
         _START_CPU_SECONDS
         + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels
         + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.lift_pixels
-        + _EVALUATE_CPU_SECONDS_PER_PIXEL * pixels * held_out
+        + each_pixel * pixels * held_out
         + training_cpu_seconds
     )
     training = _gaussian_bytes(train.sh_degree) * gaussians + _RAY_BYTES * max(train.rays, train.probe_rays)
+    if materials:
+        training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
     memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
     disk = reconstruction_bytes(options, photographs)
     return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto", disk_bytes=disk)
@@ -200,6 +211,8 @@ def _gaussians(train: TrainConfig, trained_on: int) -> int:
 def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
     if train.window_rays == 1:
         return _SINGLE_RAY_CPU_SECONDS
+    if train.materials.learn:
+        return float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
     near, far = min(gaussians, _FITTED_GAUSSIANS) / 1e5, max(gaussians / _FITTED_GAUSSIANS, 1.0)
     seconds = _RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER
     return float(max(seconds, _LEAST_RAY_CPU_SECONDS))

@@ -1,0 +1,41 @@
+"""Estimates beside what runs have taken (``docs/experiments.md``, ``docs/materials.md``)."""
+
+import pytest
+
+from engine.config import resolve_config
+from workers.records.sizes import Sizes
+from workers.work.kinds.estimates import Estimate, estimate_reconstruction
+from workers.work.kinds.options import ReconstructOptions
+
+
+def estimated(preset: str, sizes: Sizes, *, materials: bool = False) -> Estimate:
+    config = resolve_config(preset, materials=materials)
+    options = ReconstructOptions.model_validate(config.model_dump(mode="json"))
+    return estimate_reconstruction(options, [sizes], 1)
+
+
+@pytest.mark.parametrize(
+    ("preset", "sizes", "materials", "took_cpu_seconds"),
+    [
+        ("fast", Sizes(269, 480, 50), False, 109),
+        ("standard", Sizes(269, 480, 50), False, 599),
+        ("fast", Sizes(960, 716, 48), False, 137),
+        ("standard", Sizes(960, 716, 48), False, 1413),
+        ("standard", Sizes(800, 533, 126), False, 1999),
+        ("standard", Sizes(400, 400, 100), True, 2343),
+    ],
+)
+def test_the_time_is_right_within_a_factor_of_two(
+    preset: str, sizes: Sizes, materials: bool, took_cpu_seconds: float
+) -> None:
+    found = estimated(preset, sizes, materials=materials).cpu_seconds
+    assert took_cpu_seconds / 2 < found < took_cpu_seconds * 2
+
+
+def test_materials_take_more_memory_and_time() -> None:
+    plain, shiny = (
+        estimated("standard", Sizes(400, 400, 100), materials=materials) for materials in (False, True)
+    )
+    assert shiny.memory_bytes == pytest.approx(1.74e9, rel=0.05)  # private memory
+    assert shiny.memory_bytes > plain.memory_bytes
+    assert shiny.cpu_seconds > 2 * plain.cpu_seconds
