@@ -18,6 +18,7 @@ from engine.light.kernels_material_layer import ALBEDO, COLUMNS, LIFT, MATERIAL
 from engine.light.meshes import rotation_matrix
 from engine.light.stage import Stage, StageGaussians
 from engine.rays import RayBatch
+from engine.trace.facing import faced
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer, TraceResult, TraceSettings
 
@@ -52,7 +53,12 @@ class GaussianLayers:
 
     def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
         """What lies on rays up to a distance each."""
-        return self.tracer.trace(rays.up_to(t_max))
+        seen = self.tracer.trace(rays.up_to(t_max))
+        if self.tracer.settings.turned_beyond > 0:
+            seen.normal_world = faced(seen.normal_world, rays.directions_world).normal_world.astype(
+                np.float32
+            )
+        return seen
 
 
 def stage_layers(

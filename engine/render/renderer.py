@@ -9,7 +9,8 @@ from jaxtyping import Float32, Int64
 from engine.rays import ImageRays, RayBatch
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import ShadingModel, Sight
-from engine.trace.protocol import Tracer, TraceResult
+from engine.trace.facing import faced
+from engine.trace.protocol import Tracer
 
 RAYS_AT_ONCE = 1 << 18
 FRONT = 0.005
@@ -70,7 +71,7 @@ def render_rays(
             (out.alpha, seen.alpha),
             (out.depth, seen.expected_depth),
             (out.depth_median, seen.depth_median),
-            (out.normal_world, _unit_normals(seen)),
+            (out.normal_world, faced(seen.normal_world, rays.directions_world).normal_world),
             *((layers[name], values) for name, values in developed.layers.items()),
         ):
             part[band].reshape(len(order), -1)[order] = values.reshape(len(order), -1)
@@ -95,7 +96,7 @@ def front_normals(
         depth = depth_median[band].reshape(-1)[order]
         ends = np.where(depth > 0, depth * np.float32(1 + FRONT), np.inf).astype(np.float32)
         seen = tracer.trace(replace(rays, t_max=np.minimum(rays.t_max, ends).astype(np.float32)))
-        out[band].reshape(-1, 3)[order] = _unit_normals(seen)
+        out[band].reshape(-1, 3)[order] = faced(seen.normal_world, rays.directions_world).normal_world
     return out
 
 
@@ -107,11 +108,6 @@ def _bands(image: ImageRays) -> Iterator[tuple[slice, Int64[np.ndarray, " r"], R
         count = min(rows, height - top)
         order = tile_order(count, width)
         yield slice(top, top + count), order, image.rays[top * width + order]
-
-
-def _unit_normals(seen: TraceResult) -> Float32[np.ndarray, "r 3"]:
-    length = np.linalg.norm(seen.normal_world, axis=1, keepdims=True)
-    return np.asarray(seen.normal_world / np.maximum(length, 1e-12))
 
 
 def tile_order(height: int, width: int) -> Int64[np.ndarray, " r"]:

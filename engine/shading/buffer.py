@@ -7,6 +7,7 @@ from jaxtyping import Float64, Int64
 
 from engine.rays import AT_INFINITY, RayBatch
 from engine.shading.split_sum import Surface
+from engine.trace.facing import Faced, faced
 from engine.trace.protocol import TraceResult
 
 LEAST_RISE = 0.01
@@ -23,14 +24,14 @@ class Buffer:
         which: numbers of these rays.
         alpha: what each met.
         depth: mean distance, lengths of the direction.
-        length: of the blended normal.
+        faced: the blended normals.
         surface: materials, normals and directions, not yet dimmed by anything.
     """
 
     which: Int64[np.ndarray, " p"]
     alpha: Float64[np.ndarray, " p"]
     depth: Float64[np.ndarray, " p"]
-    length: Float64[np.ndarray, " p"]
+    faced: Faced
     surface: Surface
 
 
@@ -39,12 +40,10 @@ def gather(rays: RayBatch, seen: TraceResult) -> Buffer:
     alpha = 1.0 - seen.transmittance.astype(np.float64)
     which = np.flatnonzero(alpha > LEAST_ALPHA)
     alpha = alpha[which]
-    sums = seen.normal_world[which].astype(np.float64)
-    length = np.maximum(np.linalg.norm(sums, axis=1), 1e-9)
-    surface = Surface.alone(
-        seen.features[which, :5] / alpha[:, None], sums / length[:, None], rays.directions_world[which]
-    )
-    return Buffer(which, alpha, seen.depth_sum[which] / alpha, length, surface)
+    directions = rays.directions_world[which]
+    normals = faced(seen.normal_world[which], directions)
+    surface = Surface.alone(seen.features[which, :5] / alpha[:, None], normals.normal_world, directions)
+    return Buffer(which, alpha, seen.depth_sum[which] / alpha, normals, surface)
 
 
 def spread_back(
@@ -59,8 +58,7 @@ def spread_back(
     which, surface = buffer.which, buffer.surface
     by_features[which, :5] += by_material / buffer.alpha[:, None]
     by_alpha[which] -= (by_material * surface.material).sum(axis=1) / buffer.alpha
-    along = (by_unit_normal * surface.normal_world).sum(axis=1, keepdims=True)
-    by_normal[which] += (by_unit_normal - along * surface.normal_world) / buffer.length[:, None]
+    by_normal[which] += buffer.faced.slope(by_unit_normal, surface.direction_world)
 
 
 def reflected_rays(

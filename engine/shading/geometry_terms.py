@@ -37,7 +37,7 @@ def spread_term(
     That is the accumulated alpha minus the length of the blended normal: it needs no neighbours.
     """
     by_alpha[buffer.which] += weight
-    by_normal[buffer.which] -= weight * buffer.surface.normal_world
+    by_normal[buffer.which] -= weight * buffer.faced.blended_world
 
 
 def neighbour_terms(

@@ -24,6 +24,10 @@ class TraceSettings(BaseModel):
             just behind the visible ones still receive a gradient.
         max_hits: most Gaussians on a ray.
         alpha_max: alpha is clamped to this, with zero gradient above it, so that 1/(1 - alpha) stays finite.
+        turned_beyond: a normal that points away from the viewer is turned towards it if its cosine to the
+            direction from the ray's origin to the mean is larger than this: 0 turns all, which suits normals
+            without a side. Where they point outwards, those just behind an outline had better stay: turned,
+            they would cancel the ones just before it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -34,6 +38,7 @@ class TraceSettings(BaseModel):
     second_phase_min: float | None = Field(None, gt=0, lt=1)
     max_hits: int = Field(512, ge=1, le=4096)
     alpha_max: float = Field(0.999, gt=0, le=0.9999)
+    turned_beyond: float = Field(0.0, ge=0, le=1)
 
     @model_validator(mode="before")
     @classmethod
@@ -54,7 +59,7 @@ class TraceResult:
         depth_sum: sum of weight times distance; the expected depth is this over the accumulated alpha.
         depth_median: distance of the Gaussian at which the transmittance falls to one half, 0 where it
             never does.
-        normal_world: sum of weight times the normal turned towards the viewer.
+        normal_world: sum of weight times the normal, turned towards the viewer as the settings say.
         features: sum of weight times the Gaussians' extra channels.
         hit_counts: Gaussians on each ray.
         hits: the recording, which :meth:`Tracer.backward` needs; None unless the trace was asked for it.

@@ -149,7 +149,9 @@ def trace_reference(
             view = to_mean[ray, ids] - viewers[ray] * view
         basis = sh_basis(view / view.norm(dim=-1, keepdim=True), p.sh.shape[1])
         colour = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
-        facing = -torch.sign(cosine[ray, ids].detach())
+        ways = to_mean[ray, ids].detach()
+        away = (ways * r1[ids].detach()).sum(-1) / ways.norm(dim=-1)
+        facing = torch.where(away > settings.turned_beyond, -1.0, 1.0)
         crossing = torch.nonzero((through[:-1] > 0.5) & (through[1:] <= 0.5)).squeeze(-1)
         median = t[ray, ids[crossing[0]]] if len(crossing) else torch.zeros((), dtype=torch.float64)
         out.append(

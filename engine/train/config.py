@@ -19,6 +19,8 @@ from engine.train.preset_names import PRESETS
 MOST_PLANNED_ITERATIONS = 30_000
 """Where a time decides their number, see :mod:`engine.train.within`."""
 
+TURNED_BEYOND = 0.5
+"""Cosine beyond which normals that point away are turned, where materials are learnt."""
 FOR_SURFACE = 0.05
 """Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""
 
@@ -310,6 +312,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "stop_early": 0.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
+            "trace": config.trace.model_copy(update={"turned_beyond": TURNED_BEYOND}),
             "max_gaussians_auto": min(config.max_gaussians_auto, 80_000),
         }
     )

@@ -74,6 +74,11 @@ class Schedule:
         since = max(self.config.average_after * self.iterations, self.hastened_after or 0)
         return since < done and (done % AVERAGE_EVERY == 0 or self.ends(done))
 
+    def settles_sides(self, done: int) -> bool:
+        """Whether Gaussians are turned over whose outer side is in; not while states are averaged."""
+        sided = self.config.trace.turned_beyond > 0
+        return sided and self.measures(done) and done <= self.config.average_after * self.iterations
+
     def rebuilds(self, done: int, gaussians: int) -> bool:
         """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
         due = done % rebuild_interval(self.config, gaussians) == 0

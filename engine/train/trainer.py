@@ -29,6 +29,7 @@ from engine.train.pose_refinement import PoseRefiner, RefinedPoses
 from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
 from engine.train.shading import make_shading
+from engine.train.sides import turn_outwards
 from engine.train.state import TrainState
 from engine.train.view_grids import guess_exposures
 
@@ -209,8 +210,17 @@ class Trainer:
     def _build(self) -> None:
         gaussians, machinery = self.state.gaussians, self._machinery
         machinery.tracer.build(gaussians, machinery.shading.features(gaussians))
+        self._settle_sides()
         progress = self.schedule.progress(self.state.iteration)
         machinery.shading.settle(gaussians, machinery.tracer, progress=progress)
+
+    def _settle_sides(self) -> None:
+        """Turn Gaussians with their outer sides out, where that is due; done twice, it changes nothing."""
+        state, tracer = self.state, self._machinery.tracer
+        if self.schedule.settles_sides(state.iteration):
+            turned = turn_outwards(state.gaussians, self._dataset, self._dataset.train_indices, tracer)
+            state.adam.reset(turned)
+            tracer.refresh(turned)
 
     def _pause(self, watch: Stopwatch, *, resumed: bool) -> None:
         """Measure and keep the state where that is due, and stop if asked to.

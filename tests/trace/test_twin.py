@@ -48,6 +48,14 @@ def test_viewers_that_stand_anywhere(rng: np.random.Generator, degree: int) -> N
     assert_like_twin(make_cloud(rng, 1000, degree=degree), rays)
 
 
+def test_normals_that_keep_their_side(rng: np.random.Generator) -> None:
+    cloud, rays = make_cloud(rng, 1000), rays_inwards(rng, 250)
+    ours, _ = assert_like_twin(cloud, rays, turned_beyond=0.4)
+    all_turned = make_tracer(cloud).trace(rays)
+    assert np.abs(ours.normal_world - all_turned.normal_world).max() > 0.1
+    assert np.array_equal(ours.rgb_srgb, all_turned.rgb_srgb)
+
+
 def test_quaternions_of_any_length(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 1000)
     cloud.quats_wxyz *= f32(10 ** rng.uniform(-3, 3, (1000, 1)))

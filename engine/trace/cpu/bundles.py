@@ -58,19 +58,24 @@ class Parameters(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Where a ray ends; ``eps2`` above 1 means that there is no second phase."""
+    """Where a ray ends and normals are turned; ``eps2`` above 1 means that there is no second phase."""
 
     eps1: float
     eps2: float
     alpha_max: float
     max_hits: int
+    turned_beyond: float
 
     @classmethod
     def of(cls, settings: TraceSettings) -> "Limits":
         """The limits among ``settings``."""
         eps2 = settings.second_phase_min
         return cls(
-            settings.transmittance_min, 2.0 if eps2 is None else eps2, settings.alpha_max, settings.max_hits
+            settings.transmittance_min,
+            2.0 if eps2 is None else eps2,
+            settings.alpha_max,
+            settings.max_hits,
+            settings.turned_beyond,
         )
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from engine.trace.cpu.kernels_hit import MEAN
-from engine.trace.cpu.kernels_rays import ray_viewer
+from engine.trace.cpu.kernels_rays import ray_viewer, side_shown
 from engine.trace.cpu.kernels_sh import colour, write_ray_view
 from engine.trace.kernels_native import lean
 
@@ -65,8 +65,7 @@ def composite(front, hit, forward, r, origin, direction, basis):
     write_ray_view(basis, forward.scene.sh.shape[1], to_mean, direction, ray_viewer(forward.rays, r))
     weight = alpha * front.t1
     red, green, blue = colour(forward.scene.sh, i, basis)
-    along = direction[0] * hit.normal_x + direction[1] * hit.normal_y + direction[2] * hit.normal_z
-    facing = -weight if along > 0.0 else weight  # the normal is turned towards the viewer
+    facing = weight * side_shown(to_mean, (hit.normal_x, hit.normal_y, hit.normal_z), forward.limits)
     for f in range(forward.scene.features.shape[1]):
         forward.out.features[r, f] += np.float32(weight * forward.scene.features[i, f])
     t1 = front.t1 * (1.0 - alpha)

@@ -19,7 +19,7 @@ from numba import njit, prange
 
 from engine.trace.cpu.kernels_eight_backward import add_row, replay_hits, walk_through
 from engine.trace.cpu.kernels_packet import AHEAD
-from engine.trace.cpu.kernels_rays import first_place, ray_origin
+from engine.trace.cpu.kernels_rays import first_place, ray_origin, side_shown
 from engine.trace.cpu.kernels_records import rotation_columns
 from engine.trace.cpu.kernels_sh import slope_by_mean, write_view
 from engine.trace.cpu.kernels_simd import prefetch
@@ -93,8 +93,7 @@ def begin_rows(packet, memory, rays, packets, kept, parameters, limits, g, rows)
                 np.float64(quats[i, 2]), np.float64(quats[i, 3]),
             )  # fmt: skip
             x, y, z = means[i, 0] - ox, means[i, 1] - oy, means[i, 2] - oz
-            # turned towards the origin
-            side = -1.0 if x * r1[0] + y * r1[1] + z * r1[2] > 0.0 else 1.0
+            side = side_shown((x, y, z), r1, limits)
             for axis in range(3):
                 memory.normals[slot, axis] = side * r1[axis]
 
@@ -206,7 +205,7 @@ def replay_packets(
 
 
 @lean(fastmath={"contract"})
-def sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, out, sums, basis):
+def sum_chunk(first, last, rays, packets, parameters, scene, limits, by_gaussian, rows, out, sums, basis):
     """Sum the rows of the Gaussians ``first`` to ``last`` in packet order; the sums become gradients.
 
     ``sums`` is room for one row, ``basis`` for harmonics. The frame is taken in float64 from the raw
@@ -246,7 +245,7 @@ def sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, 
                 by_t = rows.geometry[row]
                 gt, gtu, gtv = np.float64(by_t[GT]), np.float64(by_t[GTU]), np.float64(by_t[GTV])
                 # the gradient of the turned normal, turned back
-                side = -1.0 if inverse > 0.0 else 1.0
+                side = side_shown((x, y, z), r1, limits)
                 n0 += side * by_t[N_0]
                 n1 += side * by_t[N_1]
                 n2 += side * by_t[N_2]
@@ -278,11 +277,11 @@ def sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, 
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def sum_packets(rays, packets, parameters, scene, by_gaussian, rows, chunks, out):
+def sum_packets(rays, packets, parameters, scene, limits, by_gaussian, rows, chunks, out):
     """:func:`sum_chunk` on all Gaussians that were hit."""
     segments = len(by_gaussian.starts) - 1
     per_chunk = (segments + chunks - 1) // chunks
     for chunk in prange(chunks):
         first, last = chunk * per_chunk, min(segments, (chunk + 1) * per_chunk)
         sums, basis = np.empty(ROW_WORDS, np.float64), np.empty(16, np.float64)
-        sum_chunk(first, last, rays, packets, parameters, scene, by_gaussian, rows, out, sums, basis)
+        sum_chunk(first, last, rays, packets, parameters, scene, limits, by_gaussian, rows, out, sums, basis)

@@ -30,7 +30,14 @@ from engine.trace.cpu.kernels_packet import (
     write_rows,
 )
 from engine.trace.cpu.kernels_packet_order import keep_candidates, sort_candidates
-from engine.trace.cpu.kernels_rays import first_place, ray_direction, ray_limits, ray_origin, record_vector
+from engine.trace.cpu.kernels_rays import (
+    first_place,
+    ray_direction,
+    ray_limits,
+    ray_origin,
+    record_vector,
+    side_shown,
+)
 from engine.trace.cpu.kernels_sh import colour, write_view
 from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit
 from engine.trace.cpu.kernels_tree import WIDTH
@@ -145,18 +152,15 @@ def know_alphas(candidates, first, last, alpha_max):
 
 
 @lean(fastmath={"contract"})
-def show(shown, i, scene, origin, basis):
-    """What Gaussian ``i`` shows to rays from ``origin``.
-
-    A ray that meets it in front of the origin does so from the side on which the origin lies.
-    """
+def show(shown, i, scene, limits, origin, basis):
+    """What Gaussian ``i`` shows to rays from ``origin``."""
     record = scene.records[i]
     x, y, z = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
     n0, n1, n2 = record_vector(record, NORMAL)
     write_view(basis, scene.sh.shape[1], x, y, z)
     shown[0], shown[1], shown[2] = colour(scene.sh, i, basis)
     shown[3] = shown[7] = 0.0
-    side = -1.0 if x * n0 + y * n1 + z * n2 > 0.0 else 1.0
+    side = side_shown((x, y, z), (n0, n1, n2), limits)
     shown[4], shown[5], shown[6] = side * n0, side * n1, side * n2
 
 
@@ -226,7 +230,7 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
                 new &= new - 1
                 number = scratch.numbers[k]
                 scratch.slots[k] = slot_of[number] = slots
-                show(shown[slots], ids[number], forward.scene, origin, scratch.basis)
+                show(shown[slots], ids[number], forward.scene, limits, origin, scratch.basis)
                 if recording:
                     kept.slot_ids[slot_base + slots] = ids[number]
                     for channel in range(3):

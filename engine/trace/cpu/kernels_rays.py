@@ -1,5 +1,7 @@
 """Single rays and vectors out of bundles, where one origin, limit or viewer may stand for all."""
 
+import math
+
 import numpy as np
 
 from engine.trace.kernels_native import lean
@@ -41,6 +43,21 @@ def ray_limits(rays, r):
 def ray_viewer(rays, r):
     """Where on ray ``r`` its viewer stands; a single one stands for all rays."""
     return np.float64(rays.t_viewer[r if len(rays.t_viewer) > 1 else 0])
+
+
+@lean(forceinline=True)
+def side_shown(to_mean, normal, limits):
+    """1, or -1 where ``normal`` is turned to the viewer, see :class:`engine.trace.protocol.TraceSettings`.
+
+    ``to_mean`` leads from the origin of a ray to the Gaussian's mean. A ray that meets a Gaussian in front
+    of its origin does so from the side on which the origin lies.
+    """
+    x, y, z = to_mean
+    along = x * normal[0] + y * normal[1] + z * normal[2]
+    if along <= 0.0:
+        return 1.0
+    beyond = limits.turned_beyond
+    return -1.0 if beyond == 0.0 or along > beyond * math.sqrt(x * x + y * y + z * z) else 1.0
 
 
 @lean(forceinline=True)

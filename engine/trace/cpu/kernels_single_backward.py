@@ -13,8 +13,14 @@ from jaxtyping import Float32, Int32
 from numba import njit, prange
 
 from engine.gaussians.model import SH_C0
-from engine.trace.cpu.kernels_hit import NORMAL, OPACITY
-from engine.trace.cpu.kernels_rays import ray_direction, ray_origin, ray_viewer
+from engine.trace.cpu.kernels_hit import MEAN, NORMAL, OPACITY
+from engine.trace.cpu.kernels_rays import (
+    ray_direction,
+    ray_origin,
+    ray_viewer,
+    record_vector,
+    side_shown,
+)
 from engine.trace.cpu.kernels_records import rotation_columns
 from engine.trace.cpu.kernels_sh import slope_by_mean, write_ray_view
 from engine.trace.kernels_native import lean, next_from_counter
@@ -67,7 +73,7 @@ def replay_ray(r, first, rays, hits, counts, scene, limits, g, shares):
 
     They go to ``shares`` from ``first`` on.
     """
-    directions, records, features = rays.directions, scene.records, scene.features
+    records, features = scene.records, scene.features
     alphas, ts, hit_rgb = hits.alphas, hits.distances, hits.rgb
     weights = shares.weights
     feature_count = features.shape[1]
@@ -81,7 +87,7 @@ def replay_ray(r, first, rays, hits, counts, scene, limits, g, shares):
         t *= 1.0 - alpha
     g0, g1, g2 = np.float64(g.rgb[r, 0]), np.float64(g.rgb[r, 1]), np.float64(g.rgb[r, 2])
     gn0 = gn1 = gn2 = gd = gm = 0.0
-    dx, dy, dz = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
+    ox, oy, oz = ray_origin(rays, r)
     if g.with_geometry:
         gd, gm = np.float64(g.depth_sum[r]), np.float64(g.depth_median[r])
         gn0, gn1, gn2 = np.float64(g.normal[r, 0]), np.float64(g.normal[r, 1]), np.float64(g.normal[r, 2])
@@ -100,9 +106,10 @@ def replay_ray(r, first, rays, hits, counts, scene, limits, g, shares):
         if g.with_geometry:
             value += gd * ts[e]
             gt = gd * weight
-            n0, n1, n2 = records[i, NORMAL], records[i, NORMAL + 1], records[i, NORMAL + 2]
-            along = gn0 * n0 + gn1 * n1 + gn2 * n2
-            value += -along if dx * n0 + dy * n1 + dz * n2 > 0.0 else along
+            n0, n1, n2 = record_vector(records[i], NORMAL)
+            x, y, z = record_vector(records[i], MEAN)
+            side = side_shown((x - ox, y - oy, z - oz), (n0, n1, n2), limits)
+            value += side * (gn0 * n0 + gn1 * n1 + gn2 * n2)
             if k == median:
                 gt += gm
         for f in range(feature_count):
@@ -165,7 +172,7 @@ def write_gradients(segment, i, frame, quats, records, sums, out):
 
 
 @lean(fastmath={"contract"})
-def gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shares, g, out):
+def gather_chunk(first, last, memory, rays, parameters, scene, limits, by_gaussian, shares, g, out):
     """Gradients of the Gaussians ``first`` to ``last`` of the sorted hits.
 
     In the Gaussian's own frame, with u, v the hit in standard deviations, tau = dL/dt through the point and
@@ -245,7 +252,7 @@ def gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shar
                     sh_sum[j, 1] += basis[j] * gg
                     sh_sum[j, 2] += basis[j] * gb
             if g.with_geometry:
-                facing = -w if inverse > 0.0 else w
+                facing = w * side_shown(to_mean, r1, limits)
                 s_n0 += facing * g.normal[r, 0]
                 s_n1 += facing * g.normal[r, 1]
                 s_n2 += facing * g.normal[r, 2]
@@ -268,7 +275,9 @@ def gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shar
 
 
 @njit(cache=True, parallel=True, fastmath={"contract"}, error_model="numpy")
-def gather_gaussians(rays, parameters, scene, by_gaussian, chunk_bounds, workers, counter, shares, g, out):
+def gather_gaussians(
+    rays, parameters, scene, limits, by_gaussian, chunk_bounds, workers, counter, shares, g, out
+):
     """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters.
 
     Chunk c has the Gaussians ``chunk_bounds[c]`` to ``chunk_bounds[c + 1]``; ``counter`` holds one zero.
@@ -285,4 +294,4 @@ def gather_gaussians(rays, parameters, scene, by_gaussian, chunk_bounds, workers
             if chunk >= len(chunk_bounds) - 1:
                 break
             first, last = chunk_bounds[chunk], chunk_bounds[chunk + 1]
-            gather_chunk(first, last, memory, rays, parameters, scene, by_gaussian, shares, g, out)
+            gather_chunk(first, last, memory, rays, parameters, scene, limits, by_gaussian, shares, g, out)

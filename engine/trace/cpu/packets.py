@@ -151,7 +151,7 @@ class PacketTracer:
         by_gaussian = ByGaussian(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
         out = empty_gradients(len(by_gaussian.starts) - 1, basis_count, feature_count)
         sum_packets(
-            rays, packets, parameters, scene, by_gaussian, rows, SUM_CHUNKS * self._threads,
-            raw_gradients(out),
+            rays, packets, parameters, scene, self._limits, by_gaussian, rows,
+            SUM_CHUNKS * self._threads, raw_gradients(out),
         )  # fmt: skip
         return out

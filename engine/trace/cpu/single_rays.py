@@ -103,8 +103,8 @@ class SingleRayTracer:
         bounds[0], bounds[-1] = 0, segments
         out = empty_gradients(segments, scene.sh.shape[1], scene.features.shape[1])
         gather_gaussians(
-            rays, parameters, scene, by_gaussian, bounds, self._threads, np.zeros(1, np.int64),
-            shares, gradients, raw_gradients(out),
+            rays, parameters, scene, self._limits, by_gaussian, bounds, self._threads,
+            np.zeros(1, np.int64), shares, gradients, raw_gradients(out),
         )  # fmt: skip
         return out
 
