@@ -1,6 +1,6 @@
 """Rays as every part of the engine passes them on: from cameras and photographs to whatever traces them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +27,10 @@ class RayBatch:
     so that a pane that bends nothing changes nothing; behind anything else it is infinitely far away
     (``AT_INFINITY``), and the direction is the ray's own.
 
+    Rays that leave a surface of Gaussians may have some of these in their way, as the surface is as thick as
+    their noise. Up to ``t_leaves`` a ray passes all Gaussians that it would meet from behind, which is how it
+    meets those of the surface that it leaves, if their normals point outwards.
+
     Origins, limits and viewers have one row a ray, or a single one that stands for all.
 
     >>> rays = RayBatch(np.zeros((1, 3), np.float32), np.eye(3, dtype=np.float32)[:2], t_min=0.5)
@@ -39,6 +43,7 @@ class RayBatch:
     t_min: Float32[np.ndarray, "#r"]
     t_max: Float32[np.ndarray, "#r"]
     t_viewer: Float32[np.ndarray, "#r"]
+    t_leaves: Float32[np.ndarray, "#r"]
 
     def __init__(
         self,
@@ -47,6 +52,7 @@ class RayBatch:
         t_min: Float[np.ndarray, "#r"] | float = 0.0,
         t_max: Float[np.ndarray, "#r"] | float = np.inf,
         t_viewer: Float[np.ndarray, "#r"] | float = 0.0,
+        t_leaves: Float[np.ndarray, "#r"] | float = 0.0,
     ) -> None:
         """Rays through ``directions_world``; a ``t_min`` below 0 counts as 0."""
         object.__setattr__(self, "origins_world", _for_kernels(origins_world))
@@ -54,6 +60,7 @@ class RayBatch:
         object.__setattr__(self, "t_min", _for_kernels(np.maximum(np.atleast_1d(t_min), 0)))
         object.__setattr__(self, "t_max", _for_kernels(np.atleast_1d(t_max)))
         object.__setattr__(self, "t_viewer", _for_kernels(np.atleast_1d(t_viewer)))
+        object.__setattr__(self, "t_leaves", _for_kernels(np.atleast_1d(t_leaves)))
 
     @classmethod
     def between(
@@ -77,18 +84,18 @@ class RayBatch:
 
     def __getitem__(self, which: slice | Int[np.ndarray, " k"] | np.ndarray) -> "RayBatch":
         """The rays of a slice, of numbers or of a mask."""
-        return RayBatch(
-            *(
-                rows if len(rows) == 1 and len(self) != 1 else rows[which]
-                for rows in (
-                    self.origins_world, self.directions_world, self.t_min, self.t_max, self.t_viewer
-                )
-            )
+        return RayBatch(*(rows if len(rows) == 1 and len(self) != 1 else rows[which] for rows in self.arrays))
+
+    @property
+    def arrays(self) -> tuple[Float32[np.ndarray, "#r *c"], ...]:
+        """What they are made of, in order."""
+        return (
+            self.origins_world, self.directions_world, self.t_min, self.t_max, self.t_viewer, self.t_leaves
         )  # fmt: skip
 
     def up_to(self, t_max: Float[np.ndarray, "#r"] | float) -> "RayBatch":
         """These rays with another end."""
-        return RayBatch(self.origins_world, self.directions_world, self.t_min, t_max, self.t_viewer)
+        return replace(self, t_max=np.asarray(t_max))
 
     @cached_property
     def starts_world(self) -> Float32[np.ndarray, "r 3"]:
@@ -116,7 +123,21 @@ class RayBatch:
         origins, directions = self.origins_world.astype(np.float64), self.directions_world.astype(np.float64)
         origins -= 2 * ((origins - point_world) @ normal)[:, None] * normal
         directions -= 2 * (directions @ normal)[:, None] * normal
-        return RayBatch(origins, directions, np.maximum(t_mirror, self.t_min), self.t_max, self.t_viewer)
+        return RayBatch(
+            origins, directions, np.maximum(t_mirror, self.t_min), self.t_max, self.t_viewer, self.t_leaves
+        )
+
+
+def joined(first: RayBatch, second: RayBatch) -> RayBatch:
+    """One batch after the other; what stands for all rays of both goes on doing so."""
+
+    def both(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        if len(one) == 1 and np.array_equal(one, other):
+            return one
+        wide = [np.broadcast_to(x, (len(of), *x.shape[1:])) for x, of in ((one, first), (other, second))]
+        return np.concatenate(wide)
+
+    return RayBatch(*map(both, first.arrays, second.arrays))
 
 
 @dataclass(frozen=True)

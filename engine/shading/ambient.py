@@ -8,6 +8,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
+from engine.shading.buffer import Leaving
 from engine.trace.protocol import Tracer
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
@@ -20,18 +21,19 @@ Radiance = Callable[[RayBatch], Float64[np.ndarray, "r 3"]]
 
 
 def ambient_visibility(
-    gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer, *, rays: int, gap_world: float
+    gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer, *, rays: int, leaving: Leaving
 ) -> tuple[Float32[np.ndarray, " u"], Float32[np.ndarray, " u"]]:
     """Mean transmittance over the hemisphere, weighted by the cosine, of the side that sees more.
 
-    A Gaussian of a solid thing has one side outside and one inside, and nothing else says which is which.
+    A Gaussian of a solid thing has one side outside and one inside, and nothing else says which is which
+    where no photograph shows it.
 
     Args:
         gaussians: the scene.
         ids: which of them.
         tracer: built around all of them.
         rays: for each side of each.
-        gap_world: distance from the Gaussian at which rays begin.
+        leaving: how rays leave it.
 
     Returns:
         That, and the side: 1 where the normal looks, else -1.
@@ -39,7 +41,7 @@ def ambient_visibility(
     sides = np.empty((2, len(ids)), np.float32)
     for part in _parts(len(ids), rays):
         for number, side in enumerate((1.0, -1.0)):
-            fan = _fan_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, gap_world)
+            fan = _fan_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, leaving)
             sides[number, part] = tracer.transmittance(fan).reshape(-1, rays).mean(axis=1)
     return sides.max(axis=0), np.where(sides[0] >= sides[1], 1.0, -1.0).astype(np.float32)
 
@@ -51,7 +53,7 @@ def bounced_light(
     radiance: Radiance,
     *,
     rays: int,
-    gap_world: float,
+    leaving: Leaving,
 ) -> Float32[np.ndarray, "u 3"]:
     """Irradiance over pi that the other Gaussians send to one side of each: the mean over the same rays.
 
@@ -61,11 +63,11 @@ def bounced_light(
         side: of :func:`ambient_visibility`.
         radiance: what comes from where it is not clear.
         rays: for each.
-        gap_world: distance from the Gaussian at which rays begin.
+        leaving: how rays leave it.
     """
     out = np.empty((len(ids), 3), np.float32)
     for part in _parts(len(ids), rays):
-        light = radiance(_fan_rays(gaussians, ids[part], side[part], rays, gap_world))
+        light = radiance(_fan_rays(gaussians, ids[part], side[part], rays, leaving))
         out[part] = light.reshape(-1, rays, 3).mean(axis=1)
     return out
 
@@ -80,14 +82,15 @@ def _fan_rays(
     ids: Int64[np.ndarray, " u"],
     side: Float[np.ndarray, " u"],
     rays: int,
-    gap_world: float,
+    leaving: Leaving,
 ) -> RayBatch:
     """The fan over one side of each, begun a little above."""
     frames = rotation_matrices(gaussians.quats_wxyz[ids])
     frames = frames * np.stack([side, np.ones_like(side), np.ones_like(side)], axis=1)[:, None, :]
     ways = np.einsum("nij,kj->nki", frames, cosine_fan(rays))
-    starts = np.repeat(gaussians.means_world[ids] + gap_world * frames[:, :, 0], rays, axis=0)
-    return RayBatch(starts, ways.reshape(-1, 3), gap_world)
+    starts = np.repeat(gaussians.means_world[ids] + leaving.gap_world * frames[:, :, 0], rays, axis=0)
+    reaches = np.repeat(np.where(side > 0, leaving.reach_world, 0.0), rays)
+    return RayBatch(starts, ways.reshape(-1, 3), leaving.gap_world, t_leaves=reaches)
 
 
 def cosine_fan(rays: int) -> Float64[np.ndarray, "k 3"]:

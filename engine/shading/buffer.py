@@ -1,6 +1,7 @@
 """What is blended along rays before anything is shaded: materials, normals and depths, with the way back."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -14,6 +15,18 @@ LEAST_RISE = 0.01
 """Cosine to the normal that reflected rays have at least."""
 LEAST_ALPHA = 0.02
 """Rays that met less show nothing that could be shaded."""
+
+
+class Leaving(NamedTuple):
+    """How rays leave a surface of Gaussians.
+
+    Attributes:
+        gap_world: distance from it at which they begin.
+        reach_world: distance up to which they pass what they would meet from behind.
+    """
+
+    gap_world: float
+    reach_world: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -64,7 +77,7 @@ def spread_back(
 def reflected_rays(
     rays: RayBatch,
     buffer: Buffer,
-    gap_world: float,
+    leaving: Leaving,
     facets_world: Float64[np.ndarray, "p 3"] | None = None,
 ) -> RayBatch:
     """Rays from the points of a buffer along their reflected directions, begun a little off the surface.
@@ -72,17 +85,18 @@ def reflected_rays(
     Args:
         rays: that the buffer was gathered along.
         buffer: of ``p`` points.
-        gap_world: how far off.
+        leaving: how far off, and how they get away from there.
         facets_world: unit normals to be mirrored at instead of the surface's; where that leads below the
             surface, the ray leaves along it.
     """
     which, normals = buffer.which, buffer.surface.normal_world
     origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[which]
     directions = rays.directions_world[which].astype(np.float64)
+    gap_world = leaving.gap_world
     points = origins + buffer.depth[:, None] * directions + gap_world * normals
     facets = normals if facets_world is None else facets_world
     mirrored = directions - 2 * (directions * facets).sum(axis=1, keepdims=True) * facets
     rise = (mirrored * normals).sum(axis=1, keepdims=True)
     mirrored += np.maximum(LEAST_RISE - rise, 0.0) * normals
     mirrored /= np.linalg.norm(mirrored, axis=1, keepdims=True)
-    return RayBatch(points, mirrored, gap_world, t_viewer=AT_INFINITY)
+    return RayBatch(points, mirrored, gap_world, t_viewer=AT_INFINITY, t_leaves=leaving.reach_world)

@@ -18,7 +18,7 @@ from engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
 from engine.shading.ambient import OPEN, ambient_visibility, bounced_light
-from engine.shading.buffer import Buffer, gather, reflected_rays, spread_back
+from engine.shading.buffer import Buffer, Leaving, gather, reflected_rays, spread_back
 from engine.shading.environment_frame import environment_frame
 from engine.shading.geometry_terms import neighbour_terms, spread_term
 from engine.shading.learnt_light import LearntLight
@@ -90,6 +90,8 @@ class Deferred:
         self.light = LearntLight(settings)
         self.frame = environment_frame(np.array(settings.up_world, np.float64))
         self._gap = settings.start * extent_world
+        self._leaving = Leaving(self._gap, settings.leaves * extent_world)
+        self._leaving_far = self._leaving._replace(gap_world=2 * self._gap)
         self._window = window_rays
         self._started_over = np.zeros(1, bool)
         self._features: Float32[np.ndarray, "n f"] = np.empty((0, 5), np.float32)
@@ -115,7 +117,7 @@ class Deferred:
     ) -> Float32[np.ndarray, " u"]:
         """Measure the ambient visibility of Gaussians; returns their open sides for :meth:`bounce`."""
         rays = self.settings.ambient_rays
-        visible, side = ambient_visibility(gaussians, ids, tracer, rays=rays, gap_world=2 * self._gap)
+        visible, side = ambient_visibility(gaussians, ids, tracer, rays=rays, leaving=self._leaving_far)
         gaussians.channels[AMBIENT][ids, 0] = visible
         self._features[ids, AMBIENT_COLUMN] = visible
         return side
@@ -134,7 +136,7 @@ class Deferred:
         bounced = np.zeros((len(ids), 3), np.float32)
         bounced[dim] = bounced_light(
             gaussians, ids[dim], side[dim], lambda fan: self._radiance(fan, tracer),
-            rays=self.settings.ambient_rays, gap_world=2 * self._gap,
+            rays=self.settings.ambient_rays, leaving=self._leaving_far,
         )  # fmt: skip
         gaussians.channels[BOUNCED][ids] = bounced
         self._features[ids, BOUNCED_COLUMNS] = bounced
@@ -345,15 +347,16 @@ class Deferred:
             salt = int(sight.progress * TURNS)
             facets = facets_of(surface, least_slope=settings.least_slope(sight.progress), salt=salt)
             mirrored = follow(
-                mirrored_pair(rays, buffer, facets, gap_world=self._gap),
+                mirrored_pair(rays, buffer, facets, self._leaving),
                 sight.tracer, self.light.levels, self.frame, self._dimmed,
-                surfaces=settings.reflections, gap_world=self._gap, apart_world=settings.parted * self._gap,
+                surfaces=settings.reflections, leaving=self._leaving,
+                apart_world=settings.parted * self._gap,
                 record=record,
             )  # fmt: skip
             visibility, indirect = pair_mean(mirrored.seen)
             surface = replace(surface, visibility=visibility, indirect_linear=indirect)
             return surface, _Reflection(mirrored.trace, mirrored, facets)
-        mirrored_rays = reflected_rays(rays, buffer, self._gap)
+        mirrored_rays = reflected_rays(rays, buffer, self._leaving)
         if seed:
             mirrored_rays = mirrored_rays.up_to(SEED_REACH)
         seen = sight.tracer.trace(mirrored_rays, record=record)

@@ -44,6 +44,8 @@ class MaterialSettings(BaseModel):
         normal_clip: gradients by normals through the reflected direction are cut off at so many times their
             median of a batch; 0 leaves them alone.
         start: distance from the surface at which reflected rays begin, of the extent.
+        leaves: distance up to which they pass what they would meet from behind, likewise; for normals that
+            point outwards.
         blur: roughness of the level that leads reflected directions at first, and sees farther than a
             sharp one; it falls to 0 until ``blur_until``.
         blur_until: see there.
@@ -91,6 +93,7 @@ class MaterialSettings(BaseModel):
     reflected_gradient: bool = True
     normal_clip: float = Field(2.0, ge=0)
     start: float = Field(0.004, gt=0)
+    leaves: float = Field(0.0, ge=0)
     blur: float = Field(0.5, ge=0, le=1)
     blur_until: float = Field(0.3, ge=0, le=1)
     normal_weight: float = Field(0.1, ge=0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, Shaped
 
-from engine.rays import RayBatch
+from engine.rays import RayBatch, joined
 from engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 
 LEAST_SHARE = 0.05
@@ -113,19 +113,4 @@ def part(rays: RayBatch, seen: TraceResult, tracer: Tracer, *, apart_world: floa
         features=divided(seen.features, front.features),
         hit_counts=listed(seen.hit_counts, front.hit_counts),
     )
-    return Parted(_joined(rays, front_rays[kept]), parts, two, front.hits, kept)
-
-
-def _joined(rays: RayBatch, fronts: RayBatch) -> RayBatch:
-    """One batch after the other."""
-
-    def rows(name: str) -> np.ndarray:
-        first, second = getattr(rays, name), getattr(fronts, name)
-        if len(first) == 1 and np.array_equal(first, second):
-            return np.asarray(first)
-        wide = [np.broadcast_to(x, (len(of), *x.shape[1:])) for x, of in ((first, rays), (second, fronts))]
-        return np.concatenate(wide)
-
-    return RayBatch(
-        *(rows(name) for name in ("origins_world", "directions_world", "t_min", "t_max", "t_viewer"))
-    )
+    return Parted(joined(rays, front_rays[kept]), parts, two, front.hits, kept)

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, UInt64
 
-from engine.rays import AT_INFINITY, RayBatch
-from engine.shading.buffer import Buffer, gather, reflected_rays, spread_back
+from engine.rays import RayBatch, joined
+from engine.shading.buffer import Buffer, Leaving, gather, reflected_rays, spread_back
 from engine.shading.environment_levels import LightLevels
 from engine.shading.parted import Parted, part, whole
 from engine.shading.split_sum import Surface, shade, shade_reverse
@@ -98,18 +98,13 @@ def facets_of(surface: Surface, *, least_slope: float, salt: int) -> Facets:
     return Facets(np.cos(angle) * first + np.sin(angle) * np.cross(n, first), slope)
 
 
-def mirrored_pair(rays: RayBatch, buffer: Buffer, facets: Facets, *, gap_world: float) -> RayBatch:
+def mirrored_pair(rays: RayBatch, buffer: Buffer, facets: Facets, leaving: Leaving) -> RayBatch:
     """Rays from the points of a buffer, mirrored at the facets of one side and then at those of the other."""
     one, other = (
-        reflected_rays(rays, buffer, gap_world, facets.normals(buffer.surface.normal_world, sign))
+        reflected_rays(rays, buffer, leaving, facets.normals(buffer.surface.normal_world, sign))
         for sign in (1.0, -1.0)
     )
-    return RayBatch(
-        np.concatenate([one.origins_world, other.origins_world]),
-        np.concatenate([one.directions_world, other.directions_world]),
-        gap_world,
-        t_viewer=AT_INFINITY,
-    )
+    return joined(one, other)
 
 
 def follow(
@@ -120,7 +115,7 @@ def follow(
     dimmed: Callable[[TraceResult, Buffer], Surface],
     *,
     surfaces: int,
-    gap_world: float,
+    leaving: Leaving,
     apart_world: float,
     record: bool,
 ) -> Mirrored:
@@ -133,7 +128,7 @@ def follow(
         frame: its right, up and forward in the world, as rows.
         dimmed: the surface of a buffer with its ambient visibility.
         surfaces: on a path, at least 1; the last one sees nothing but the environment.
-        gap_world: distance from a surface at which rays begin.
+        leaving: how rays leave a surface.
         apart_world: see :func:`engine.shading.parted.part`; 0 parts nothing.
         record: whether there will be a way back.
     """
@@ -144,10 +139,10 @@ def follow(
     buffer = gather(parted.rays, parted.seen)
     surface, further = dimmed(parted.seen, buffer), None
     if surfaces > 1 and len(buffer.which):
-        onward = reflected_rays(parted.rays, buffer, gap_world)
+        onward = reflected_rays(parted.rays, buffer, leaving)
         further = follow(
             onward, tracer, light, frame, dimmed,
-            surfaces=surfaces - 1, gap_world=gap_world, apart_world=apart_world, record=record,
+            surfaces=surfaces - 1, leaving=leaving, apart_world=apart_world, record=record,
         )  # fmt: skip
         seen = further.seen
         surface = replace(surface, visibility=seen.visibility, indirect_linear=seen.light_linear)

@@ -130,7 +130,9 @@ def trace_reference(
     au, av = u.detach().abs(), v.detach().abs()
     inside = torch.maximum(au * cos + av * sin, au * sin + av * cos) <= inner_radius
     t32 = t.detach().float()
-    hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0)
+    leaves = torch.tensor(rays.t_leaves).expand(len(d))[:, None]
+    left_behind = (cosine > 0) & (t32 < leaves)
+    hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0) & ~left_behind
 
     out: list[list[Tensor]] = []
     hit_ids = []

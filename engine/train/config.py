@@ -299,7 +299,9 @@ def with_materials(config: TrainConfig) -> TrainConfig:
     }
     return config.model_copy(
         update={
-            "materials": config.materials.model_copy(update={"learn": True}),
+            "materials": config.materials.model_copy(
+                update={"learn": True, "start": 1e-3, "leaves": 1e-2, "parted": 8.0}
+            ),
             "rates": config.rates.model_copy(update=rates),
             "lift_pixels": False,
             "plane_points": 10,

@@ -68,12 +68,10 @@ class CorrectedViews:
         if not moved.any():
             return rays
         turned = np.einsum("nij,nj->ni", self._turns_world[view], rays.directions_world)
-        return RayBatch(
-            np.where(moved[:, None], self._origins_world[view], rays.origins_world),
-            np.where(moved[:, None], turned, rays.directions_world),
-            rays.t_min,
-            rays.t_max,
-            rays.t_viewer,
+        return replace(
+            rays,
+            origins_world=np.where(moved[:, None], self._origins_world[view], rays.origins_world),
+            directions_world=np.where(moved[:, None], turned, rays.directions_world),
         )
 
     def pixels(

@@ -13,6 +13,7 @@ from engine.gaussians.frames import frames_from_normals, quaternions
 from engine.gaussians.model import FlatGaussians, concatenate
 from engine.rays import RayBatch
 from engine.shading.ambient import ambient_visibility, bounced_light
+from engine.shading.buffer import Leaving
 from engine.shading.deferred import Deferred
 from engine.shading.material_settings import MaterialSettings
 from engine.shading.protocol import Sight
@@ -136,10 +137,10 @@ def test_ambient_visibility_under_a_lid_is_its_form_factor() -> None:
     tracer = CpuTracer(threads=1)
     tracer.build(both)
     one = np.array([0])
-    found, side = ambient_visibility(both, one, tracer, rays=2000, gap_world=0.01)
+    found, side = ambient_visibility(both, one, tracer, rays=2000, leaving=Leaving(0.01))
     bounced = bounced_light(
         both, one, side, lambda rays: (1 - tracer.transmittance(rays))[:, None] * np.array([[3.0, 2.0, 1.0]]),
-        rays=2000, gap_world=0.01,
+        rays=2000, leaving=Leaving(0.01),
     )  # fmt: skip
     # A lid that shines evenly sends what it hides.
     np.testing.assert_allclose(bounced[0], (1 - found[0]) * np.array([3, 2, 1]), rtol=1e-4)

@@ -56,6 +56,21 @@ def test_normals_that_keep_their_side(rng: np.random.Generator) -> None:
     assert np.array_equal(ours.rgb_srgb, all_turned.rgb_srgb)
 
 
+def test_rays_that_leave_a_surface(rng: np.random.Generator) -> None:
+    inwards = rays_inwards(rng, 120, distance=0.5)
+    leaves = rng.choice([0.0, 0.3, np.inf], 120)
+    rays = RayBatch(inwards.origins_world, inwards.directions_world, t_leaves=leaves)
+    cloud = make_cloud(rng, 1000)
+    ours, _ = assert_like_twin(cloud, rays)
+    before = make_tracer(cloud).trace(inwards)
+    assert np.array_equal(ours.hit_counts[leaves == 0], before.hit_counts[leaves == 0])
+    assert ours.hit_counts[leaves > 1].mean() < 0.7 * before.hit_counts[leaves > 1].mean()
+    np.testing.assert_allclose(
+        make_tracer(cloud).transmittance(rays), np.where(ours.transmittance < 1e-3, 0, ours.transmittance),
+        atol=1e-5,
+    )  # fmt: skip
+
+
 def test_quaternions_of_any_length(rng: np.random.Generator) -> None:
     cloud = make_cloud(rng, 1000)
     cloud.quats_wxyz *= f32(10 ** rng.uniform(-3, 3, (1000, 1)))

@@ -26,11 +26,12 @@ class Rays(NamedTuple):
     t_min: Float32[np.ndarray, "#r"]
     t_max: Float32[np.ndarray, "#r"]
     t_viewer: Float32[np.ndarray, "#r"]
+    t_leaves: Float32[np.ndarray, "#r"]
 
     @classmethod
     def of(cls, rays: RayBatch) -> "Rays":
         """The arrays of ``rays``, not copied."""
-        return cls(rays.origins_world, rays.directions_world, rays.t_min, rays.t_max, rays.t_viewer)
+        return cls(*rays.arrays)
 
 
 class Scene(NamedTuple):

@@ -28,7 +28,7 @@ RAY_TFAR = 8
 K = 64
 """Hits that one traversal gathers; a ray that needs more is traced on from the last one."""
 COUNT, LAST_ID, LAST_T, BUFFER_FULL = 2, 3, 4, 5  # words of the context (0 and 1 are Embree's)
-T_LIMIT = 26
+T_LIMIT, T_LEAVES = 26, 27
 RECORDS = 3  # as 64-bit word
 TRANSMITTANCE, PRUNE_BELOW, ALPHA_MAX = 4, 5, 6  # as float64 words
 RAY64 = 7  # origin and direction, six float64 words
@@ -79,15 +79,18 @@ def insert_hit(context_i32, context_f32, context_f64, t, identity, alpha):
 
 @njit(forceinline=True, fastmath={"contract"})
 def plane_distance(record, context_f64):
-    """Distance along the ray at which it meets the Gaussian's plane; infinite where it runs inside it."""
+    """Distance along the ray at which it meets the Gaussian's plane; infinite where it runs inside it.
+
+    And whether it meets it from behind.
+    """
     nx, ny, nz = np.float64(record[NORMAL]), np.float64(record[NORMAL + 1]), np.float64(record[NORMAL + 2])
     cosine = context_f64[RAY64 + 3] * nx + context_f64[RAY64 + 4] * ny + context_f64[RAY64 + 5] * nz
     if abs(cosine) < GRAZING_COSINE:
-        return np.inf
+        return np.inf, False
     x = context_f64[RAY64] - record[MEAN]
     y = context_f64[RAY64 + 1] - record[MEAN + 1]
     z = context_f64[RAY64 + 2] - record[MEAN + 2]
-    return -(x * nx + y * ny + z * nz) / cosine
+    return -(x * nx + y * ny + z * nz) / cosine, cosine > 0.0
 
 
 @njit(forceinline=True, fastmath={"contract"})
@@ -123,11 +126,13 @@ def intersect_octagon(arguments):
         float32_pointer(context_u64[RECORDS] + np.uint64(gaussian * RECORD_WORDS * 4)), RECORD_WORDS
     )
 
-    distance = plane_distance(record, context_f64)
+    distance, behind = plane_distance(record, context_f64)
     t = np.float32(distance)
     if t > ray[RAY_TFAR] or t >= context_f32[T_LIMIT] or t < context_f32[LAST_T]:
         return
     if t == context_f32[LAST_T] and gaussian <= context_i32[LAST_ID]:
+        return
+    if behind and t < context_f32[T_LEAVES]:
         return
     u, v, inside = octagon_place(record, context_f64, distance)
     if not inside:
@@ -157,9 +162,9 @@ def absorb_octagon(arguments):
     record = carray(
         float32_pointer(context_u64[RECORDS] + np.uint64(gaussian * RECORD_WORDS * 4)), RECORD_WORDS
     )
-    distance = plane_distance(record, context_f64)
+    distance, behind = plane_distance(record, context_f64)
     t = np.float32(distance)
-    if t <= context_f32[LAST_T] or t >= context_f32[T_LIMIT]:
+    if t <= context_f32[LAST_T] or t >= context_f32[T_LIMIT] or (behind and t < context_f32[T_LEAVES]):
         return
     u, v, inside = octagon_place(record, context_f64, distance)
     if inside:

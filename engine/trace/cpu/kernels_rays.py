@@ -46,6 +46,12 @@ def ray_viewer(rays, r):
 
 
 @lean(forceinline=True)
+def ray_leaves(rays, r):
+    """Up to where ray ``r`` passes what it would meet from behind; a single distance stands for all rays."""
+    return rays.t_leaves[r if len(rays.t_leaves) > 1 else 0]
+
+
+@lean(forceinline=True)
 def side_shown(to_mean, normal, limits):
     """1, or -1 where ``normal`` is turned to the viewer, see :class:`engine.trace.protocol.TraceSettings`.
 

@@ -23,10 +23,11 @@ from engine.trace.cpu.kernels_hit import (
     RAY_TFAR,
     RAY_WORDS,
     RECORDS,
+    T_LEAVES,
     T_LIMIT,
     TRANSMITTANCE,
 )
-from engine.trace.cpu.kernels_rays import first_place, ray_direction, ray_limits, ray_origin
+from engine.trace.cpu.kernels_rays import first_place, ray_direction, ray_leaves, ray_limits, ray_origin
 from engine.trace.kernels_native import call_with_three_pointers, lean, next_from_counter
 
 INT32_MAX = 2**31 - 1
@@ -99,6 +100,7 @@ def trace_from_counter(embree, forward, which, rays_per_chunk, counter, basis):
                 context_f64[RAY64 + 3 + axis] = direction[axis]
             front = begin(forward, r, place)
             context[LAST_T], context_i32[LAST_ID], context[T_LIMIT] = t_min, INT32_MAX, t_max
+            context[T_LEAVES] = ray_leaves(rays, r)
             stop = not t_min < t_max
             while not stop:
                 write_query(ray, ray_i32, context_i32, origin, direction, context[LAST_T], t_max)
@@ -160,6 +162,7 @@ def absorb_from_counter(embree, rays, scene, limits, which, rays_per_chunk, coun
                 context_f64[RAY64 + axis] = origin[axis]
                 context_f64[RAY64 + 3 + axis] = direction[axis]
             context[LAST_T], context[T_LIMIT] = ray_limits(rays, r)
+            context[T_LEAVES] = ray_leaves(rays, r)
             context_f64[TRANSMITTANCE] = 1.0
             if context[LAST_T] < context[T_LIMIT]:
                 write_query(ray, ray_i32, context_i32, origin, direction, context[LAST_T], context[T_LIMIT])

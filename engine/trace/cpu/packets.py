@@ -54,7 +54,7 @@ def find_packets(
 
     A group are neighbours in the batch that share an origin, to the bit, and look about one way. Each is
     judged by its own size, but few small ones go as packets, too. A packet sees a Gaussian in one colour, so
-    that where colours matter the viewers have to stand at the origins.
+    that where colours matter the viewers have to stand at the origins. Rays that leave surfaces go alone.
 
     Args:
         rays: any rays.
@@ -65,7 +65,7 @@ def find_packets(
         First ray of each packet and the one behind its last; and the rays that go alone.
     """
     count = len(rays)
-    if ways == "never" or count == 0 or (coloured and rays.t_viewer.any()):
+    if ways == "never" or count == 0 or (coloured and rays.t_viewer.any()) or rays.t_leaves.any():
         return np.empty((0, 2), np.int64), np.arange(count)
     starts = np.empty(count + 1, np.int64)
     groups = packet_starts(rays.origins_world, rays.directions_world, MAX_RAYS, LEAST_COSINE, starts)
