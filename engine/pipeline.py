@@ -184,6 +184,7 @@ def reconstruct(
                     output / SCENE,
                     near_world=dataset.near_world,
                     pixel_rad=trained_pixel_rad(dataset.viewpoints),
+                    turned_beyond=config.train.trace.turned_beyond,
                 )
         unmeasured: Exception | None = None
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():

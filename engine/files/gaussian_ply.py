@@ -37,7 +37,7 @@ from engine.gaussians.model import FlatGaussians
 
 MAX_SH_DEGREE = 3
 ROWS_AT_ONCE = 65536
-_NEAR, _PIXEL = "near_world", "pixel_rad"
+_NEAR, _PIXEL, _TURNED = "near_world", "pixel_rad", "turned_beyond"
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -52,6 +52,7 @@ def write_gaussian_ply(
     sh_pad_degree: int | None = None,
     near_world: float = 0.0,
     pixel_rad: float = 0.0,
+    turned_beyond: float = 0.0,
 ) -> None:
     """Write ``gaussians`` as a 3DGS PLY, atomically and in blocks.
 
@@ -62,6 +63,7 @@ def write_gaussian_ply(
             importers accept only degree 3.
         near_world: the distance from a camera at which the scene begins to be seen, kept as a comment.
         pixel_rad: the angle of a pixel in the middle of a training view, likewise.
+        turned_beyond: of :class:`engine.trace.protocol.TraceSettings`, likewise; 0: normals have no side.
 
     Raises:
         SceneFileError: nothing to write, a parameter is not finite, or the file cannot be written.
@@ -78,7 +80,8 @@ def write_gaussian_ply(
     names += [column for name, width in widths.items() for column in column_names(name, width)]
     dtype = np.dtype([(name, "<f4") for name in names])
     element = PlyWriteElement("vertex", len(gaussians), dtype, _row_blocks(gaussians, degree, dtype))
-    known = [f"{name} {value!r}" for name, value in ((_NEAR, near_world), (_PIXEL, pixel_rad)) if value > 0]
+    facts = {_NEAR: near_world, _PIXEL: pixel_rad, _TURNED: turned_beyond}
+    known = [f"{name} {value!r}" for name, value in facts.items() if value > 0]
     write_ply(path, [element], [*known, *channel_comments(widths)])
 
 
@@ -98,6 +101,15 @@ def read_pixel_rad(path: Path) -> float:
         SceneFileError: a PLY is damaged.
     """
     return _commented(path, _PIXEL)
+
+
+def read_turned_beyond(path: Path) -> float:
+    """Beyond which cosine normals of the scene in a file are turned to the viewer; 0 where they have no side.
+
+    Raises:
+        SceneFileError: a PLY is damaged.
+    """
+    return min(_commented(path, _TURNED), 1.0)
 
 
 def _commented(path: Path, wanted: str) -> float:

@@ -106,10 +106,14 @@ def shiny_run(run, tmp_path_factory) -> Path:
         "metallic": np.full((count, 1), 1.0, np.float32),
         "roughness": np.full((count, 1), 0.5, np.float32),
     }
-    write_gaussian_ply(gaussians.with_channels(channels), root / "run" / "scene.ply")
+    given = resolve_config("fast", settings={"test_every": 4}, assignments=["materials.learn=true"])
+    write_gaussian_ply(
+        gaussians.with_channels(channels),
+        root / "run" / "scene.ply",
+        turned_beyond=given.train.trace.turned_beyond,
+    )
     write_environment(root / "run" / "environment.hdr", np.full((16, 32, 3), 0.5, np.float32))
     content = json.loads((root / "run" / "config.json").read_text())
-    given = resolve_config("fast", settings={"test_every": 4}, assignments=["materials.learn=true"])
     content["reconstruction"] = given.model_dump(mode="json")
     (root / "run" / "config.json").write_text(json.dumps(content))
     return root / "run"

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.files.gaussian_ply import (
+    read_gaussian_ply,
+    read_near_world,
+    read_pixel_rad,
+    read_turned_beyond,
+    write_gaussian_ply,
+)
 from engine.files.ply_container import read_ply
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
@@ -56,6 +62,16 @@ def assert_same_bits(actual: FlatGaussians, expected: FlatGaussians) -> None:
         a, b = getattr(actual, name), getattr(expected, name)
         assert a.shape == b.shape and a.dtype == np.float32
         np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32), err_msg=name)
+
+
+def test_what_is_known_of_a_scene_is_kept_in_comments(make_gaussians: Make, tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    facts = read_near_world, read_pixel_rad, read_turned_beyond
+    write_gaussian_ply(make_gaussians(3), path, near_world=0.125, pixel_rad=1e-3, turned_beyond=0.5)
+    assert [fact(path) for fact in facts] == [0.125, 1e-3, 0.5]
+    write_gaussian_ply(make_gaussians(3), path)
+    assert [fact(path) for fact in facts] == [0, 0, 0]
+    assert read_turned_beyond(tmp_path / "scene.splat") == 0
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -17,7 +17,7 @@ from engine.config import read_config
 from engine.errors import ConfigError, DatasetError, OutputError
 from engine.events import Listener
 from engine.files import check_surface_path, write_surface
-from engine.files.gaussian_ply import read_near_world
+from engine.files.gaussian_ply import read_near_world, read_turned_beyond
 from engine.gaussians.materials import require_materials
 from engine.gaussians.model import FlatGaussians
 from engine.rays import ImageRays
@@ -197,12 +197,13 @@ def _cameras(
         train = read_config(source / CONFIG).train
         near_world = train.near * seen.extent
         return photograph_cameras(seen, seen.train_indices, options.depth_side, near_world), train.trace
+    settings = TraceSettings(turned_beyond=read_turned_beyond(source))
     if scene is not None:
         photographs = load_scene(scene)
         every = np.arange(len(photographs.views))
         near_world = read_near_world(source)
-        return photograph_cameras(photographs, every, options.depth_side, near_world), TraceSettings()
-    return cameras_around(gaussians, options.depth_side), TraceSettings()
+        return photograph_cameras(photographs, every, options.depth_side, near_world), settings
+    return cameras_around(gaussians, options.depth_side), settings
 
 
 def _photographs(source: Path, scene: Path | None, threads: int, listener: Listener) -> tuple[Picture, ...]:

@@ -12,7 +12,12 @@ from jaxtyping import Float64
 from engine.config import read_config
 from engine.errors import ConfigError, OutputError
 from engine.events import Listener
-from engine.files.gaussian_ply import read_gaussian_ply, read_near_world, read_pixel_rad
+from engine.files.gaussian_ply import (
+    read_gaussian_ply,
+    read_near_world,
+    read_pixel_rad,
+    read_turned_beyond,
+)
 from engine.gaussians.model import FlatGaussians
 from engine.light.companions import companions
 from engine.light.stage import Stage
@@ -270,7 +275,8 @@ def _read_file(options: dict[str, Any], say: Callable[[str], None]) -> Source:
     path: Path = options["source"]
     gaussians = open_scene(path, say)
     near_world, trained_rad = read_near_world(path), read_pixel_rad(path)
-    return Source(gaussians, TraceSettings(), near_world, trained_rad=trained_rad)
+    settings = TraceSettings(turned_beyond=read_turned_beyond(path))
+    return Source(gaussians, settings, near_world, trained_rad=trained_rad)
 
 
 def stage_place(
