@@ -127,6 +127,24 @@ def test_a_mirror_shows_what_stands_before_it_and_else_the_environment() -> None
         np.testing.assert_allclose(linear, expected, atol=0.012)
 
 
+def test_rays_that_leave_a_rough_heap_of_gaussians_are_not_stopped_by_it() -> None:
+    places = floor(1.0, 0.05)
+    places[:, 2] = np.random.default_rng(3).uniform(-0.03, 0.03, len(places))
+    mirror = wall((0, 0, 1), places, [1, 1, 1, 1, 0.05])
+    mirror.opacity_logits[:] = -1.5
+    down = np.array([[0.6, 0.0, -0.8]])
+    rays = RayBatch(np.array([[-0.3, 0, 0.4]]), down)
+    seen = []
+    for leaves in (0.0, 0.1):
+        model = Deferred(MaterialSettings(**BARE, start=1e-3, leaves=leaves), extent_world=1.0)
+        model.light.put(np.full((16, 32, 3), 0.5, np.float32))
+        tracer = CpuTracer(TraceSettings(turned_beyond=0.5), threads=1)
+        tracer.build(mirror, model.features(mirror))
+        seen.append(model.develop(Sight(rays, tracer.trace(rays), tracer)).layers["visibility"][0, 0])
+    assert seen[0] < 0.9
+    assert seen[1] > 0.99
+
+
 def test_ambient_visibility_under_a_lid_is_its_form_factor() -> None:
     ground = wall((0, 0, 1), np.zeros((1, 3)), [0.5] * 5)
     lid = wall((0, 0, 1), floor(2.0, 0.08, above=1.0) + 0.04, [0.5] * 5)
