@@ -95,7 +95,7 @@ class RayBatch:
 
     def up_to(self, t_max: Float[np.ndarray, "#r"] | float) -> "RayBatch":
         """These rays with another end."""
-        return replace(self, t_max=np.asarray(t_max))
+        return replace(self, t_max=np.atleast_1d(t_max))
 
     @cached_property
     def starts_world(self) -> Float32[np.ndarray, "r 3"]:
