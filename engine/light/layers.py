@@ -55,9 +55,8 @@ class GaussianLayers:
         """What lies on rays up to a distance each."""
         seen = self.tracer.trace(rays.up_to(t_max))
         if self.tracer.settings.turned_beyond > 0:
-            seen.normal_world = faced(seen.normal_world, rays.directions_world).normal_world.astype(
-                np.float32
-            )
+            normals = faced(seen.normal_world, rays.directions_world)
+            seen.normal_world = normals.normal_world.astype(np.float32)
         return seen
 
 
