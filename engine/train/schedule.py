@@ -75,7 +75,7 @@ class Schedule:
         return since < done and (done % AVERAGE_EVERY == 0 or self.ends(done))
 
     def settles_sides(self, done: int) -> bool:
-        """Whether Gaussians are turned over whose outer side is in: for materials, until states are averaged."""
+        """Whether Gaussians whose outer side is in are turned over: until states are averaged."""
         sided = self.config.trace.turned_beyond > 0 and self.config.materials.learn
         return sided and self.measures(done) and done <= self.config.average_after * self.iterations
 
