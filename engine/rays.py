@@ -29,7 +29,7 @@ class RayBatch:
 
     Rays that leave a surface of Gaussians may have some of these in their way, as the surface is as thick as
     their noise. Up to ``t_leaves`` a ray passes all Gaussians that it would meet from behind, which is how it
-    meets those of the surface that it leaves, if their normals point outwards.
+    meets those of the surface that it leaves. Tracers for normals without a side know no behind.
 
     Origins, limits and viewers have one row a ray, or a single one that stands for all.
 

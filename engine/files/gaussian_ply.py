@@ -4,8 +4,8 @@ One element ``vertex``, all float32: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..
 channel-major (all red, then green, then blue), ``opacity`` (logit), ``scale_0..2`` (ln of the standard
 deviations) and ``rot_0..3`` (w, x, y, z). The flat axis, the normal r1, is axis 0 with scale ln 1e-5, so that
 every viewer of 3DGS files shows the scene. A comment ``near_world`` gives the distance from a camera at which
-it begins to be seen, as in training, and ``pixel_rad`` the angle of a pixel that it was trained with, so that
-one file is one picture.
+it begins to be seen, as in training, ``pixel_rad`` the angle of a pixel that it was trained with, and
+``turned_beyond`` which normals, that point outwards, are turned, so that one file is one picture.
 
 Named channels come last, ``metallic`` or ``albedo_0..2``, and a comment ``octasplat_channel albedo 3`` says
 of each that it is one.

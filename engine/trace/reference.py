@@ -131,7 +131,7 @@ def trace_reference(
     inside = torch.maximum(au * cos + av * sin, au * sin + av * cos) <= inner_radius
     t32 = t.detach().float()
     leaves = torch.tensor(rays.t_leaves).expand(len(d))[:, None]
-    left_behind = (cosine > 0) & (t32 < leaves)
+    left_behind = (cosine > 0) & (t32 < leaves) & (settings.turned_beyond > 0)
     hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0) & ~left_behind
 
     out: list[list[Tensor]] = []

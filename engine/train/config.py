@@ -299,6 +299,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
     }
     return config.model_copy(
         update={
+            # Rays may begin so near to a surface as they pass it, which normals with a side allow.
             "materials": config.materials.model_copy(
                 update={"learn": True, "start": 1e-3, "leaves": 1e-2, "parted": 8.0}
             ),

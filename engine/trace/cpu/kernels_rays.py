@@ -46,8 +46,10 @@ def ray_viewer(rays, r):
 
 
 @lean(forceinline=True)
-def ray_leaves(rays, r):
+def ray_leaves(rays, r, limits):
     """Up to where ray ``r`` passes what it would meet from behind; a single distance stands for all rays."""
+    if limits.turned_beyond == 0.0:  # normals have no side
+        return np.float32(0.0)
     return rays.t_leaves[r if len(rays.t_leaves) > 1 else 0]
 
 

@@ -100,7 +100,7 @@ def trace_from_counter(embree, forward, which, rays_per_chunk, counter, basis):
                 context_f64[RAY64 + 3 + axis] = direction[axis]
             front = begin(forward, r, place)
             context[LAST_T], context_i32[LAST_ID], context[T_LIMIT] = t_min, INT32_MAX, t_max
-            context[T_LEAVES] = ray_leaves(rays, r)
+            context[T_LEAVES] = ray_leaves(rays, r, limits)
             stop = not t_min < t_max
             while not stop:
                 write_query(ray, ray_i32, context_i32, origin, direction, context[LAST_T], t_max)
@@ -162,7 +162,7 @@ def absorb_from_counter(embree, rays, scene, limits, which, rays_per_chunk, coun
                 context_f64[RAY64 + axis] = origin[axis]
                 context_f64[RAY64 + 3 + axis] = direction[axis]
             context[LAST_T], context[T_LIMIT] = ray_limits(rays, r)
-            context[T_LEAVES] = ray_leaves(rays, r)
+            context[T_LEAVES] = ray_leaves(rays, r, limits)
             context_f64[TRANSMITTANCE] = 1.0
             if context[LAST_T] < context[T_LIMIT]:
                 write_query(ray, ray_i32, context_i32, origin, direction, context[LAST_T], context[T_LIMIT])
