@@ -76,6 +76,7 @@ from engine.train.exposure_changes import with_exposure_decided
 from engine.train.fingerprint import run_fingerprint
 from engine.train.first_state import first_state
 from engine.train.floors import ScaleFloor
+from engine.train.holding import Held
 from engine.train.shading import background_of, deferred_of, exposures_of
 from engine.train.trainer import Trainer
 from engine.train.within import make_plan, read_plan, write_plan
@@ -309,6 +310,7 @@ def _train(
         scale_floor=_scale_floor(dataset, config),
         near_zones=zones if config.near_share > 0 else None,
         seen_space=seen if config.materials.clears_unseen else None,
+        held=Held(dataset.points.xyz_world) if config.materials.hold > 0 else None,
         onlooker=None
         if watch is None
         else lambda done, tracer: watch(done, dataset, tracer, trainer.shading),

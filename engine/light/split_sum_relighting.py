@@ -45,7 +45,7 @@ class SplitSumRelighter:
         self._across = side
         changed = {"learn": True, "environment_height": HEIGHT, "visibility": True, "indirect": "shaded"}
         shading = (learnt or MaterialSettings()).model_copy(update=changed)
-        self._shading = Deferred(shading, extent_world=extent_world)
+        self._shading = Deferred(shading, extent_world=extent_world, sided=settings.turned_beyond > 0)
         self._gaussians = with_room_for_bounced(gaussians)
         self._tracer = make_tracer(settings, threads=threads, build_quality=2)
         self._tracer.build(self._gaussians, self._shading.features(self._gaussians))

@@ -21,12 +21,18 @@ Radiance = Callable[[RayBatch], Float64[np.ndarray, "r 3"]]
 
 
 def ambient_visibility(
-    gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer, *, rays: int, leaving: Leaving
+    gaussians: FlatGaussians,
+    ids: Int64[np.ndarray, " u"],
+    tracer: Tracer,
+    *,
+    rays: int,
+    leaving: Leaving,
+    sided: bool = False,
 ) -> tuple[Float32[np.ndarray, " u"], Float32[np.ndarray, " u"]]:
-    """Mean transmittance over the hemisphere, weighted by the cosine, of the side that sees more.
+    """Mean transmittance over the hemisphere, weighted by the cosine, of the outer side.
 
-    A Gaussian of a solid thing has one side outside and one inside, and nothing else says which is which
-    where no photograph shows it.
+    Where normals do not say which that is, it is the side that sees more: a Gaussian of a solid thing has one
+    side outside and one inside.
 
     Args:
         gaussians: the scene.
@@ -34,16 +40,18 @@ def ambient_visibility(
         tracer: built around all of them.
         rays: for each side of each.
         leaving: how rays leave it.
+        sided: whether normals point outwards.
 
     Returns:
         That, and the side: 1 where the normal looks, else -1.
     """
-    sides = np.empty((2, len(ids)), np.float32)
+    sides = [1.0] if sided else [1.0, -1.0]
+    seen = np.empty((len(sides), len(ids)), np.float32)
     for part in _parts(len(ids), rays):
-        for number, side in enumerate((1.0, -1.0)):
+        for number, side in enumerate(sides):
             fan = _fan_rays(gaussians, ids[part], np.full(len(ids[part]), side), rays, leaving)
-            sides[number, part] = tracer.transmittance(fan).reshape(-1, rays).mean(axis=1)
-    return sides.max(axis=0), np.where(sides[0] >= sides[1], 1.0, -1.0).astype(np.float32)
+            seen[number, part] = tracer.transmittance(fan).reshape(-1, rays).mean(axis=1)
+    return seen.max(axis=0), np.array(sides, np.float32)[seen.argmax(axis=0)]
 
 
 def bounced_light(

@@ -75,6 +75,7 @@ class Deferred:
     Args:
         settings: how they are learnt.
         extent_world: the scene's extent.
+        sided: whether normals point outwards, so that only one side of each Gaussian is lit.
         window_rays: rays of a window of the training's batches, see
             :class:`engine.train.batches.BatchSource`; 1 where there are none.
 
@@ -85,8 +86,11 @@ class Deferred:
 
     name = "materials"
 
-    def __init__(self, settings: MaterialSettings, *, extent_world: float, window_rays: int = 1) -> None:
+    def __init__(
+        self, settings: MaterialSettings, *, extent_world: float, window_rays: int = 1, sided: bool = False
+    ) -> None:
         self.settings = settings
+        self._sided = sided
         self.light = LearntLight(settings)
         self.frame = environment_frame(np.array(settings.up_world, np.float64))
         self._gap = settings.start * extent_world
@@ -117,7 +121,9 @@ class Deferred:
     ) -> Float32[np.ndarray, " u"]:
         """Measure the ambient visibility of Gaussians; returns their open sides for :meth:`bounce`."""
         rays = self.settings.ambient_rays
-        visible, side = ambient_visibility(gaussians, ids, tracer, rays=rays, leaving=self._leaving_far)
+        visible, side = ambient_visibility(
+            gaussians, ids, tracer, rays=rays, leaving=self._leaving_far, sided=self._sided
+        )
         gaussians.channels[AMBIENT][ids, 0] = visible
         self._features[ids, AMBIENT_COLUMN] = visible
         return side

@@ -31,7 +31,12 @@ def make_shading(config: TrainConfig, views: int, extent_world: float) -> Shadin
 
 def make_deferred(config: TrainConfig, extent_world: float) -> Deferred:
     """The model of materials, with an environment of which nothing is known yet."""
-    return Deferred(config.materials, extent_world=extent_world, window_rays=config.window_rays)
+    return Deferred(
+        config.materials,
+        extent_world=extent_world,
+        window_rays=config.window_rays,
+        sided=config.trace.turned_beyond > 0,
+    )
 
 
 def exposures_of(shading: ShadingModel) -> Exposures | None:

@@ -23,6 +23,7 @@ from engine.train.densify import make_densifier
 from engine.train.densify.propagating import Propagating
 from engine.train.early_end import gains_no_more
 from engine.train.floors import ScaleFloor
+from engine.train.holding import Held
 from engine.train.iteration import Differentiated, Machinery, iterate
 from engine.train.misfits import TrainingViews, ViewJudge
 from engine.train.pose_refinement import PoseRefiner, RefinedPoses
@@ -52,6 +53,7 @@ class Trainer:
         scale_floor: what no scale falls below.
         near_zones: where no Gaussian stays, whatever the strategy does.
         seen_space: outside of which none stays.
+        held: points that surfaces are held to.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: likewise.
         onlooker: shown the iterations done and the tracer as it is then, after each; it may trace without
@@ -82,6 +84,7 @@ class Trainer:
         scale_floor: ScaleFloor | None = None,
         near_zones: NearZones | None = None,
         seen_space: SeenSpace | None = None,
+        held: Held | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
         onlooker: Callable[[int, Tracer], None] | None = None,
@@ -91,6 +94,7 @@ class Trainer:
         self._scale_floor = scale_floor
         self._near_zones = near_zones
         self._seen_space = seen_space
+        self._held = held
         self._config = config
         self._folder = folder
         self._fingerprint = fingerprint
@@ -169,8 +173,10 @@ class Trainer:
                 batches.begin(state.rng, state.iteration + 1)
             progress = schedule.progress(state.iteration)
             found = iterate(state, batch, machinery, self._config, progress=progress, extent=self._extent)
-            stale = schedule.may_densify(state.iteration) and self._change()
-            if stale:
+            held = self._hold()
+            changed = schedule.may_densify(state.iteration) and self._change()
+            stale = held or changed
+            if changed:
                 state.average.clear()
             elif schedule.averages(state.iteration):
                 state.average.add(state.gaussians)
@@ -296,6 +302,13 @@ class Trainer:
         state.shading = self._machinery.shading.state()
         path = save_checkpoint(state, self._folder, self._fingerprint)
         self._tell(CheckpointWritten(state.iteration, str(path)))
+
+    def _hold(self) -> bool:
+        """Take surfaces back to the sparse points where that is due; whether it was."""
+        if self._held is None or not self.schedule.holds(self.state.iteration):
+            return False
+        self._held.hold(self.state.gaussians, self._config.materials.hold)
+        return True
 
     def _change(self) -> bool:
         """Change the set of Gaussians where that is due; whether it was."""
