@@ -232,6 +232,7 @@ def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> Sp
     rgb = np.array([point.color for point in points], dtype=np.float32).reshape(-1, 3) / np.float32(255)
     tracks = np.array([point.track.length() for point in points], dtype=np.int32)
     errors = np.array([point.error for point in points], dtype=np.float32)
+    ids = np.array(sorted(reconstruction.points3D), np.uint64).astype(np.int64)
     announced = _announced_points(folder / "points3D.txt")
     if not (folder / "points3D.bin").is_file() and announced is not None and announced != len(points):
         warnings.append(
@@ -243,7 +244,7 @@ def _sparse_points(reconstruction: Any, folder: Path, warnings: list[str]) -> Sp
         warnings.append(
             f"{int((~finite).sum())} points of the model in {folder} are not finite and left out."
         )
-    return SparsePoints(xyz[finite], rgb[finite], tracks[finite], errors[finite])
+    return SparsePoints(xyz[finite], rgb[finite], tracks[finite], errors[finite], ids[finite])
 
 
 def _announced_points(path: Path) -> int | None:

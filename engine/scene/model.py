@@ -58,12 +58,14 @@ class SparsePoints:
         rgb_srgb: display colours in [0, 1].
         track_lengths: number of observations of each point.
         errors_px: mean reprojection error at the size COLMAP worked with; -1 where it is not known.
+        ids: COLMAP's numbers, ascending.
     """
 
     xyz_world: Float32[np.ndarray, "n 3"]
     rgb_srgb: Float32[np.ndarray, "n 3"]
     track_lengths: Int32[np.ndarray, " n"]
     errors_px: Float32[np.ndarray, " n"]
+    ids: Int64[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.xyz_world)
@@ -75,7 +77,7 @@ class Observations:
 
     Attributes:
         view: index of the view.
-        point: a number that all observations of one point share.
+        point: COLMAP's number of the point.
         xy_px: where in the picture, at its working size.
     """
 

@@ -1,6 +1,7 @@
 """Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
 
 import math
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -64,6 +65,7 @@ class Batch:
     patches: int
     side: int
     background_srgb: Float32[np.ndarray, "3"]
+    sight_lines: RayBatch | None = None
 
     @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
@@ -173,6 +175,10 @@ def _fold(position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]) ->
     return np.minimum(period, 2 * size - 1 - period)
 
 
+def _no_lines(_rng: np.random.Generator, _count: int) -> None:
+    return None
+
+
 class BatchSource:
     """Draws the batches of a training.
 
@@ -182,12 +188,18 @@ class BatchSource:
     Args:
         dataset: the photographs.
         config: sizes and shares.
+        draw_lines: draws lines of sight of the sparse points, or none.
 
     Raises:
         ConfigError: the SSIM term would have no patch, or a background is to be learnt where none is shown.
     """
 
-    def __init__(self, dataset: TrainingData, config: TrainConfig) -> None:
+    def __init__(
+        self,
+        dataset: TrainingData,
+        config: TrainConfig,
+        draw_lines: Callable[[np.random.Generator, int], RayBatch | None] = _no_lines,
+    ) -> None:
         if config.background == "learnt" and dataset.has_alpha:
             raise ConfigError(
                 "These photographs have alpha, so that they show no background; leave background=learnt out."
@@ -197,6 +209,7 @@ class BatchSource:
         self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
         self._window_side_px = window_side_px(config, self.sampler.longest_side_px)
         self._patches = self._patch_count()
+        self._draw_lines = draw_lines
 
     def leave_out(self, views: Int64[np.ndarray, " m"]) -> None:
         """Draw nothing of these views any more."""
@@ -219,7 +232,8 @@ class BatchSource:
         rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
         background = self._background(rng)
-        batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background)
+        lines = self._draw_lines(rng, round(config.sight_line_share * config.rays))
+        batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background, lines)
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch
 

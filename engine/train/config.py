@@ -73,6 +73,7 @@ class LossWeights(_Frozen):
     ssim: float = Field(0.0, ge=0)
     opacity: float = Field(0.0, ge=0, description="mean opacity of the Gaussians that were hit")
     scale: float = Field(0.0, ge=0, description="mean in-plane scale of those, of the extent")
+    blocked: float = Field(0.0, ge=0, description="what hides the sparse points from views that show them")
     depth_normal: float = Field(
         0.0, ge=0, description="one minus the cosine between normals and what depths span; not with materials"
     )
@@ -184,6 +185,15 @@ class TrainConfig(_Frozen):
     )
     refine_poses: bool = Field(
         False, description="learn a small correction of the pose of each training view; not with materials"
+    )
+    sight_line_share: float = Field(
+        0.0625, gt=0, le=1, description="lines of sight of sparse points beside each batch, of its rays"
+    )
+    sight_line_margin: float = Field(
+        0.01,
+        ge=0,
+        lt=0.5,
+        description="least distance before its point at which such a line ends, of its length",
     )
     average_after: float = Field(
         0.85,

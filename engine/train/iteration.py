@@ -16,6 +16,7 @@ from engine.train.batches import Batch
 from engine.train.config import LossWeights, TrainConfig
 from engine.train.densify import Densifier
 from engine.train.losses import BatchLoss, batch_loss, ray_errors
+from engine.train.sight_lines import blocked_term
 from engine.train.state import TrainState
 
 RUNNING = 0.98
@@ -78,6 +79,8 @@ def differentiate(
     if with_errors:
         by_seen = replace(by_seen, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
     recorded = [(seen.hits, by_seen), *back.further]
+    if batch.sight_lines is not None:
+        recorded.append(blocked_term(batch.sight_lines, tracer, weights.blocked))
     return Differentiated(
         loss=loss,
         gaussians=add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded]),

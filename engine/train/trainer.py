@@ -10,6 +10,7 @@ from engine.errors import Cancelled, ConfigError, TrainingFailure
 from engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
+from engine.rays import RayBatch
 from engine.scene.near import NearZones
 from engine.scene.seen import SeenSpace
 from engine.shading.protocol import ShadingModel
@@ -31,6 +32,7 @@ from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
 from engine.train.shading import make_shading
 from engine.train.sides import turn_outwards
+from engine.train.sight_lines import PhotographsOfPoints, SightLines
 from engine.train.state import TrainState
 from engine.train.view_grids import guess_exposures
 
@@ -110,7 +112,7 @@ class Trainer:
             else:
                 state.pose_corrections = np.zeros((len(dataset.views), 6))
         self._dataset = dataset
-        self._batches = BatchSource(dataset, config)
+        self._batches = BatchSource(dataset, config, *_line_drawers(dataset, config))
         pixels = self._batches.sampler.pixel_count
         self.schedule = Schedule.of(config, pixels)
         densifier = make_densifier(
@@ -371,6 +373,15 @@ class Trainer:
                 seconds_left=pace_s * (total - state.iteration),
             )
         )
+
+
+def _line_drawers(
+    dataset: TrainingData, config: TrainConfig
+) -> list[Callable[[np.random.Generator, int], RayBatch]]:
+    if config.loss.blocked == 0 or not isinstance(dataset, PhotographsOfPoints):
+        return []
+    lines = SightLines.of(dataset, config.sight_line_margin)
+    return [lines.draw] if len(lines) else []
 
 
 def _refiner(dataset: TrainingData, config: TrainConfig) -> PoseRefiner | None:

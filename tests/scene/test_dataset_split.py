@@ -13,7 +13,11 @@ def points(xyz) -> SparsePoints:
     xyz = np.asarray(xyz, dtype=np.float32).reshape(-1, 3)
     n = len(xyz)
     return SparsePoints(
-        xyz, np.zeros((n, 3), np.float32), np.full(n, 2, np.int32), np.full(n, -1, dtype=np.float32)
+        xyz,
+        np.zeros((n, 3), np.float32),
+        np.full(n, 2, np.int32),
+        np.full(n, -1, dtype=np.float32),
+        np.arange(n),
     )
 
 

@@ -65,7 +65,9 @@ class UnderTheSky(FlatWorld):
         radius, turn = 0.6 * np.sqrt(rng.random(3000)), rng.uniform(0, 2 * np.pi, 3000)
         xyz = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn], axis=1).astype(np.float32)
         counts = np.full(len(xyz), 3, np.int32)
-        return SparsePoints(xyz, paint(xyz[:, 0], xyz[:, 1]), counts, np.zeros(len(xyz), np.float32))
+        return SparsePoints(
+            xyz, paint(xyz[:, 0], xyz[:, 1]), counts, np.zeros(len(xyz), np.float32), np.arange(len(xyz))
+        )
 
 
 def sight(directions: np.ndarray, rgb: np.ndarray, transmittance: np.ndarray) -> Sight:

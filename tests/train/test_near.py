@@ -25,6 +25,7 @@ def cloud(points: np.ndarray) -> SparsePoints:
         np.zeros((n, 3), np.float32),
         np.full(n, 3, np.int32),
         np.zeros(n, np.float32),
+        np.arange(n),
     )
 
 
