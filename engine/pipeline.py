@@ -76,8 +76,6 @@ from engine.train.exposure_changes import with_exposure_decided
 from engine.train.fingerprint import run_fingerprint
 from engine.train.first_state import first_state
 from engine.train.floors import ScaleFloor
-from engine.train.holding import Held
-from engine.train.initialise import MIN_POINTS
 from engine.train.shading import background_of, deferred_of, exposures_of
 from engine.train.trainer import Trainer
 from engine.train.within import make_plan, read_plan, write_plan
@@ -311,7 +309,6 @@ def _train(
         scale_floor=_scale_floor(dataset, config),
         near_zones=zones if config.near_share > 0 else None,
         seen_space=seen if config.materials.clears_unseen else None,
-        held=_held(dataset, config),
         onlooker=None
         if watch is None
         else lambda done, tracer: watch(done, dataset, tracer, trainer.shading),
@@ -343,11 +340,6 @@ def _train(
     record["nearest_world"] = {name: depth for name, depth in depths.items() if depth > 0}
     write_json(output / TRAINING, record)
     return gaussians
-
-
-def _held(dataset: Dataset, config: TrainConfig) -> Held | None:
-    points = dataset.points.xyz_world
-    return Held(points) if config.materials.hold > 0 and len(points) >= MIN_POINTS else None
 
 
 def _scale_floor(dataset: Dataset, config: TrainConfig) -> ScaleFloor | None:

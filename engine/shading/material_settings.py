@@ -49,8 +49,6 @@ class MaterialSettings(BaseModel):
         blur: roughness of the level that leads reflected directions at first, and sees farther than a
             sharp one; it falls to 0 until ``blur_until``.
         blur_until: see there.
-        hold: share of the distance to the sparse points by which surfaces are taken back to them at a time,
-            see :mod:`engine.train.holding`; for normals that point outwards.
         normal_weight: of the spread of the normals along a ray.
         depth_normal_weight: of the angle between normals and the surface that the depths span.
         smooth_normal_weight: of the angle between the normals of neighbouring rays.
@@ -98,7 +96,6 @@ class MaterialSettings(BaseModel):
     leaves: float = Field(0.0, ge=0)
     blur: float = Field(0.5, ge=0, le=1)
     blur_until: float = Field(0.3, ge=0, le=1)
-    hold: float = Field(0.0, ge=0, le=1)
     normal_weight: float = Field(0.1, ge=0)
     depth_normal_weight: float = Field(0.1, ge=0)
     smooth_normal_weight: float = Field(0.1, ge=0)

@@ -1,7 +1,6 @@
 """Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
 
 import math
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ from engine.errors import ConfigError
 from engine.rays import RayBatch
 from engine.scene import View
 from engine.train.config import TrainConfig, window_side_px
+from engine.train.sight_lines import PhotographsOfPoints, SightLines
 
 TILE_PX = 8
 GOLDEN = (math.sqrt(5) - 1) / 2
@@ -54,7 +54,7 @@ class Batch:
     """Rays and what the photographs show there.
 
     The last ``patches * side * side`` rays are patches, row-major one after another. ``background_srgb`` lies
-    behind both the Gaussians and photographs with alpha.
+    behind both the Gaussians and photographs with alpha. ``sight_lines`` end before points that views show.
     """
 
     rays: RayBatch
@@ -175,10 +175,6 @@ def _fold(position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]) ->
     return np.minimum(period, 2 * size - 1 - period)
 
 
-def _no_lines(_rng: np.random.Generator, _count: int) -> None:
-    return None
-
-
 class BatchSource:
     """Draws the batches of a training.
 
@@ -188,18 +184,12 @@ class BatchSource:
     Args:
         dataset: the photographs.
         config: sizes and shares.
-        draw_lines: draws lines of sight of the sparse points, or none.
 
     Raises:
         ConfigError: the SSIM term would have no patch, or a background is to be learnt where none is shown.
     """
 
-    def __init__(
-        self,
-        dataset: TrainingData,
-        config: TrainConfig,
-        draw_lines: Callable[[np.random.Generator, int], RayBatch | None] = _no_lines,
-    ) -> None:
+    def __init__(self, dataset: TrainingData, config: TrainConfig) -> None:
         if config.background == "learnt" and dataset.has_alpha:
             raise ConfigError(
                 "These photographs have alpha, so that they show no background; leave background=learnt out."
@@ -209,12 +199,16 @@ class BatchSource:
         self.sampler = PixelSampler(dataset.train_indices, view_sizes_px(dataset))
         self._window_side_px = window_side_px(config, self.sampler.longest_side_px)
         self._patches = self._patch_count()
-        self._draw_lines = draw_lines
+        self._lines: SightLines | None = None
+        if config.loss.blocked > 0 and isinstance(dataset, PhotographsOfPoints):
+            self._lines = SightLines.of(dataset, config.sight_line_margin)
 
     def leave_out(self, views: Int64[np.ndarray, " m"]) -> None:
         """Draw nothing of these views any more."""
         kept = np.setdiff1d(self._dataset.train_indices, views)
         self.sampler = PixelSampler(kept, view_sizes_px(self._dataset))
+        if self._lines is not None:
+            self._lines = self._lines.without(views)
 
     def draw(self, rng: np.random.Generator, turn: int = 0) -> Batch:
         """The next batch, after ``turn`` others."""
@@ -232,7 +226,9 @@ class BatchSource:
         rays = self._dataset.rays(view, y, x)
         rgb, alpha, weight = self._dataset.pixels(view, y, x)
         background = self._background(rng)
-        lines = self._draw_lines(rng, round(config.sight_line_share * config.rays))
+        lines = None
+        if self._lines is not None and len(self._lines):
+            lines = self._lines.draw(rng, max(1, round(config.sight_line_share * config.rays)))
         batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background, lines)
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch

@@ -187,13 +187,10 @@ class TrainConfig(_Frozen):
         False, description="learn a small correction of the pose of each training view; not with materials"
     )
     sight_line_share: float = Field(
-        0.0625, gt=0, le=1, description="lines of sight of sparse points beside each batch, of its rays"
+        0.02, gt=0, le=1, description="lines of sight of sparse points beside each batch, of its rays"
     )
     sight_line_margin: float = Field(
-        0.01,
-        ge=0,
-        lt=0.5,
-        description="least distance before its point at which such a line ends, of its length",
+        0.003, ge=0, lt=0.5, description="least distance before its point at which one ends, of its length"
     )
     average_after: float = Field(
         0.85,
@@ -314,6 +311,8 @@ def with_materials(config: TrainConfig) -> TrainConfig:
                 update={"learn": True, "start": 1e-3, "leaves": 1e-2, "parted": 8.0}
             ),
             "rates": config.rates.model_copy(update=rates),
+            # Gaps under things that stand on a mirror would be filled with what looks like the reflection.
+            "loss": config.loss.model_copy(update={"blocked": 0.05}),
             "lift_pixels": False,
             "plane_points": 10,
             "sh_degree": min(config.sh_degree, 1),

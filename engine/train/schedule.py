@@ -79,11 +79,6 @@ class Schedule:
         sided = self.config.trace.turned_beyond > 0 and self.config.materials.learn
         return sided and self.measures(done) and done <= self.config.average_after * self.iterations
 
-    def holds(self, done: int) -> bool:
-        """Whether surfaces are taken back to the sparse points."""
-        sided = self.config.trace.turned_beyond > 0 and self.config.materials.learn
-        return sided and self.config.materials.hold > 0 and done % self.config.densify.interval == 0
-
     def rebuilds(self, done: int, gaussians: int) -> bool:
         """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
         due = done % rebuild_interval(self.config, gaussians) == 0

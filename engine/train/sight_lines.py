@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from engine.rays import RayBatch
-from engine.scene.model import Observations, SparsePoints
+from engine.scene.model import Observations, SparsePoints, View
 from engine.trace.protocol import Recording, TraceGradients, Tracer
-from engine.train.batches import TrainingData
 
 LEAST_TRACK = 3
 """Points in fewer training views may be wrong matches."""
@@ -26,11 +25,19 @@ LEAST_ERROR_PX = 0.5
 
 
 @runtime_checkable
-class PhotographsOfPoints(TrainingData, Protocol):
+class PhotographsOfPoints(Protocol):
     """Photographs with the points that they show, and where these lie (see :class:`engine.scene.Dataset`)."""
 
+    views: tuple[View, ...]
+    train_indices: Int64[np.ndarray, " t"]
     points: SparsePoints
     observations: Observations
+
+    def rays(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> RayBatch:
+        """Unit rays of pixels, world frame."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -41,11 +48,13 @@ class SightLines:
         starts_world: the cameras.
         directions_world: unit vectors.
         ends: where each way ends, world units from the camera.
+        view: index of the camera's view.
     """
 
     starts_world: Float64[np.ndarray, "k 3"]
     directions_world: Float64[np.ndarray, "k 3"]
     ends: Float64[np.ndarray, " k"]
+    view: Int64[np.ndarray, " k"]
 
     def __len__(self) -> int:
         return len(self.ends)
@@ -56,7 +65,8 @@ class SightLines:
 
         The depth of a point along one ray of its track is known to
         ``error / sqrt(sum over the other rays of sin^2 of the angle between)``, with the reprojection error
-        at its distance; each way ends three of these before the point, or ``margin`` of the distance.
+        at its distance; each way ends three of these before the point, or ``margin`` of the distance. Poses
+        are those of the model, also where they are refined.
         """
         seen, points = dataset.observations, dataset.points
         row = np.searchsorted(points.ids, seen.point)
@@ -79,7 +89,14 @@ class SightLines:
         deviation = error_px * pixel_rad * distance / sharpness
         ends = distance - np.maximum(DEVIATIONS * deviation, margin * distance)
         good = (track[row] >= LEAST_TRACK) & (ends > 0.5 * distance)
-        return cls(origins[view[good]], direction[good], ends[good])
+        return cls(origins[view[good]], direction[good], ends[good], view[good])
+
+    def without(self, views: Int64[np.ndarray, " m"]) -> "SightLines":
+        """Those of other views."""
+        kept = ~np.isin(self.view, views)
+        return SightLines(
+            self.starts_world[kept], self.directions_world[kept], self.ends[kept], self.view[kept]
+        )
 
     def draw(self, rng: np.random.Generator, count: int) -> RayBatch:
         """Any ``count`` of them, neighbours in the order of the views."""

@@ -10,7 +10,6 @@ from engine.errors import Cancelled, ConfigError, TrainingFailure
 from engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.order import morton_order
-from engine.rays import RayBatch
 from engine.scene.near import NearZones
 from engine.scene.seen import SeenSpace
 from engine.shading.protocol import ShadingModel
@@ -24,7 +23,6 @@ from engine.train.densify import make_densifier
 from engine.train.densify.propagating import Propagating
 from engine.train.early_end import gains_no_more
 from engine.train.floors import ScaleFloor
-from engine.train.holding import Held
 from engine.train.iteration import Differentiated, Machinery, iterate
 from engine.train.misfits import TrainingViews, ViewJudge
 from engine.train.pose_refinement import PoseRefiner, RefinedPoses
@@ -32,7 +30,6 @@ from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
 from engine.train.shading import make_shading
 from engine.train.sides import turn_outwards
-from engine.train.sight_lines import PhotographsOfPoints, SightLines
 from engine.train.state import TrainState
 from engine.train.view_grids import guess_exposures
 
@@ -55,7 +52,6 @@ class Trainer:
         scale_floor: what no scale falls below.
         near_zones: where no Gaussian stays, whatever the strategy does.
         seen_space: outside of which none stays.
-        held: points that surfaces are held to.
         tracer: anything that follows the protocol; None takes the one that the configuration names.
         shading: likewise.
         onlooker: shown the iterations done and the tracer as it is then, after each; it may trace without
@@ -86,7 +82,6 @@ class Trainer:
         scale_floor: ScaleFloor | None = None,
         near_zones: NearZones | None = None,
         seen_space: SeenSpace | None = None,
-        held: Held | None = None,
         tracer: Tracer | None = None,
         shading: ShadingModel | None = None,
         onlooker: Callable[[int, Tracer], None] | None = None,
@@ -96,7 +91,6 @@ class Trainer:
         self._scale_floor = scale_floor
         self._near_zones = near_zones
         self._seen_space = seen_space
-        self._held = held
         self._config = config
         self._folder = folder
         self._fingerprint = fingerprint
@@ -112,7 +106,7 @@ class Trainer:
             else:
                 state.pose_corrections = np.zeros((len(dataset.views), 6))
         self._dataset = dataset
-        self._batches = BatchSource(dataset, config, *_line_drawers(dataset, config))
+        self._batches = BatchSource(dataset, config)
         pixels = self._batches.sampler.pixel_count
         self.schedule = Schedule.of(config, pixels)
         densifier = make_densifier(
@@ -175,10 +169,8 @@ class Trainer:
                 batches.begin(state.rng, state.iteration + 1)
             progress = schedule.progress(state.iteration)
             found = iterate(state, batch, machinery, self._config, progress=progress, extent=self._extent)
-            held = self._hold()
-            changed = schedule.may_densify(state.iteration) and self._change()
-            stale = held or changed
-            if changed:
+            stale = schedule.may_densify(state.iteration) and self._change()
+            if stale:
                 state.average.clear()
             elif schedule.averages(state.iteration):
                 state.average.add(state.gaussians)
@@ -305,13 +297,6 @@ class Trainer:
         path = save_checkpoint(state, self._folder, self._fingerprint)
         self._tell(CheckpointWritten(state.iteration, str(path)))
 
-    def _hold(self) -> bool:
-        """Take surfaces back to the sparse points where that is due; whether it was."""
-        if self._held is None or not self.schedule.holds(self.state.iteration):
-            return False
-        self._held.hold(self.state.gaussians, self._config.materials.hold)
-        return True
-
     def _change(self) -> bool:
         """Change the set of Gaussians where that is due; whether it was."""
         cleared = self._clear()  # first, so that the strategy can use those elsewhere
@@ -373,15 +358,6 @@ class Trainer:
                 seconds_left=pace_s * (total - state.iteration),
             )
         )
-
-
-def _line_drawers(
-    dataset: TrainingData, config: TrainConfig
-) -> list[Callable[[np.random.Generator, int], RayBatch]]:
-    if config.loss.blocked == 0 or not isinstance(dataset, PhotographsOfPoints):
-        return []
-    lines = SightLines.of(dataset, config.sight_line_margin)
-    return [lines.draw] if len(lines) else []
 
 
 def _refiner(dataset: TrainingData, config: TrainConfig) -> PoseRefiner | None:

@@ -9,6 +9,7 @@ from flat_world import FlatWorld
 from engine.gaussians.model import FlatGaussians, concatenate
 from engine.scene.model import Observations, SparsePoints
 from engine.trace.make import make_tracer
+from engine.train.batches import BatchSource
 from engine.train.config import LossWeights, TrainConfig
 from engine.train.sight_lines import SightLines, blocked_term
 from engine.train.state import fresh_state
@@ -108,3 +109,21 @@ def test_training_takes_a_veil_away_only_where_lines_of_sight_say_so(tmp_path: P
         hidden[weight] = float(1 - tracer.transmittance(lines).mean())
     assert hidden[0.0] > 0.1
     assert hidden[0.1] < 0.3 * hidden[0.0]
+
+
+def test_batches_have_lines_where_they_count_and_none_of_views_left_out() -> None:
+    world, rng = SeenWorld(), np.random.default_rng(0)
+    assert BatchSource(world, TrainConfig(rays=1024)).draw(rng).sight_lines is None
+    assert BatchSource(FlatWorld(), _counting(0.1)).draw(rng).sight_lines is None  # shows no points
+    source = BatchSource(world, _counting(0.1))
+    lines = source.draw(rng).sight_lines
+    assert lines is not None and len(lines) == 102
+    assert len(np.unique(lines.origins_world, axis=0)) == 6
+    source.leave_out(np.array([2, 5]))
+    lines = source.draw(rng).sight_lines
+    assert lines is not None
+    assert len(np.unique(lines.origins_world, axis=0)) == 4
+
+
+def _counting(share: float) -> TrainConfig:
+    return TrainConfig(rays=1024, sight_line_share=share, loss=LossWeights(blocked=0.05))
