@@ -172,11 +172,7 @@ def scene_paint(
 
 def trained_pixel_rad(scene: Viewpoints) -> float:
     """The angle of a pixel in the middle of the first view of a training."""
-    camera = scene.cameras[scene.views[0].camera_index]
-    x, y = camera.width_px / 2, camera.height_px / 2
-    ways = camera.directions_cam(np.array([[x, y], [x + 1, y]]))
-    angle = float(np.linalg.norm(np.cross(ways[0], ways[1])))
-    return angle if np.isfinite(angle) else 0.0
+    return scene.cameras[scene.views[0].camera_index].pixel_rad
 
 
 def _view_rays(view: PosedView, camera: Camera, near_world: float) -> ImageRays:

@@ -57,6 +57,14 @@ class Camera:
             return f, f, cx, cy
         raise ValueError(f"{self.model} is not a pinhole model")
 
+    @property
+    def pixel_rad(self) -> float:
+        """The angle of a pixel in the middle of the image; 0 where the model has no rays there."""
+        x, y = self.width_px / 2, self.height_px / 2
+        ways = self.directions_cam(np.array([[x, y], [x + 1, y]]))
+        angle = float(np.linalg.norm(np.cross(ways[0], ways[1])))
+        return angle if np.isfinite(angle) else 0.0
+
     def to_pycolmap(self) -> pycolmap.Camera:
         """The same camera as an object of pycolmap."""
         return pycolmap.Camera(

@@ -200,7 +200,7 @@ class BatchSource:
         self._window_side_px = window_side_px(config, self.sampler.longest_side_px)
         self._patches = self._patch_count()
         self._lines: SightLines | None = None
-        if config.loss.blocked > 0 and isinstance(dataset, PhotographsOfPoints):
+        if config.loss.blocked > 0 and isinstance(dataset, PhotographsOfPoints) and len(dataset.points):
             self._lines = SightLines.of(dataset, config.sight_line_margin)
 
     def leave_out(self, views: Int64[np.ndarray, " m"]) -> None:

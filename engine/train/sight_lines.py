@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from engine.rays import RayBatch
+from engine.scene.cameras import Camera
 from engine.scene.model import Observations, SparsePoints, View
 from engine.trace.protocol import Recording, TraceGradients, Tracer
 
@@ -29,15 +30,10 @@ class PhotographsOfPoints(Protocol):
     """Photographs with the points that they show, and where these lie (see :class:`engine.scene.Dataset`)."""
 
     views: tuple[View, ...]
+    cameras: tuple[Camera, ...]
     train_indices: Int64[np.ndarray, " t"]
     points: SparsePoints
     observations: Observations
-
-    def rays(
-        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
-    ) -> RayBatch:
-        """Unit rays of pixels, world frame."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,8 @@ class SightLines:
         The depth of a point along one ray of its track is known to
         ``error / sqrt(sum over the other rays of sin^2 of the angle between)``, with the reprojection error
         at its distance; each way ends three of these before the point, or ``margin`` of the distance. Poses
-        are those of the model, also where they are refined.
+        are those of the model, also where they are refined; errors count as pixels of the working size, so
+        that sight ends the sooner before points of photographs that were made smaller.
         """
         seen, points = dataset.observations, dataset.points
         row = np.searchsorted(points.ids, seen.point)
@@ -84,7 +81,7 @@ class SightLines:
             "ki,kij,kj->k", direction, outer[row], direction
         )  # sum of squared cosines, itself 1
         sharpness = np.sqrt(np.maximum(track[row] - along, 1e-12))
-        pixel_rad = _pixel_rad(dataset)[view]
+        pixel_rad = np.array([dataset.cameras[each.camera_index].pixel_rad for each in dataset.views])[view]
         error_px = np.maximum(points.errors_px[row], LEAST_ERROR_PX)
         deviation = error_px * pixel_rad * distance / sharpness
         ends = distance - np.maximum(DEVIATIONS * deviation, margin * distance)
@@ -112,14 +109,3 @@ def blocked_term(lines: RayBatch, tracer: Tracer, weight: float) -> tuple[Record
     return seen.hits, TraceGradients(
         none, transmittance=np.full(len(lines), -weight / len(lines), np.float32)
     )
-
-
-def _pixel_rad(dataset: PhotographsOfPoints) -> Float64[np.ndarray, " v"]:
-    """The angle of a pixel of each view, from rays of two neighbours in its middle."""
-    count = len(dataset.views)
-    x = np.array([view.width_px // 2 for view in dataset.views], np.int64)
-    y = np.array([view.height_px // 2 for view in dataset.views], np.int64)
-    which: Int64[np.ndarray, " v"] = np.arange(count)
-    middle, beside = dataset.rays(which, y, x), dataset.rays(which, y, x - 1)
-    apart = np.linalg.norm(middle.directions_world - beside.directions_world, axis=1)
-    return np.asarray(apart, np.float64)

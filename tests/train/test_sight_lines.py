@@ -7,6 +7,7 @@ import pytest
 from flat_world import FlatWorld
 
 from engine.gaussians.model import FlatGaussians, concatenate
+from engine.scene.cameras import Camera
 from engine.scene.model import Observations, SparsePoints
 from engine.trace.make import make_tracer
 from engine.train.batches import BatchSource
@@ -21,6 +22,7 @@ class SeenWorld(FlatWorld):
 
     def __init__(self, points: int = 200, error_px: float = 0.0) -> None:
         super().__init__()
+        self.cameras = (Camera("PINHOLE", (40.0, 40.0, 20.0, 20.0), 40, 40),)
         rng = np.random.default_rng(7)
         xyz = np.concatenate([rng.uniform(-0.8, 0.8, (points, 2)), np.zeros((points, 1))], axis=1)
         ids = 3 * np.arange(points) + 5
@@ -115,6 +117,7 @@ def test_batches_have_lines_where_they_count_and_none_of_views_left_out() -> Non
     world, rng = SeenWorld(), np.random.default_rng(0)
     assert BatchSource(world, TrainConfig(rays=1024)).draw(rng).sight_lines is None
     assert BatchSource(FlatWorld(), _counting(0.1)).draw(rng).sight_lines is None  # shows no points
+    assert BatchSource(SeenWorld(points=0), _counting(0.1)).draw(rng).sight_lines is None
     source = BatchSource(world, _counting(0.1))
     lines = source.draw(rng).sight_lines
     assert lines is not None and len(lines) == 102
