@@ -52,7 +52,8 @@ def pixel_means(
     coverage = np.zeros((image.height_px, image.width_px))
     for number, (across, down) in enumerate(_offsets(side)):
         part(number / side**2)
-        found = render_rays(tracer, image.shifted(across, down), background_colour("black"), shading)
+        shifted = image.shifted(across, down)
+        found = render_rays(tracer, shifted, background_colour("black"), shading, number)
         light += found.alpha[..., None] * found.layers[LINEAR]
         coverage += found.alpha
     linear = light / np.maximum(coverage, 1e-6)[..., None]
@@ -95,13 +96,13 @@ def render_averaged(
 
     That is what making a larger picture smaller gives. Everything else is that of the pixels' centres.
     """
-    centre = render_rays(tracer, image, background_srgb, shading)
+    centre = render_rays(tracer, image, background_srgb, shading, side**2 // 2)
     if side == 1:
         return centre
     rgb, alpha = np.zeros(centre.rgb_srgb.shape), np.zeros(centre.alpha.shape)
-    for across, down in _offsets(side):
+    for number, (across, down) in enumerate(_offsets(side)):
         shifted = image.shifted(across, down)
-        found = centre if shifted is image else render_rays(tracer, shifted, background_srgb, shading)
+        found = centre if shifted is image else render_rays(tracer, shifted, background_srgb, shading, number)
         rgb += found.rgb_srgb
         alpha += found.alpha
     rays = side**2

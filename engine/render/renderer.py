@@ -4,8 +4,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 
+from engine.hashing import unit_numbers
 from engine.rays import ImageRays, RayBatch
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import ShadingModel, Sight
@@ -15,6 +16,8 @@ from engine.trace.protocol import Tracer
 RAYS_AT_ONCE = 1 << 18
 FRONT = 0.005
 """What lies farther behind the median depth than this share of it is another surface."""
+STEPS = np.array([0.7548776662466927, 0.5698402909980532])
+"""One over the plastic number, and that squared."""
 TILE = 8
 """Rays go to the tracer in tiles of this side, so that neighbours are traced together."""
 
@@ -45,10 +48,12 @@ def render_rays(
     image: ImageRays,
     background: Float32[np.ndarray, "3"],
     shading: ShadingModel = PLAIN,
+    sample: int = 0,
 ) -> RenderedImage:
     """Trace an image and develop it; directions have unit length.
 
-    Where ``shading`` has features, ``tracer`` must have been built with them.
+    Where ``shading`` has features, ``tracer`` must have been built with them. ``sample`` numbers pictures of
+    which the mean will be taken, so that what the model draws at random is evenly spread over them.
     """
     height, width = image.height_px, image.width_px
     layers: dict[str, Float32[np.ndarray, "h w _"]] = {}
@@ -62,7 +67,8 @@ def render_rays(
     )
     for band, order, rays in _bands(image):
         seen = tracer.trace(rays)
-        developed = shading.develop(Sight(rays, seen, tracer))
+        dither = dithered(band.start * width + order, sample)
+        developed = shading.develop(Sight(rays, seen, tracer, dither=dither))
         rgb = developed.over(background)
         for name, values in developed.layers.items():
             layers.setdefault(name, np.empty((height, width, values.shape[1]), np.float32))
@@ -115,6 +121,15 @@ def tile_order(height: int, width: int) -> Int64[np.ndarray, " r"]:
     y, x = np.divmod(np.arange(height * width), width)
     across = -(-width // TILE)
     return np.argsort((y // TILE) * across + x // TILE, kind="stable")
+
+
+def dithered(pixels: Int64[np.ndarray, " r"], sample: int) -> Float64[np.ndarray, "2 r"]:
+    """Two numbers in [0, 1) for each pixel; those of following samples fill the gaps that are left.
+
+    Steps of the plastic number's powers, from a place of the pixel's own: "The Unreasonable Effectiveness of
+    Quasirandom Sequences" (Roberts 2018, https://extremelearning.com.au).
+    """
+    return (unit_numbers(pixels.astype(np.uint64)) + sample * STEPS[:, None]) % 1.0
 
 
 def background_colour(name: str) -> Float32[np.ndarray, "3"]:

@@ -22,19 +22,11 @@ from engine.shading.buffer import Buffer, Leaving, gather, reflected_rays, sprea
 from engine.shading.environment_frame import environment_frame
 from engine.shading.geometry_terms import neighbour_terms, spread_term
 from engine.shading.learnt_light import LearntLight
+from engine.shading.lobe import Lobe, by_each, look, numbers_of, pair_slope, roughness_slope
 from engine.shading.material_settings import SEED_MATERIAL, SEED_REACH, MaterialSettings
 from engine.shading.parted import Parted, part, whole
 from engine.shading.protocol import Developed, Reversed, Sight
-from engine.shading.reflections import (
-    Facets,
-    Mirrored,
-    facets_of,
-    follow,
-    follow_back,
-    mirrored_pair,
-    pair_mean,
-    pair_slope,
-)
+from engine.shading.reflections import Follower, Seen, follow_back
 from engine.shading.slopes import clipped, encoding_slope
 from engine.shading.split_sum import ShadeGradients, Surface, shade, shade_reverse
 from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
@@ -49,11 +41,10 @@ TURNS = 1 << 20
 
 @dataclass(frozen=True)
 class _Reflection:
-    """What the reflected rays of a buffer met, two of each point where there are facets."""
+    """What the reflected rays of a buffer met; two of each point where there is a lobe."""
 
     trace: TraceResult
-    mirrored: Mirrored | None = None
-    facets: Facets | None = None
+    lobe: Lobe | None = None
 
 
 @dataclass(frozen=True)
@@ -173,7 +164,7 @@ class Deferred:
         buffer = gather(parted.rays, parted.seen)
         surface, reflection = self._dimmed(parted.seen, buffer), None
         if sight.progress >= self.settings.secondary_from:
-            surface, reflection = self._reflect(sight, parted.rays, buffer, surface)
+            surface, reflection = self._reflect(sight, parted, buffer, surface)
         linear = shade(surface, self.light.levels, self.frame)
         rgb = parted.seen.rgb_srgb * np.float32(1 - share)
         if self.settings.recipe == "seed":
@@ -232,6 +223,7 @@ class Deferred:
         if settings.reflected_gradient:
             led = back.reflected + self._facing_gradient(kept, back)
             normal = normal + clipped(led, settings.normal_clip)
+        self._add_widening(kept, back)
         by_material = back.material
         if settings.is_seed_deferred(sight.progress):
             rgb[which] = by_rgb[which] * (1 - kept.surface.material[:, 3:4])
@@ -342,26 +334,18 @@ class Deferred:
         return layers
 
     def _reflect(
-        self, sight: Sight, rays: RayBatch, buffer: Buffer, surface: Surface
+        self, sight: Sight, parted: Parted, buffer: Buffer, surface: Surface
     ) -> tuple[Surface, "_Reflection | None"]:
         """The surface with what reflected rays say of it."""
-        settings = self.settings
+        settings, rays = self.settings, parted.rays
         if not settings.visibility:
             return surface, None
         record, seed = sight.view is not None, settings.recipe == "seed"
         if settings.indirect == "shaded" and not seed:
-            salt = int(sight.progress * TURNS)
-            facets = facets_of(surface, least_slope=settings.least_slope(sight.progress), salt=salt)
-            mirrored = follow(
-                mirrored_pair(rays, buffer, facets, self._leaving),
-                sight.tracer, self.light.levels, self.frame, self._dimmed,
-                surfaces=settings.reflections, leaving=self._leaving,
-                apart_world=settings.parted * self._gap,
-                record=record,
-            )  # fmt: skip
-            visibility, indirect = pair_mean(mirrored.seen)
+            lobe = self._look(sight, parted, buffer)
+            visibility, indirect = lobe.seen
             surface = replace(surface, visibility=visibility, indirect_linear=indirect)
-            return surface, _Reflection(mirrored.trace, mirrored, facets)
+            return surface, _Reflection(lobe.mirrored.trace, lobe)
         mirrored_rays = reflected_rays(rays, buffer, self._leaving)
         if seed:
             mirrored_rays = mirrored_rays.up_to(SEED_REACH)
@@ -376,16 +360,34 @@ class Deferred:
         surface = replace(surface, visibility=visibility, indirect_linear=indirect)
         return surface, _Reflection(seen)
 
+    def _look(self, sight: Sight, parted: Parted, buffer: Buffer) -> Lobe:
+        """What the lobes of a buffer see, and in a training how that changes with the roughness."""
+        settings, record, ways = self.settings, sight.view is not None, buffer.surface.direction_world
+        salt = int(sight.progress * TURNS)
+        if sight.dither is None:
+            numbers = numbers_of(ways, salt)
+        else:
+            numbers = parted.each(sight.dither.T)[buffer.which].T
+        thirds = None
+        if record and settings.third_rays > 0:
+            thirds = numbers_of(ways, salt + 1)[0] < settings.third_rays
+        follower = Follower(
+            sight.tracer, self.light.levels, self.frame, self._dimmed,
+            settings.reflections, self._leaving, settings.parted * self._gap,
+        )  # fmt: skip
+        least = settings.least_slope(sight.progress)
+        return look(parted.rays, buffer, follower, numbers, least_slope=least, record=record, thirds=thirds)
+
     def _reflected_back(
         self, kept: _Kept, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]
     ) -> tuple[tuple[Recording, TraceGradients], ...]:
-        """Gradients by what reflected rays met: its materials, or its harmonics; no geometry."""
+        """Gradients by what reflected rays met: materials and how much of it there is, or harmonics."""
         reflection = kept.reflection
         if reflection is None or (hits := reflection.trace.hits) is None:
             return ()
-        if (mirrored := reflection.mirrored) is not None:
-            by_light = np.concatenate([back.indirect, back.indirect]) / 2
-            return follow_back(mirrored, self.light.levels, self.frame, by_light, by_texels)
+        if (lobe := reflection.lobe) is not None:
+            by_seen = by_each(Seen(back.visibility, back.indirect))
+            return follow_back(lobe.mirrored, self.light.levels, self.frame, by_seen, by_texels)
         seen = reflection.trace
         if self.settings.recipe == "seed":
             slope = (seen.transmittance <= HIDDEN).astype(np.float64)[:, None]
@@ -400,6 +402,16 @@ class Deferred:
     def _facing_gradient(kept: _Kept, back: ShadeGradients) -> Float64[np.ndarray, "p 3"] | float:
         """Gradients by the normals through what reflected rays meet."""
         reflection = kept.reflection
-        if reflection is None or reflection.mirrored is None or reflection.facets is None:
+        if reflection is None or (lobe := reflection.lobe) is None:
             return 0.0
-        return pair_slope(reflection.mirrored.seen, reflection.facets, back.around, back.specular)
+        return pair_slope(lobe.mirrored.seen, lobe.facets, back.around, back.specular)
+
+    def _add_widening(self, kept: _Kept, back: ShadeGradients) -> None:
+        """Add gradients by the roughness through what reflected rays meet."""
+        reflection = kept.reflection
+        if reflection is None or (lobe := reflection.lobe) is None or (found := lobe.widening) is None:
+            return
+        at = found.points
+        roughness = kept.surface.material[at, 4]
+        slope = roughness_slope(found, roughness, back.around[at], back.specular[at])
+        back.material[at, 4] += slope / self.settings.third_rays

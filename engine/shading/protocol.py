@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
@@ -29,6 +29,8 @@ class Sight:
         tracer: for further rays, mirrored ones say, through the same Gaussians.
         view: number of each ray's training view; None for views that were not trained on.
         progress: share of the training that is done; 1 for a finished scene.
+        dither: two numbers in [0, 1) for each ray, for models that draw anything at random; they are evenly
+            spread over the rays of a pixel. None: models find some by themselves.
     """
 
     rays: RayBatch
@@ -36,6 +38,7 @@ class Sight:
     tracer: Tracer
     view: Int64[np.ndarray, " r"] | None = None
     progress: float = 1.0
+    dither: Float64[np.ndarray, "2 r"] | None = None
 
 
 @dataclass(frozen=True)

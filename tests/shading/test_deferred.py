@@ -19,6 +19,7 @@ from engine.shading.material_settings import MaterialSettings
 from engine.shading.protocol import Sight
 from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import TraceSettings
+from engine.trace.sums import add_gradients
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.initialise import with_first_materials
@@ -66,8 +67,7 @@ def floor(side: float, step: float, above: float = 0.0) -> np.ndarray:
 def test_gradients_agree_with_finite_differences(indirect: str) -> None:
     rng = np.random.default_rng(5)
     world = FlatWorld()
-    # What reflected rays meet has no gradient by its geometry; nothing is seen that hides the rest by edges.
-    settings = MaterialSettings(**BARE, indirect=indirect, blur=0.0, ambient=False)
+    settings = MaterialSettings(**BARE, indirect=indirect, blur=0.0, ambient=False, third_rays=0.0)
     gaussians = with_first_materials(world.start(opacity=0.6), settings)
     gaussians.means_world[:, 2] = rng.permutation(np.linspace(-0.4, 0.4, len(gaussians)))
     for values in gaussians.channels.values():
@@ -103,6 +103,44 @@ def test_gradients_agree_with_finite_differences(indirect: str) -> None:
         model.light._levels = None
         expected = float((gradient * direction).sum())
         assert (values[0] - values[1]) / 0.04 == pytest.approx(expected, rel=0.03), name
+
+
+def test_what_only_a_mirror_shows_has_gradients_by_how_much_of_it_there_is() -> None:
+    mirror = wall((0, 0, 1), floor(0.6, 0.1), [0.9, 0.8, 0.7, 1.0, 0.02])
+    lid = wall((0, 0, 1), floor(0.3, 0.1, above=0.5), [0.5, 0.3, 0.1, 0.0, 1.0])
+    lid.opacity_logits[:] = np.random.default_rng(1).uniform(-2, 0, len(lid))
+    scene, hung = concatenate([mirror, lid]), slice(len(mirror), None)
+    settings = MaterialSettings(**BARE, blur=0.0, ambient=False, facet_slope=(1e-3, 1e-3), start=0.01)
+    model = Deferred(settings, extent_world=1.0)
+    model.light.put(np.full((16, 32, 3), 0.5, np.float32))
+    x, y = (values.ravel() for values in np.meshgrid(*[np.linspace(-0.2, 0.2, 9)] * 2))
+    ways = np.stack([0.2 * x, 0.2 * y, np.full(len(x), -1.0)], axis=1)
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    rays = RayBatch(np.stack([x, y, np.full(len(x), 0.3)], axis=1), ways)  # begun below the lid
+    target = np.float32(0.4)
+    tracer = CpuTracer(TraceSettings(q=30.0, transmittance_min=1e-6), threads=1)
+
+    def look() -> tuple[float, np.ndarray]:
+        tracer.build(scene, model.features(scene))
+        seen = tracer.trace(rays, record=True)
+        assert seen.hits is not None
+        sight = Sight(rays, seen, tracer, np.zeros(len(rays), np.int64))
+        developed = model.develop(sight)
+        error = developed.rgb_srgb - target
+        back = model.reverse(sight, developed, 2 * error, np.zeros(len(rays), np.float32))
+        recorded = [(seen.hits, back.seen), *back.further]
+        found = add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded])
+        whole = np.zeros(len(scene))
+        whole[found.ids] = found.opacity_logits
+        return float((error.astype(np.float64) ** 2).sum()), whole[hung]
+
+    _, gradient = look()
+    direction = (gradient / np.linalg.norm(gradient)).astype(np.float32)
+    before, values = scene.opacity_logits[hung].copy(), []
+    for sign in (1, -1):
+        scene.opacity_logits[hung] = before + sign * np.float32(0.05) * direction
+        values.append(look()[0])
+    assert (values[0] - values[1]) / 0.1 == pytest.approx(float((gradient * direction).sum()), rel=0.03)
 
 
 def test_a_mirror_shows_what_stands_before_it_and_else_the_environment() -> None:

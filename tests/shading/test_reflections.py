@@ -11,9 +11,10 @@ from engine.gaussians.model import concatenate
 from engine.rays import ImageRays, RayBatch
 from engine.render.oversampling import pixel_means
 from engine.shading.deferred import Deferred
+from engine.shading.lobe import Widening, facets_of, numbers_of, pair_mean, pair_slope, roughness_slope
 from engine.shading.material_settings import MaterialSettings
 from engine.shading.protocol import Sight
-from engine.shading.reflections import Seen, facets_of, noise, pair_mean, pair_slope
+from engine.shading.reflections import Seen
 from engine.shading.split_sum import Surface
 from engine.trace.cpu.tracer import CpuTracer
 
@@ -26,11 +27,11 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def test_noise_is_even_and_follows_from_the_direction_and_the_salt_alone() -> None:
+def test_numbers_are_even_and_follows_from_the_direction_and_the_salt_alone() -> None:
     ways = unit(np.random.default_rng(0).normal(size=(20_000, 3)))
-    found = noise(ways, 3)
-    np.testing.assert_array_equal(found[:, ::-1], noise(ways[::-1].copy(), 3))
-    assert np.abs(found - noise(ways, 4)).max() > 0.5
+    found = numbers_of(ways, 3)
+    np.testing.assert_array_equal(found[:, ::-1], numbers_of(ways[::-1].copy(), 3))
+    assert np.abs(found - numbers_of(ways, 4)).max() > 0.5
     counts, _, _ = np.histogram2d(*found, bins=10, range=[[0, 1], [0, 1]])
     assert counts.min() > 130 and counts.max() < 270  # 200 each
 
@@ -42,7 +43,7 @@ def test_facets_lie_on_both_sides_as_far_off_as_the_roughness_says() -> None:
     normal = np.tile([0.0, 0.0, 1.0], (count, 1))
     for roughness, least in ((0.6, 0.001), (0.02, 0.03)):
         surface = Surface.alone(np.full((count, 5), roughness), normal, way)
-        facets = facets_of(surface, least_slope=least, salt=0)
+        facets = facets_of(surface, numbers_of(way, 0), least_slope=least)
         one, other = facets.normals(normal, 1.0), facets.normals(normal, -1.0)
         np.testing.assert_allclose(one[:, :2], -other[:, :2], atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(one, axis=1), 1)
@@ -57,7 +58,7 @@ def test_differences_of_pairs_are_the_slope_by_the_normal_in_the_mean() -> None:
     way = np.tile(unit(np.array([0.5, -0.2, -1.0])), (count, 1)) + rng.normal(scale=1e-6, size=(count, 3))
     normal = np.tile(unit(np.array([0.1, 0.2, 1.0])), (count, 1))
     surface = Surface.alone(np.full((count, 5), 0.1), normal, way)
-    facets = facets_of(surface, least_slope=1e-3, salt=0)
+    facets = facets_of(surface, numbers_of(way, 0), least_slope=1e-3)
     colours, hidden = rng.normal(size=(3, 3)), rng.normal(size=3)
 
     def seen(facing: np.ndarray) -> Seen:
@@ -79,6 +80,39 @@ def test_differences_of_pairs_are_the_slope_by_the_normal_in_the_mean() -> None:
     expected -= (expected @ normal[0]) * normal[0]
     np.testing.assert_allclose(found, expected, atol=0.03 * np.linalg.norm(expected))
     np.testing.assert_allclose(pair_mean(pairs).light_linear, seen(normal).light_linear, atol=5e-3)
+
+
+def test_third_rays_say_how_the_mean_of_pairs_changes_with_the_roughness() -> None:
+    count, roughness = 1000, 0.2
+    rng = np.random.default_rng(4)
+    way = np.tile(unit(np.array([0.5, -0.2, -1.0])), (count, 1)) + rng.normal(scale=1e-6, size=(count, 3))
+    normal = np.tile(unit(np.array([0.1, 0.2, 1.0])), (count, 1))
+    numbers = numbers_of(way, 0) * np.array([[0.2], [1.0]])  # none far out, where squares are not all
+    curves, hidden = rng.normal(size=(3, 3)), rng.normal(size=3)
+
+    def seen(facing: np.ndarray) -> Seen:
+        """Light and visibility that grow with the square of the reflected direction."""
+        mirrored = way - 2 * (way * facing).sum(axis=1, keepdims=True) * facing
+        return Seen(mirrored**2 @ hidden, mirrored**2 @ curves)
+
+    def mean(roughness: float) -> Seen:
+        surface = Surface.alone(np.full((count, 5), roughness), normal, way)
+        facets = facets_of(surface, numbers, least_slope=1e-9)
+        pair = (seen(facets.normals(normal, sign)) for sign in (1.0, -1.0))
+        return pair_mean(Seen(*(np.concatenate(both) for both in zip(*pair, strict=True))))
+
+    around, by_incoming = np.full((count, 3), 2.0), np.tile([1.0, -0.5, 0.25], (count, 1))
+    change = Seen(*(a - b for a, b in zip(mean(roughness), seen(normal), strict=True)))
+    widening = Widening(np.arange(count), change)
+    found = roughness_slope(widening, np.full(count, roughness), around, by_incoming)
+
+    def loss(roughness: float) -> np.ndarray:
+        visibility, light = mean(roughness)
+        return (by_incoming * (light + visibility[:, None] * around)).sum(axis=1)
+
+    expected = (loss(roughness + 1e-3) - loss(roughness - 1e-3)) / 2e-3
+    assert np.abs(expected).mean() > 1e-3
+    np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
 
 
 def test_a_path_goes_from_mirror_to_mirror() -> None:
