@@ -381,13 +381,16 @@ class Deferred:
     def _reflected_back(
         self, kept: _Kept, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]
     ) -> tuple[tuple[Recording, TraceGradients], ...]:
-        """Gradients by what reflected rays met: materials and how much of it there is, or harmonics."""
+        """Gradients by what reflected rays met: materials, normals and how much of it there is, or harmonics."""
         reflection = kept.reflection
         if reflection is None or (hits := reflection.trace.hits) is None:
             return ()
         if (lobe := reflection.lobe) is not None:
             by_seen = by_each(Seen(back.visibility, back.indirect))
-            return follow_back(lobe.mirrored, self.light.levels, self.frame, by_seen, by_texels)
+            clip = self.settings.normal_clip
+            return follow_back(
+                lobe.mirrored, self.light.levels, self.frame, by_seen, by_texels, normal_clip=clip
+            )
         seen = reflection.trace
         if self.settings.recipe == "seed":
             slope = (seen.transmittance <= HIDDEN).astype(np.float64)[:, None]
