@@ -381,7 +381,7 @@ class Deferred:
     def _reflected_back(
         self, kept: _Kept, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]
     ) -> tuple[tuple[Recording, TraceGradients], ...]:
-        """Gradients by what reflected rays met: materials, normals and how much of it there is, or harmonics."""
+        """Gradients by what reflected rays met: its geometry and materials, or its harmonics."""
         reflection = kept.reflection
         if reflection is None or (hits := reflection.trace.hits) is None:
             return ()
