@@ -22,7 +22,16 @@ from engine.shading.buffer import Buffer, Leaving, gather, reflected_rays, sprea
 from engine.shading.environment_frame import environment_frame
 from engine.shading.geometry_terms import neighbour_terms, spread_term
 from engine.shading.learnt_light import LearntLight
-from engine.shading.lobe import Lobe, by_each, look, numbers_of, pair_slope, roughness_slope
+from engine.shading.lobe import (
+    Lobe,
+    Widening,
+    by_each,
+    look,
+    numbers_of,
+    pair_slope,
+    roughness_slope,
+    widening,
+)
 from engine.shading.material_settings import SEED_MATERIAL, SEED_REACH, MaterialSettings
 from engine.shading.parted import Parted, part, whole
 from engine.shading.protocol import Developed, Reversed, Sight
@@ -45,6 +54,7 @@ class _Reflection:
 
     trace: TraceResult
     lobe: Lobe | None = None
+    widened: Widening | None = None
 
 
 @dataclass(frozen=True)
@@ -342,10 +352,11 @@ class Deferred:
             return surface, None
         record, seed = sight.view is not None, settings.recipe == "seed"
         if settings.indirect == "shaded" and not seed:
-            lobe = self._look(sight, parted, buffer)
-            visibility, indirect = lobe.seen
+            reflection = self._look(sight, parted, buffer)
+            assert reflection.lobe is not None
+            visibility, indirect = reflection.lobe.seen
             surface = replace(surface, visibility=visibility, indirect_linear=indirect)
-            return surface, _Reflection(lobe.mirrored.trace, lobe)
+            return surface, reflection
         mirrored_rays = reflected_rays(rays, buffer, self._leaving)
         if seed:
             mirrored_rays = mirrored_rays.up_to(SEED_REACH)
@@ -360,7 +371,7 @@ class Deferred:
         surface = replace(surface, visibility=visibility, indirect_linear=indirect)
         return surface, _Reflection(seen)
 
-    def _look(self, sight: Sight, parted: Parted, buffer: Buffer) -> Lobe:
+    def _look(self, sight: Sight, parted: Parted, buffer: Buffer) -> "_Reflection":
         """What the lobes of a buffer see, and in a training how that changes with the roughness."""
         settings, record, ways = self.settings, sight.view is not None, buffer.surface.direction_world
         salt = int(sight.progress * TURNS)
@@ -368,15 +379,18 @@ class Deferred:
             numbers = numbers_of(ways, salt)
         else:
             numbers = parted.each(sight.dither.T)[buffer.which].T
-        thirds = None
-        if record and settings.third_rays > 0:
-            thirds = numbers_of(ways, salt + 1)[0] < settings.third_rays
+        least = settings.least_slope(sight.progress)
         follower = Follower(
             sight.tracer, self.light.levels, self.frame, self._dimmed,
             settings.reflections, self._leaving, settings.parted * self._gap,
         )  # fmt: skip
-        least = settings.least_slope(sight.progress)
-        return look(parted.rays, buffer, follower, numbers, least_slope=least, record=record, thirds=thirds)
+        lobe = look(parted.rays, buffer, follower, numbers, least_slope=least, record=record)
+        widened = None
+        if record and settings.widened > 0:
+            others = numbers_of(ways, salt + 1)
+            drawn = numbers_of(ways, salt + 2)[0] < settings.widened
+            widened = widening(parted.rays, buffer, follower, others, drawn, least_slope=least)
+        return _Reflection(lobe.mirrored.trace, lobe, widened)
 
     def _reflected_back(
         self, kept: _Kept, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]
@@ -411,10 +425,9 @@ class Deferred:
 
     def _add_widening(self, kept: _Kept, back: ShadeGradients) -> None:
         """Add gradients by the roughness through what reflected rays meet."""
-        reflection = kept.reflection
-        if reflection is None or (lobe := reflection.lobe) is None or (found := lobe.widening) is None:
+        if kept.reflection is None or (found := kept.reflection.widened) is None:
             return
         at = found.points
         roughness = kept.surface.material[at, 4]
         slope = roughness_slope(found, roughness, back.around[at], back.specular[at])
-        back.material[at, 4] += slope / self.settings.third_rays
+        back.material[at, 4] += slope / self.settings.widened

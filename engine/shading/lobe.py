@@ -1,9 +1,11 @@
-"""The lobe of a surface beside others: three reflected rays say what it sees, and how that would change.
+"""The lobe of a surface beside others: pairs of reflected rays say what it sees, and how that would change.
 
 From each point of a buffer go two rays, mirrored at two facets that lie on either side of the normal, as far
 off as the roughness says. Their mean is what the lobe sees past other surfaces; their difference says how
-that changes with the normal, whatever it is that they meet. From some points goes a third, mirrored at the
-normal itself: how far the mean of the two is from it says how what is seen changes with the roughness.
+that changes with the normal, whatever it is that they meet. From some points go another pair and one ray
+mirrored at the normal itself: how far the mean of the pair is from that one says how what is seen changes
+with the roughness. The first pair cannot say so: it made the error that the gradient comes from, which would
+then hold the pair's own variance, and the least rough surface always has the least of that.
 
 These are slopes of what the lobe's blur makes of the scene, estimated from samples; the tracer is asked for
 no derivative by a ray.
@@ -65,18 +67,6 @@ def numbers_of(directions: Float64[np.ndarray, "p 3"], salt: int) -> Float64[np.
     return unit_numbers(bits[:, 0] + np.uint64(salt), bits[:, 1], bits[:, 2])
 
 
-class Widening(NamedTuple):
-    """What widens with the lobe at ``w`` of the points.
-
-    Attributes:
-        points: their numbers.
-        change: mean of the two rays less the third.
-    """
-
-    points: Int64[np.ndarray, " w"]
-    change: Seen
-
-
 @dataclass(frozen=True)
 class Lobe:
     """What the lobes of a buffer's points see.
@@ -84,17 +74,27 @@ class Lobe:
     Attributes:
         facets: that the two rays of each point were mirrored at.
         mirrored: these rays, those of one side and then those of the other.
-        widening: what third rays say; None where none were sent.
     """
 
     facets: Facets
     mirrored: Mirrored
-    widening: Widening | None
 
     @property
     def seen(self) -> Seen:
         """The mean of the two rays of each point."""
         return pair_mean(self.mirrored.seen)
+
+
+class Widening(NamedTuple):
+    """What changes as lobes widen, at ``w`` of the points of a buffer.
+
+    Attributes:
+        points: their numbers.
+        change: mean of the pair less the ray in its middle.
+    """
+
+    points: Int64[np.ndarray, " w"]
+    change: Seen
 
 
 def look(
@@ -105,9 +105,8 @@ def look(
     *,
     least_slope: float,
     record: bool,
-    thirds: Bool[np.ndarray, " p"] | None = None,
 ) -> Lobe:
-    """Send two rays from each point of a buffer, mirrored at its facets, and a third from some.
+    """Send two rays from each point of a buffer, mirrored at its facets.
 
     Args:
         rays: that the buffer was gathered along.
@@ -115,22 +114,42 @@ def look(
         follower: of reflected rays.
         numbers: see :func:`facets_of`.
         least_slope: likewise.
-        record: whether there will be a way back for the pairs.
-        thirds: which points send a third, if their facets are as steep as their roughness says.
+        record: whether there will be a way back.
     """
-    normals, leaving = buffer.surface.normal_world, follower.leaving
     facets = facets_of(buffer.surface, numbers, least_slope=least_slope)
-    sides = (facets.normals(normals, sign) for sign in (1.0, -1.0))
-    mirrored = follower.follow(
-        joined(*(reflected_rays(rays, buffer, leaving, side) for side in sides)), record=record
+    pair = joined(*_mirrored(rays, buffer, follower, facets))
+    return Lobe(facets, follower.follow(pair, record=record))
+
+
+def widening(
+    rays: RayBatch,
+    buffer: Buffer,
+    follower: Follower,
+    numbers: Float64[np.ndarray, "2 p"],
+    drawn: Bool[np.ndarray, " p"],
+    *,
+    least_slope: float,
+) -> Widening:
+    """Send three rays from the points that were drawn, where facets are as steep as the roughness says."""
+    facets = facets_of(buffer.surface, numbers, least_slope=least_slope)
+    points = np.flatnonzero(drawn & (facets.slope > least_slope))
+    middle = reflected_rays(rays, buffer, follower.leaving)
+    one, other = (side[points] for side in _mirrored(rays, buffer, follower, facets))
+    seen = follower.follow(joined(joined(one, other), middle[points]), record=False).seen
+    pair = Seen(*(values[: 2 * len(points)] for values in seen))
+    change = (mean - own[2 * len(points) :] for mean, own in zip(pair_mean(pair), seen, strict=True))
+    return Widening(points, Seen(*change))
+
+
+def _mirrored(
+    rays: RayBatch, buffer: Buffer, follower: Follower, facets: Facets
+) -> tuple[RayBatch, RayBatch]:
+    """Rays mirrored at the facets of one side, and at those of the other."""
+    one, other = (
+        reflected_rays(rays, buffer, follower.leaving, facets.normals(buffer.surface.normal_world, sign))
+        for sign in (1.0, -1.0)
     )
-    if thirds is None:
-        return Lobe(facets, mirrored, None)
-    points = np.flatnonzero(thirds & (facets.slope > least_slope))
-    mean = pair_mean(mirrored.seen)
-    middle = follower.follow(reflected_rays(rays, buffer, leaving)[points], record=False).seen
-    change = Seen(*(of_pair[points] - own for of_pair, own in zip(mean, middle, strict=True)))
-    return Lobe(facets, mirrored, Widening(points, change))
+    return one, other
 
 
 def pair_mean(seen: Seen) -> Seen:
@@ -173,22 +192,22 @@ def pair_slope(
 
 
 def roughness_slope(
-    widening: Widening,
+    found: Widening,
     roughness: Float64[np.ndarray, " w"],
     around_linear: Float64[np.ndarray, "w 3"],
     by_incoming: Float64[np.ndarray, "w 3"],
 ) -> Float64[np.ndarray, " w"]:
-    """Gradients by the roughness through how far the mean of two rays is from the one between them.
+    """Gradients by the roughness through how far the mean of two rays is from the one in their middle.
 
     That distance grows with the square of the facets' slope where what is seen is smooth, and the slope of
     GGX's facets with the square of the roughness: with its fourth power, then. Where an edge is seen it
     grows more slowly, and this is too steep by as much; the sign is right.
 
     Args:
-        widening: what the rays saw.
-        roughness: of the points that sent three.
+        found: what the three rays saw.
+        roughness: of the points that sent them.
         around_linear: the environment as their lobes see it where nothing hides it.
         by_incoming: gradient by the light that comes in there.
     """
-    change = widening.change.light_linear + widening.change.visibility[:, None] * around_linear
+    change = found.change.light_linear + found.change.visibility[:, None] * around_linear
     return np.asarray(4 * (by_incoming * change).sum(axis=1) / np.maximum(roughness, LEAST_ROUGHNESS))

@@ -67,7 +67,7 @@ def floor(side: float, step: float, above: float = 0.0) -> np.ndarray:
 def test_gradients_agree_with_finite_differences(indirect: str) -> None:
     rng = np.random.default_rng(5)
     world = FlatWorld()
-    settings = MaterialSettings(**BARE, indirect=indirect, blur=0.0, ambient=False, third_rays=0.0)
+    settings = MaterialSettings(**BARE, indirect=indirect, blur=0.0, ambient=False, widened=0.0)
     gaussians = with_first_materials(world.start(opacity=0.6), settings)
     gaussians.means_world[:, 2] = rng.permutation(np.linspace(-0.4, 0.4, len(gaussians)))
     for values in gaussians.channels.values():

@@ -82,7 +82,7 @@ def test_differences_of_pairs_are_the_slope_by_the_normal_in_the_mean() -> None:
     np.testing.assert_allclose(pair_mean(pairs).light_linear, seen(normal).light_linear, atol=5e-3)
 
 
-def test_third_rays_say_how_the_mean_of_pairs_changes_with_the_roughness() -> None:
+def test_three_rays_say_how_the_mean_of_pairs_changes_with_the_roughness() -> None:
     count, roughness = 1000, 0.2
     rng = np.random.default_rng(4)
     way = np.tile(unit(np.array([0.5, -0.2, -1.0])), (count, 1)) + rng.normal(scale=1e-6, size=(count, 3))
@@ -103,8 +103,8 @@ def test_third_rays_say_how_the_mean_of_pairs_changes_with_the_roughness() -> No
 
     around, by_incoming = np.full((count, 3), 2.0), np.tile([1.0, -0.5, 0.25], (count, 1))
     change = Seen(*(a - b for a, b in zip(mean(roughness), seen(normal), strict=True)))
-    widening = Widening(np.arange(count), change)
-    found = roughness_slope(widening, np.full(count, roughness), around, by_incoming)
+    three = Widening(np.arange(count), change)
+    found = roughness_slope(three, np.full(count, roughness), around, by_incoming)
 
     def loss(roughness: float) -> np.ndarray:
         visibility, light = mean(roughness)
