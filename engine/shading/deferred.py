@@ -18,43 +18,23 @@ from engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
 from engine.shading.ambient import OPEN, ambient_visibility, bounced_light
-from engine.shading.buffer import Buffer, Leaving, gather, reflected_rays, spread_back
+from engine.shading.buffer import Buffer, Leaving, gather, spread_back
 from engine.shading.environment_frame import environment_frame
 from engine.shading.geometry_terms import neighbour_terms, spread_term
+from engine.shading.incoming import ByLobes, ByOneRay, Incoming
 from engine.shading.learnt_light import LearntLight
-from engine.shading.lobe import (
-    Lobe,
-    Widening,
-    by_each,
-    look,
-    numbers_of,
-    pair_slope,
-    roughness_slope,
-    widening,
-)
-from engine.shading.material_settings import SEED_MATERIAL, SEED_REACH, MaterialSettings
+from engine.shading.material_settings import SEED_MATERIAL, MaterialSettings
 from engine.shading.parted import Parted, part, whole
 from engine.shading.protocol import Developed, Reversed, Sight
-from engine.shading.reflections import Follower, Seen, follow_back
+from engine.shading.reflections import Follower
 from engine.shading.slopes import clipped, encoding_slope
-from engine.shading.split_sum import ShadeGradients, Surface, shade, shade_reverse
-from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
+from engine.shading.split_sum import Surface, shade, shade_reverse
+from engine.trace.protocol import GaussianGradients, TraceGradients, Tracer, TraceResult
 
 AMBIENT_COLUMN = 5
 BOUNCED_COLUMNS = slice(6, 9)
-HIDDEN = 0.5
-"""Transmittance below which the seed's way of seeing counts the environment as hidden."""
 TURNS = 1 << 20
 """So finely the share of the training that is done says whose turn it is."""
-
-
-@dataclass(frozen=True)
-class _Reflection:
-    """What the reflected rays of a buffer met; two of each point where there is a lobe."""
-
-    trace: TraceResult
-    lobe: Lobe | None = None
-    widened: Widening | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +44,7 @@ class _Kept:
     surface: Surface
     linear: Float64[np.ndarray, "p 3"]
     shown: Float64[np.ndarray, "p 3"]
-    reflection: _Reflection | None
+    incoming: Incoming | None
     shaded: float
 
 
@@ -172,9 +152,11 @@ class Deferred:
             return Developed(seen.rgb_srgb, seen.transmittance)
         parted = self._part(sight)
         buffer = gather(parted.rays, parted.seen)
-        surface, reflection = self._dimmed(parted.seen, buffer), None
-        if sight.progress >= self.settings.secondary_from:
-            surface, reflection = self._reflect(sight, parted, buffer, surface)
+        surface, incoming = self._dimmed(parted.seen, buffer), None
+        if self.settings.visibility and sight.progress >= self.settings.secondary_from:
+            incoming = self._ask(sight, parted, buffer)
+            visibility, indirect = incoming.seen
+            surface = replace(surface, visibility=visibility, indirect_linear=indirect)
         linear = shade(surface, self.light.levels, self.frame)
         rgb = parted.seen.rgb_srgb * np.float32(1 - share)
         if self.settings.recipe == "seed":
@@ -185,7 +167,7 @@ class Deferred:
         else:
             shown = linear_to_srgb(np.minimum(linear, 1.0))
         rgb[buffer.which] += (share * buffer.alpha[:, None] * shown).astype(np.float32)
-        kept = _Kept(parted, buffer, surface, linear, shown, reflection, share)
+        kept = _Kept(parted, buffer, surface, linear, shown, incoming, share)
         layers = {} if sight.view is not None else self._layers(parted, rgb, buffer, surface, linear)
         return Developed(parted.joined(rgb), seen.transmittance, kept, layers)
 
@@ -230,10 +212,12 @@ class Deferred:
         blur = settings.blurred(sight.progress)
         back = shade_reverse(kept.surface, self.light.levels, self.frame, by_linear, blur=blur)
         normal = back.normal
+        incoming = kept.incoming
         if settings.reflected_gradient:
-            led = back.reflected + self._facing_gradient(kept, back)
+            led = back.reflected + (0.0 if incoming is None else incoming.led(back))
             normal = normal + clipped(led, settings.normal_clip)
-        self._add_widening(kept, back)
+        if incoming is not None:
+            incoming.add_widening(back)
         by_material = back.material
         if settings.is_seed_deferred(sight.progress):
             rgb[which] = by_rgb[which] * (1 - kept.surface.material[:, 3:4])
@@ -241,7 +225,7 @@ class Deferred:
         spread_back(buffer, by_material, normal, by_features, by_alpha, by_normal)
         spread_term(buffer, spread, by_alpha, by_normal)
         by_texels = back.texels(len(self.light.levels.texels))
-        further = self._reflected_back(kept, back, by_texels)
+        further = () if incoming is None else incoming.back(back, by_texels)
         narrow = (x.astype(np.float32) for x in (rgb, -by_alpha, by_depth, by_normal, by_features))
         rgb, transmittance, depth, normal, features = narrow
         by_parts = TraceGradients(
@@ -343,91 +327,13 @@ class Deferred:
             layers[name] = parted.joined(share * each).astype(np.float32)
         return layers
 
-    def _reflect(
-        self, sight: Sight, parted: Parted, buffer: Buffer, surface: Surface
-    ) -> tuple[Surface, "_Reflection | None"]:
-        """The surface with what reflected rays say of it."""
-        settings, rays = self.settings, parted.rays
-        if not settings.visibility:
-            return surface, None
-        record, seed = sight.view is not None, settings.recipe == "seed"
-        if settings.indirect == "shaded" and not seed:
-            reflection = self._look(sight, parted, buffer)
-            assert reflection.lobe is not None
-            visibility, indirect = reflection.lobe.seen
-            surface = replace(surface, visibility=visibility, indirect_linear=indirect)
-            return surface, reflection
-        mirrored_rays = reflected_rays(rays, buffer, self._leaving)
-        if seed:
-            mirrored_rays = mirrored_rays.up_to(SEED_REACH)
-        seen = sight.tracer.trace(mirrored_rays, record=record)
-        visibility = (seen.transmittance > HIDDEN if seed else seen.transmittance).astype(np.float64)
-        indirect = np.zeros_like(surface.indirect_linear)
-        if seed and settings.indirect != "none":
-            indirect = (1.0 - visibility[:, None]) * seen.rgb_srgb
-        elif settings.indirect == "harmonics":
-            alpha = np.maximum(1.0 - seen.transmittance.astype(np.float64), 1e-6)[:, None]
-            indirect = srgb_to_linear(seen.rgb_srgb / alpha) * alpha
-        surface = replace(surface, visibility=visibility, indirect_linear=indirect)
-        return surface, _Reflection(seen)
-
-    def _look(self, sight: Sight, parted: Parted, buffer: Buffer) -> "_Reflection":
-        """What the lobes of a buffer see, and in a training how that changes with the roughness."""
-        settings, record, ways = self.settings, sight.view is not None, buffer.surface.direction_world
-        salt = int(sight.progress * TURNS)
-        if sight.dither is None:
-            numbers = numbers_of(ways, salt)
-        else:
-            numbers = parted.each(sight.dither.T)[buffer.which].T
-        least = settings.least_slope(sight.progress)
+    def _ask(self, sight: Sight, parted: Parted, buffer: Buffer) -> Incoming:
+        """Ask what comes in along reflected directions, in the way of the settings."""
+        settings = self.settings
+        if settings.indirect != "shaded" or settings.recipe == "seed":
+            return ByOneRay.ask(sight, parted, buffer, self._leaving, settings)
         follower = Follower(
             sight.tracer, self.light.levels, self.frame, self._dimmed,
             settings.reflections, self._leaving, settings.parted * self._gap,
         )  # fmt: skip
-        lobe = look(parted.rays, buffer, follower, numbers, least_slope=least, record=record)
-        widened = None
-        if record and settings.widened > 0:
-            others = numbers_of(ways, salt + 1)
-            drawn = numbers_of(ways, salt + 2)[0] < settings.widened
-            widened = widening(parted.rays, buffer, follower, others, drawn, least_slope=least)
-        return _Reflection(lobe.mirrored.trace, lobe, widened)
-
-    def _reflected_back(
-        self, kept: _Kept, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]
-    ) -> tuple[tuple[Recording, TraceGradients], ...]:
-        """Gradients by what reflected rays met: its geometry and materials, or its harmonics."""
-        reflection = kept.reflection
-        if reflection is None or (hits := reflection.trace.hits) is None:
-            return ()
-        if (lobe := reflection.lobe) is not None:
-            by_seen = by_each(Seen(back.visibility, back.indirect))
-            clip = self.settings.normal_clip
-            return follow_back(
-                lobe.mirrored, self.light.levels, self.frame, by_seen, by_texels, normal_clip=clip
-            )
-        seen = reflection.trace
-        if self.settings.recipe == "seed":
-            slope = (seen.transmittance <= HIDDEN).astype(np.float64)[:, None]
-        elif self.settings.indirect == "harmonics":
-            alpha = np.maximum(1.0 - seen.transmittance.astype(np.float64), 1e-6)[:, None]
-            slope = 1.0 / encoding_slope(srgb_to_linear(seen.rgb_srgb / alpha))
-        else:
-            return ()
-        return ((hits, TraceGradients(rgb_srgb=(back.indirect * slope).astype(np.float32))),)
-
-    @staticmethod
-    def _facing_gradient(kept: _Kept, back: ShadeGradients) -> Float64[np.ndarray, "p 3"] | float:
-        """Gradients by the normals through what reflected rays meet."""
-        reflection = kept.reflection
-        if reflection is None or (lobe := reflection.lobe) is None:
-            return 0.0
-        return pair_slope(lobe.mirrored.seen, lobe.facets, back.around, back.specular)
-
-    def _add_widening(self, kept: _Kept, back: ShadeGradients) -> None:
-        """Add gradients by the roughness through what reflected rays meet."""
-        if kept.reflection is None or (found := kept.reflection.widened) is None:
-            return
-        at = found.points
-        roughness = kept.surface.material[at, 4]
-        slope = roughness_slope(found, roughness, back.around[at], back.specular[at])
-        back.material[at, 4] += slope / self.settings.widened
+        return ByLobes.ask(sight, parted, buffer, follower, settings)
