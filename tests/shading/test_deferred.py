@@ -143,6 +143,42 @@ def test_what_only_a_mirror_shows_has_gradients_by_how_much_of_it_there_is() -> 
     assert (values[0] - values[1]) / 0.1 == pytest.approx(float((gradient * direction).sum()), rel=0.03)
 
 
+def test_roughness_learns_from_how_sharply_a_lid_is_mirrored() -> None:
+    rough = wall((0, 0, 1), floor(0.8, 0.1), [0.9, 0.9, 0.9, 1.0, 0.35])
+    lid = wall((0, 0, 1), floor(0.25, 0.1, above=0.6), [0.0, 0.0, 0.0, 0.0, 1.0])
+    scene = concatenate([rough, lid])
+    model = Deferred(MaterialSettings(**BARE, ambient=False, widened=1.0, start=0.01), extent_world=1.0)
+    model.light.put(np.full((16, 32, 3), 0.2, np.float32))
+    rng = np.random.default_rng(2)
+    ways = np.concatenate([rng.uniform(-0.05, 0.05, (3000, 2)), np.full((3000, 1), -1.0)], axis=1)
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    places = np.concatenate([rng.uniform(-0.05, 0.05, (3000, 2)), np.full((3000, 1), 0.3)], axis=1)
+    rays, ones = RayBatch(places, ways), np.ones((3000, 3), np.float32)
+    tracer = CpuTracer(threads=1)
+
+    def look() -> tuple[float, float]:
+        """The sum of what is shown, and its gradient by all roughnesses together."""
+        tracer.build(scene, model.features(scene))
+        seen = tracer.trace(rays, record=True)
+        assert seen.hits is not None
+        sight = Sight(rays, seen, tracer, np.zeros(3000, np.int64))
+        developed = model.develop(sight)
+        back = model.reverse(sight, developed, ones, np.zeros(3000, np.float32))
+        found = tracer.backward(seen.hits, back.seen).numpy()
+        return float(developed.rgb_srgb.sum(dtype=np.float64)), float(found.features[:, 4].sum())
+
+    _, found = look()
+    values = []
+    for sign in (1, -1):
+        scene.channels["roughness"][: len(rough)] = 0.35 + sign * 0.02
+        values.append(look()[0])
+    expected = (values[0] - values[1]) / 0.04
+    # Straight above is the lid, which is black; a wider lobe sees more of what is around. Its edge is no
+    # parabola, so that the gradient is right in its sign and about its size.
+    assert expected > 100
+    assert 0.5 < found / expected < 2
+
+
 def test_a_mirror_shows_what_stands_before_it_and_else_the_environment() -> None:
     mirror = wall((0, 0, 1), floor(1.0, 0.1), [1, 1, 1, 1, 0.05])
     red = wall((0, 0, 1), floor(1.0, 0.1, above=1.0), [1, 0, 0, 0.0, 1.0])
