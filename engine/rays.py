@@ -137,7 +137,9 @@ def joined(first: RayBatch, second: RayBatch) -> RayBatch:
         wide = [np.broadcast_to(x, (len(of), *x.shape[1:])) for x, of in ((one, first), (other, second))]
         return np.concatenate(wide)
 
-    return RayBatch(*map(both, first.arrays, second.arrays))
+    origins, _, *limits = map(both, first.arrays, second.arrays)
+    directions = np.concatenate([first.directions_world, second.directions_world])
+    return RayBatch(origins, directions, *limits)
 
 
 @dataclass(frozen=True)

@@ -88,8 +88,8 @@ class ByLobes:
         lobe = look(rays, buffer, follower, numbers, least_slope=least, record=record)
         widened = None
         if record and settings.widened > 0:
-            others, drawn = numbers_of(ways, salt + 1), numbers_of(ways, salt + 2)[0] < settings.widened
-            widened = widening(rays, buffer, follower, others, drawn, least_slope=least)
+            drawn = numbers_of(ways, salt + 1)[0] < settings.widened
+            widened = widening(rays, buffer, follower, lobe, drawn, least_slope=least)
         return cls(lobe, widened, buffer.surface.material[:, 4], follower, settings)
 
     @property
@@ -112,8 +112,7 @@ class ByLobes:
     def back(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> Traced:
         """To all that was met on the way."""
         by_seen = by_each(Seen(back.visibility, back.indirect))
-        light, frame, clip = self.follower.light, self.follower.frame, self.settings.normal_clip
-        return follow_back(self.lobe.mirrored, light, frame, by_seen, by_texels, normal_clip=clip)
+        return follow_back(self.lobe.mirrored, self.follower.light, self.follower.frame, by_seen, by_texels)
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,8 @@
 
 From each point of a buffer go two rays, mirrored at two facets that lie on either side of the normal, as far
 off as the roughness says. Their mean is what the lobe sees past other surfaces; their difference says how
-that changes with the normal, whatever it is that they meet. From some points go another pair and one ray
-mirrored at the normal itself: how far the mean of the pair is from that one says how what is seen changes
-with the roughness. The first pair cannot say so: it made the error that the gradient comes from, which would
-then hold the pair's own variance, and the least rough surface always has the least of that.
+that changes with the normal, whatever it is that they meet. From some points goes a third, mirrored at the
+normal itself: how far the mean of the two is from it says how what is seen changes with the roughness.
 
 These are slopes of what the lobe's blur makes of the scene, estimated from samples; the tracer is asked for
 no derivative by a ray.
@@ -117,39 +115,26 @@ def look(
         record: whether there will be a way back.
     """
     facets = facets_of(buffer.surface, numbers, least_slope=least_slope)
-    pair = joined(*_mirrored(rays, buffer, follower, facets))
-    return Lobe(facets, follower.follow(pair, record=record))
+    one, other = (
+        reflected_rays(rays, buffer, follower.leaving, facets.normals(buffer.surface.normal_world, sign))
+        for sign in (1.0, -1.0)
+    )
+    return Lobe(facets, follower.follow(joined(one, other), record=record))
 
 
 def widening(
     rays: RayBatch,
     buffer: Buffer,
     follower: Follower,
-    numbers: Float64[np.ndarray, "2 p"],
+    lobe: Lobe,
     drawn: Bool[np.ndarray, " p"],
     *,
     least_slope: float,
 ) -> Widening:
-    """Send three rays from the points that were drawn, where facets are as steep as the roughness says."""
-    facets = facets_of(buffer.surface, numbers, least_slope=least_slope)
-    points = np.flatnonzero(drawn & (facets.slope > least_slope))
-    middle = reflected_rays(rays, buffer, follower.leaving)
-    one, other = (side[points] for side in _mirrored(rays, buffer, follower, facets))
-    seen = follower.follow(joined(joined(one, other), middle[points]), record=False).seen
-    pair = Seen(*(values[: 2 * len(points)] for values in seen))
-    change = (mean - own[2 * len(points) :] for mean, own in zip(pair_mean(pair), seen, strict=True))
-    return Widening(points, Seen(*change))
-
-
-def _mirrored(
-    rays: RayBatch, buffer: Buffer, follower: Follower, facets: Facets
-) -> tuple[RayBatch, RayBatch]:
-    """Rays mirrored at the facets of one side, and at those of the other."""
-    one, other = (
-        reflected_rays(rays, buffer, follower.leaving, facets.normals(buffer.surface.normal_world, sign))
-        for sign in (1.0, -1.0)
-    )
-    return one, other
+    """Send a third ray from the points that were drawn, where facets are as steep as the roughness says."""
+    points = np.flatnonzero(drawn & (lobe.facets.slope > least_slope))
+    middle = follower.follow(reflected_rays(rays, buffer, follower.leaving)[points], record=False).seen
+    return Widening(points, Seen(*(mean[points] - own for mean, own in zip(lobe.seen, middle, strict=True))))
 
 
 def pair_mean(seen: Seen) -> Seen:
@@ -200,12 +185,13 @@ def roughness_slope(
     """Gradients by the roughness through how far the mean of two rays is from the one in their middle.
 
     That distance grows with the square of the facets' slope where what is seen is smooth, and the slope of
-    GGX's facets with the square of the roughness: with its fourth power, then. Where an edge is seen it
-    grows more slowly, and this is too steep by as much; the sign is right.
+    GGX's facets with the square of the roughness: with its fourth power, then. Where lobes reach an edge it
+    grows faster, and beyond it more slowly; the sign is right. As the same pair made the error that ``by_incoming`` comes from, its variance takes part: what is loud is made less rough, as in the loss
+    of a picture with one pair a pixel.
 
     Args:
         found: what the three rays saw.
-        roughness: of the points that sent them.
+        roughness: of the points that sent three.
         around_linear: the environment as their lobes see it where nothing hides it.
         by_incoming: gradient by the light that comes in there.
     """

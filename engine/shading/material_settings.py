@@ -33,7 +33,7 @@ class MaterialSettings(BaseModel):
         reflections: surfaces on the path of a reflected ray.
         facet_slope: least angle between a normal and the two facets beside it at which rays are reflected, at
             the beginning and from ``blur_until`` on; the rougher the surface, the larger.
-        widened: share of the points that send three more reflected rays while training, by which roughness
+        widened: share of the points that send a third reflected ray while training, by which roughness
             learns from how sharply other things are mirrored; 0 leaves that to the environment.
         indirect: light of what stands there: ``shaded`` by the split sum, from the ``harmonics``, or
             ``none``.
@@ -86,7 +86,7 @@ class MaterialSettings(BaseModel):
     parted: float = Field(2.0, ge=0)
     reflections: int = Field(3, ge=1, le=8)
     facet_slope: tuple[float, float] = (0.1, 0.01)
-    widened: float = Field(0.0625, ge=0, le=1)
+    widened: float = Field(0.125, ge=0, le=1)
     indirect: Literal["shaded", "harmonics", "none"] = "shaded"
     ambient: bool = True
     bounced: bool = True

@@ -14,7 +14,6 @@ from engine.rays import RayBatch
 from engine.shading.buffer import Buffer, Leaving, gather, reflected_rays, spread_back
 from engine.shading.environment_levels import LightLevels
 from engine.shading.parted import Parted, part, whole
-from engine.shading.slopes import clipped
 from engine.shading.split_sum import Surface, shade, shade_reverse
 from engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 
@@ -103,13 +102,10 @@ def follow_back(
     frame: Float64[np.ndarray, "3 3"],
     by_seen: Seen,
     by_texels: Float64[np.ndarray, "t 3"],
-    *,
-    normal_clip: float,
 ) -> tuple[tuple[Recording, TraceGradients], ...]:
-    """Gradients by materials and normals of all that was met, and by how much of it there is.
+    """Gradients by the materials of all that was met, and by how much of it there is.
 
-    So what only a mirror shows takes its shape from there. None by where it was met, and none by its normals
-    through what further rays see, but for the environment.
+    So what only a mirror shows takes its shape from there. None by its normals, none by where it was met.
 
     Args:
         mirrored: what rays met.
@@ -117,7 +113,6 @@ def follow_back(
         frame: likewise.
         by_seen: gradients by what each ray saw.
         by_texels: those by the texels are added to this.
-        normal_clip: see :class:`engine.shading.material_settings.MaterialSettings`.
     """
     buffer, trace, parted = mirrored.buffer, mirrored.trace, mirrored.parted
     assert trace.hits is not None
@@ -127,13 +122,11 @@ def follow_back(
     by_texels += back.texels(len(by_texels))
     by_alpha = -parted.each(by_seen.visibility)
     by_alpha[which] += (by_light * mirrored.linear).sum(axis=1)
-    by_features, by_normal = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
-    by_unit_normal = back.normal + clipped(back.reflected, normal_clip)
-    spread_back(buffer, back.material, by_unit_normal, by_features, by_alpha, by_normal)
+    by_features, nothing = np.zeros((count, trace.features.shape[1])), np.zeros((count, 3))
+    spread_back(buffer, back.material, np.zeros_like(back.normal), by_features, by_alpha, nothing)
     own = TraceGradients(
-        rgb_srgb=np.zeros((count, 3), np.float32),
+        rgb_srgb=nothing.astype(np.float32),
         transmittance=-by_alpha.astype(np.float32),
-        normal_world=by_normal.astype(np.float32),
         features=by_features.astype(np.float32),
     )
     by_whole, fronts = parted.back(own)
@@ -141,4 +134,4 @@ def follow_back(
     if mirrored.further is None:
         return found
     by_further = Seen(back.visibility, back.indirect)
-    return found + follow_back(mirrored.further, light, frame, by_further, by_texels, normal_clip=normal_clip)
+    return found + follow_back(mirrored.further, light, frame, by_further, by_texels)

@@ -145,7 +145,7 @@ def test_what_only_a_mirror_shows_has_gradients_by_how_much_of_it_there_is() -> 
 
 def test_roughness_learns_from_how_sharply_a_lid_is_mirrored() -> None:
     rough = wall((0, 0, 1), floor(0.8, 0.1), [0.9, 0.9, 0.9, 1.0, 0.35])
-    lid = wall((0, 0, 1), floor(0.25, 0.1, above=0.6), [0.0, 0.0, 0.0, 0.0, 1.0])
+    lid = wall((0, 0, 1), floor(0.25, 0.1, above=0.6), [0.4, 0.4, 0.4, 0.0, 1.0])
     scene = concatenate([rough, lid])
     model = Deferred(MaterialSettings(**BARE, ambient=False, widened=1.0, start=0.01), extent_world=1.0)
     model.light.put(np.full((16, 32, 3), 0.2, np.float32))
@@ -173,10 +173,10 @@ def test_roughness_learns_from_how_sharply_a_lid_is_mirrored() -> None:
         scene.channels["roughness"][: len(rough)] = 0.35 + sign * 0.02
         values.append(look()[0])
     expected = (values[0] - values[1]) / 0.04
-    # Straight above is the lid, which is black; a wider lobe sees more of what is around. Its edge is no
+    # Straight above is the lid, which is darker; a wider lobe sees more of what is around. Its edge is no
     # parabola, so that the gradient is right in its sign and about its size.
     assert expected > 100
-    assert 0.5 < found / expected < 2
+    assert 0.3 < found / expected < 3
 
 
 def test_a_mirror_shows_what_stands_before_it_and_else_the_environment() -> None:
