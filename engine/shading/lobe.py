@@ -186,8 +186,9 @@ def roughness_slope(
 
     That distance grows with the square of the facets' slope where what is seen is smooth, and the slope of
     GGX's facets with the square of the roughness: with its fourth power, then. Where lobes reach an edge it
-    grows faster, and beyond it more slowly; the sign is right. As the same pair made the error that ``by_incoming`` comes from, its variance takes part: what is loud is made less rough, as in the loss
-    of a picture with one pair a pixel.
+    grows faster, and beyond it more slowly; the sign is right. As the same pair made the error that
+    ``by_incoming`` comes from, its variance takes part: what makes grain is made less rough, as the loss of
+    pictures with one pair a pixel wants it.
 
     Args:
         found: what the three rays saw.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from trace_scenes import f32, unit
 
-from engine.rays import ImageRays, RayBatch
+from engine.rays import ImageRays, RayBatch, joined
 
 
 def test_nothing_is_copied_and_single_limits_stay_single(rng: np.random.Generator) -> None:
@@ -25,6 +25,19 @@ def test_a_part_of_a_batch(rng: np.random.Generator, which: slice | np.ndarray) 
     assert part.origins_world.tolist() == [[1, 1, 1]] and part.t_min.tolist() == [0.5]
     one = RayBatch(np.ones((1, 3)), directions[:1], 0.5, t_max[:1])
     assert len(one[np.array([], int)]) == 0 and len(one[np.array([0, 0])]) == 2
+
+
+def test_one_batch_after_another(rng: np.random.Generator) -> None:
+    directions = f32(rng.normal(size=(5, 3)))
+    both = joined(
+        RayBatch(np.ones((1, 3)), directions[:2], 0.5), RayBatch(np.zeros((1, 3)), directions[2:], 0.5)
+    )
+    np.testing.assert_array_equal(both.directions_world, directions)
+    assert both.origins_world[:, 0].tolist() == [1, 1, 0, 0, 0] and both.t_min.tolist() == [0.5]
+    one = RayBatch(np.ones((1, 3)), directions[:1])
+    twice = joined(one, one)
+    assert len(twice) == 2 and len(twice.origins_world) == 1
+    np.testing.assert_array_equal(twice.directions_world, directions[[0, 0]])
 
 
 def test_ways_between_points(rng: np.random.Generator) -> None:
