@@ -20,8 +20,26 @@ async function open({ width = 1200, height = 860, ...options } = {}) {
     page.on("pageerror", (error) => complaints.push(`error: ${error.message}`));
     page.on("console", (message) => {
         // What the steps break on purpose is no complaint.
-        if (message.type() === "error" && !/ERR_(FAILED|ABORTED|CONNECTION)/.test(message.text())) complaints.push(`console: ${message.text()} ${message.location().url}`);
+        if (message.type() === "error" && !/ERR_(FAILED|ABORTED|CONNECTION|NETWORK_CHANGED)/.test(message.text())) complaints.push(`console: ${message.text()} ${message.location().url}`);
     });
+    return steadily(page);
+}
+
+/** The page, whose visits begin anew where the machine's network changed meanwhile: Chromium then drops what is on its way, also from this machine itself. */
+function steadily(page) {
+    let dropped = false;
+    const visit = page.goto.bind(page);
+    page.on("requestfailed", (request) => { dropped ||= /ERR_NETWORK_CHANGED/.test(request.failure()?.errorText ?? ""); });
+    page.goto = async (address, options) => {
+        for (let left = 3; ; left -= 1) {
+            dropped = false;
+            const answer = await visit(address, options).catch((error) => {
+                if (!/ERR_NETWORK_CHANGED/.test(error.message) || left === 0) throw error;
+                dropped = true;
+            });
+            if (!dropped || left === 0) return answer;
+        }
+    };
     return page;
 }
 
