@@ -32,11 +32,12 @@ from engine.events import (
     Warned,
     broadcast,
 )
-from engine.files import ExportOptions, check_writable
+from engine.files import ExportOptions, check_writable, read_facts
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.several import export_files
 from engine.gaussians.materials import reflective_share
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.scene_facts import SceneFacts
 from engine.plain_colours import PlainScene
 from engine.poses import find_poses
 from engine.render.environment_map import write_background, write_environment
@@ -182,9 +183,11 @@ def reconstruct(
                 write_gaussian_ply(
                     gaussians,
                     output / SCENE,
-                    near_world=dataset.near_world,
-                    pixel_rad=trained_pixel_rad(dataset.viewpoints),
-                    turned_beyond=config.train.trace.turned_beyond,
+                    facts=SceneFacts(
+                        near_world=dataset.near_world,
+                        pixel_rad=trained_pixel_rad(dataset.viewpoints),
+                        turned_beyond=config.train.trace.turned_beyond,
+                    ),
                 )
         unmeasured: Exception | None = None
         if not (output / "metrics.json").exists() or not (output / "report.html").exists():
@@ -378,7 +381,7 @@ def _export(output: Path, config: ReconstructionConfig, threads: int, tell: List
     gaussians, _ = read_gaussian_ply(output / SCENE)
     if (left_out := not_exported(output)) is not None:
         tell(Warned(left_out))
-    options = ExportOptions(q=config.train.trace.q)
+    options = ExportOptions(q=config.train.trace.q, facts=read_facts(output))
     plain = PlainScene(
         gaussians,
         output,

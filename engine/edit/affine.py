@@ -45,6 +45,11 @@ def transform(gaussians: FlatGaussians, matrix: Float[np.ndarray, "4 4"]) -> Fla
     return apply_legs(gaussians, means, legs, signs, np.zeros(count, dtype=bool), turn)
 
 
+def mean_stretch(matrix: Float[np.ndarray, "4 4"]) -> float:
+    """How much longer an affine map makes things: the cube root of what it does to volumes."""
+    return float(np.cbrt(abs(np.linalg.det(np.asarray(matrix, np.float64)[:3, :3]))))
+
+
 def translation(offset_world: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
     """Matrix that moves by ``offset_world``."""
     matrix = np.eye(4)

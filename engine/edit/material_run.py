@@ -13,12 +13,8 @@ from engine.config import read_config
 from engine.edit.choices import MaterialChange, Selection
 from engine.edit.material_change import with_harmonics_following, with_materials
 from engine.errors import ConfigError, OutputError
-from engine.files.gaussian_ply import (
-    read_near_world,
-    read_pixel_rad,
-    read_turned_beyond,
-    write_gaussian_ply,
-)
+from engine.files import read_facts
+from engine.files.gaussian_ply import write_gaussian_ply
 from engine.gaussians.materials import require_materials
 from engine.gaussians.model import FlatGaussians
 from engine.render.environment_map import read_environment
@@ -121,9 +117,7 @@ def write_changed_run(
             write_gaussian_ply(
                 gaussians,
                 partial / SCENE,
-                near_world=read_near_world(source / SCENE),
-                pixel_rad=read_pixel_rad(source / SCENE),
-                turned_beyond=read_turned_beyond(source / SCENE),
+                facts=read_facts(source),
             )
             write_json(partial / EDITS, [*_edits(source), dict(note)])
             partial.replace(target)

@@ -12,7 +12,8 @@ from engine.evaluate.held_out import evaluate_held_out
 from engine.evaluate.scales import measure_scales
 from engine.evaluate.truth import Truth, find_truth
 from engine.events import Listener, StageProgress, Warned
-from engine.files.gaussian_ply import read_gaussian_ply, read_near_world
+from engine.files import read_facts
+from engine.files.gaussian_ply import read_gaussian_ply
 from engine.gaussians.materials import has_materials
 from engine.light.environment import EnvironmentMap, environment_frame
 from engine.light.split_sum_relighting import SplitSumRelighter
@@ -271,7 +272,7 @@ def _evaluate_on(
     dataset = Dataset.open_measured(
         on,
         output / CACHE / ON / name,
-        near_world=read_near_world(output / SCENE),
+        near_world=read_facts(output).near_world,
         max_side=config.max_side,
         masks=config.masks,
         threads=threads,

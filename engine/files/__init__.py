@@ -7,7 +7,7 @@ from engine.files.channel_columns import ChannelChoice
 from engine.files.exporting import check_surface_path, export_losses, export_scene, write_surface
 from engine.files.mesh import Mesh
 from engine.files.options import ExportOptions
-from engine.files.reading import read_mesh, read_scene
+from engine.files.reading import read_facts, read_mesh, read_scene
 from engine.files.registry import (
     Exporter,
     Importer,
@@ -40,6 +40,7 @@ __all__ = [
     "exporters",
     "importer_for",
     "importers",
+    "read_facts",
     "read_mesh",
     "read_scene",
     "register",

@@ -12,6 +12,7 @@ of each that it is one.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -34,10 +35,10 @@ from engine.files.selection import selected
 from engine.gaussians.channels import Channels, column_names, stacked
 from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
 
 MAX_SH_DEGREE = 3
 ROWS_AT_ONCE = 65536
-_NEAR, _PIXEL, _TURNED = "near_world", "pixel_rad", "turned_beyond"
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -50,9 +51,7 @@ def write_gaussian_ply(
     path: Path,
     *,
     sh_pad_degree: int | None = None,
-    near_world: float = 0.0,
-    pixel_rad: float = 0.0,
-    turned_beyond: float = 0.0,
+    facts: SceneFacts = NOTHING_KNOWN,
 ) -> None:
     """Write ``gaussians`` as a 3DGS PLY, atomically and in blocks.
 
@@ -61,9 +60,7 @@ def write_gaussian_ply(
         path: the file, replaced if it exists.
         sh_pad_degree: write at least this degree of spherical harmonics, the missing ones zero; some
             importers accept only degree 3.
-        near_world: the distance from a camera at which the scene begins to be seen, kept as a comment.
-        pixel_rad: the angle of a pixel in the middle of a training view, likewise.
-        turned_beyond: of :class:`engine.trace.protocol.TraceSettings`, likewise; 0: normals have no side.
+        facts: what is known of the scene as a whole, kept as comments.
 
     Raises:
         SceneFileError: nothing to write, a parameter is not finite, or the file cannot be written.
@@ -80,51 +77,29 @@ def write_gaussian_ply(
     names += [column for name, width in widths.items() for column in column_names(name, width)]
     dtype = np.dtype([(name, "<f4") for name in names])
     element = PlyWriteElement("vertex", len(gaussians), dtype, _row_blocks(gaussians, degree, dtype))
-    facts = {_NEAR: near_world, _PIXEL: pixel_rad, _TURNED: turned_beyond}
-    known = [f"{name} {value!r}" for name, value in facts.items() if value > 0]
+    known = [f"{name} {value!r}" for name, value in asdict(facts).items() if value > 0]
     write_ply(path, [element], [*known, *channel_comments(widths)])
 
 
-def read_near_world(path: Path) -> float:
-    """The distance from a camera at which the scene in a file begins to be seen; 0 where nothing says so.
+def read_ply_facts(path: Path) -> SceneFacts:
+    """What a file says of its scene as a whole.
 
     Raises:
-        SceneFileError: a PLY is damaged.
+        SceneFileError: the file is damaged, or says something that is no number.
     """
-    return _commented(path, _NEAR)
-
-
-def read_pixel_rad(path: Path) -> float:
-    """The angle of a pixel that the scene in a file was trained with, radians; 0 where nothing says so.
-
-    Raises:
-        SceneFileError: a PLY is damaged.
-    """
-    return _commented(path, _PIXEL)
-
-
-def read_turned_beyond(path: Path) -> float:
-    """Beyond which cosine normals of the scene in a file are turned to the viewer; 0 where they have no side.
-
-    Raises:
-        SceneFileError: a PLY is damaged.
-    """
-    return min(_commented(path, _TURNED), 1.0)
-
-
-def _commented(path: Path, wanted: str) -> float:
-    if path.suffix.lower() != ".ply":
-        return 0.0
-    for comment in read_ply_header(path).comments:
-        name, _, value = comment.partition(" ")
-        if name == wanted:
-            try:
-                return max(float(value), 0.0)
-            except ValueError:
-                raise SceneFileError(
-                    f"{path}: its comment {wanted} is {value!r}, which is no number."
-                ) from None
-    return 0.0
+    said = dict(comment.partition(" ")[::2] for comment in reversed(read_ply_header(path).comments))
+    known = {}
+    for field in fields(SceneFacts):
+        if (value := said.get(field.name)) is None:
+            continue
+        try:
+            known[field.name] = max(float(value), 0.0)
+        except ValueError:
+            raise SceneFileError(
+                f"{path}: its comment {field.name} is {value!r}, which is no number."
+            ) from None
+    facts = SceneFacts(**known)
+    return replace(facts, turned_beyond=min(facts.turned_beyond, 1.0))
 
 
 def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void]) -> Iterator[np.ndarray]:
@@ -271,7 +246,8 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
 
 def _write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
     """Write the Gaussians that are not fainter than ``options.min_opacity``."""
-    write_gaussian_ply(selected(gaussians, path, options), path, sh_pad_degree=options.sh_pad_degree)
+    chosen = selected(gaussians, path, options)
+    write_gaussian_ply(chosen, path, sh_pad_degree=options.sh_pad_degree, facts=options.facts)
     return (path,)
 
 

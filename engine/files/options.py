@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from engine.gaussians.octagon import CHI2_2_99
+from engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
 
 
 class ExportOptions(BaseModel):
@@ -24,6 +25,7 @@ class ExportOptions(BaseModel):
             former. None draws no cores.
         light_up: GLB: lit by the materials of the scene, for light whose up is this in the world; None writes
             colours as they are, to be seen without light. What is lit carries no ids.
+        facts: Gaussian PLY: what is known of the scene as a whole.
         spz_version: SPZ: 3 (gzip), which every viewer reads, or 4 (Zstandard).
     """
 
@@ -38,4 +40,5 @@ class ExportOptions(BaseModel):
     opaque: bool = False
     cores: float | None = Field(default=None, gt=0.0, lt=1.0)
     light_up: tuple[float, float, float] | None = None
+    facts: SceneFacts = NOTHING_KNOWN
     spz_version: Literal[3, 4] = 3

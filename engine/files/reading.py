@@ -8,10 +8,12 @@ import numpy as np
 from engine.errors import SceneFileError
 from engine.events import Listener, StageFinished, StageStarted, ignore
 from engine.files.channel_columns import ChannelChoice
+from engine.files.gaussian_ply import read_ply_facts
 from engine.files.mesh import Mesh
 from engine.files.registry import importer_for, mesh_reader_for
 from engine.gaussians.flattening import ImportReport, flatten
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
 
 FOLDER_FILES = ("scene.ply", "meta.json")
 """What a folder is read by: the scene of a run, or the description of an unpacked SOG."""
@@ -54,6 +56,16 @@ def read_scene(
     scene = flatten(cloud, source, drop_invalid=drop_invalid)
     listener(StageFinished("read", time.monotonic() - began))
     return scene
+
+
+def read_facts(path: Path) -> SceneFacts:
+    """What a file, or the scene of a run's folder, says of its scene as a whole; only our PLY says anything.
+
+    Raises:
+        SceneFileError: the file cannot be read or is damaged.
+    """
+    source = _file_of(path)
+    return read_ply_facts(source) if source.suffix.lower() == ".ply" else NOTHING_KNOWN
 
 
 def read_mesh(path: Path, *, looks: bool = False) -> Mesh:

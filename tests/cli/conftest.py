@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 
 from engine.config import resolve_config
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from engine.gaussians.scene_facts import SceneFacts
 from engine.render.environment_map import write_environment
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from workers.cli.main import cli
@@ -110,7 +111,7 @@ def shiny_run(run, tmp_path_factory) -> Path:
     write_gaussian_ply(
         gaussians.with_channels(channels),
         root / "run" / "scene.ply",
-        turned_beyond=given.train.trace.turned_beyond,
+        facts=SceneFacts(turned_beyond=given.train.trace.turned_beyond),
     )
     write_environment(root / "run" / "environment.hdr", np.full((16, 32, 3), 0.5, np.float32))
     content = json.loads((root / "run" / "config.json").read_text())

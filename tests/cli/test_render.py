@@ -10,12 +10,8 @@ import numpy as np
 import pytest
 
 from engine.colour import linear_to_srgb
-from engine.files.gaussian_ply import (
-    read_gaussian_ply,
-    read_near_world,
-    read_pixel_rad,
-    write_gaussian_ply,
-)
+from engine.files import read_facts
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.render.images import read_channels, read_image
 
 SIZE = ("--width", 32, "--height", 24)
@@ -89,9 +85,10 @@ def test_exr_has_depth_and_normals(run, octasplat, tmp_path):
 
 def test_a_run_and_its_file_give_one_picture(run, octasplat, tmp_path):
     gaussians, _ = read_gaussian_ply(run.output / "scene.ply")
-    near = read_near_world(run.output / "scene.ply")
+    facts = read_facts(run.output)
+    near = facts.near_world
     assert near > 0
-    assert read_pixel_rad(run.output / "scene.ply") > 0
+    assert facts.pixel_rad > 0
     # Right before the largest thing: what is nearer than the training saw is not to be seen in either.
     nearest = int(np.argmax(gaussians.opacities * gaussians.scales.prod(axis=1)))
     pose = np.eye(4)

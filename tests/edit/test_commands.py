@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 from edit_scenes import assert_same, cube
 
 from engine.edit.affine import transform
-from engine.files import export_scene, read_mesh
+from engine.files import export_scene, read_facts, read_mesh
 from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.scene_facts import SceneFacts
 
 Make = Callable[..., FlatGaussians]
 
@@ -42,6 +44,41 @@ def test_edit_without_an_edit(octasplat, scene: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out.ply").read_bytes() == scene.read_bytes()
     (counts,) = json.loads(report.read_text())
     assert counts["unmoved"] == 150 and counts["matched_by"] == "ids"
+
+
+def test_what_is_known_of_a_scene_outlives_every_edit(octasplat, make_scene: Make, tmp_path: Path) -> None:
+    scene, facts = make_scene(150), SceneFacts(near_world=0.25, pixel_rad=0.002, turned_beyond=0.5)
+    channels = {"albedo": np.full((150, 3), 0.5, np.float32), "metallic": np.ones((150, 1), np.float32)}
+    lit = scene.with_channels(channels | {"roughness": channels["metallic"]})
+    source, out = tmp_path / "scene.ply", tmp_path / "out.ply"
+    write_gaussian_ply(lit, source, facts=facts)
+    assert octasplat("export", source, tmp_path / "mesh.ply").exit_code == 0
+    cube_obj = tmp_path / "cube.obj"
+    write_obj(cube_obj, *cube(2, 4.0))
+    for command in (
+        ("crop", source, "--where", "opacity > 0", "-o", out),
+        ("clean", source, "--no-floaters", "-o", out),
+        ("transform", source, "--rotate", "x", 30, "--scale", -1, "-o", out),
+        ("edit", source, "--mesh", tmp_path / "mesh.ply", "-o", out),
+        ("deform", source, "--proxy", cube_obj, "--deformed", cube_obj, "--reach", 9, "-o", out),
+        ("material", source, "--set", "metallic=0", "-o", out),
+        ("export", source, out),
+        ("import", source, out),
+        ("merge", source, source, "-o", out),
+    ):
+        done = octasplat(*command)
+        assert done.exit_code == 0, done.output
+        assert astuple(read_facts(out)) == pytest.approx(astuple(facts), rel=1e-12), command
+        out.unlink()
+    assert octasplat("transform", source, "--scale", 2, "-o", out).exit_code == 0
+    assert astuple(read_facts(out)) == pytest.approx((0.5, 0.002, 0.5), rel=1e-12)
+    # What has no materials does not ask which way its normals point; nothing may be hidden that one shows.
+    write_gaussian_ply(scene, tmp_path / "plain.ply", facts=SceneFacts(pixel_rad=0.001))
+    assert octasplat("merge", source, tmp_path / "plain.ply", "-o", out).exit_code == 0
+    assert read_facts(out) == SceneFacts(0.0, 0.001, 0.5)
+    write_gaussian_ply(lit, tmp_path / "plain.ply")
+    assert octasplat("merge", source, tmp_path / "plain.ply", "-o", out).exit_code == 0
+    assert read_facts(out) == SceneFacts()
 
 
 def test_edit_of_a_sequence_in_the_order_of_its_numbers(octasplat, scene: Path, tmp_path: Path) -> None:

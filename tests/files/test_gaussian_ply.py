@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 
 from engine.errors import SceneFileError
-from engine.files.gaussian_ply import (
-    read_gaussian_ply,
-    read_near_world,
-    read_pixel_rad,
-    read_turned_beyond,
-    write_gaussian_ply,
-)
+from engine.files import read_facts
+from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from engine.files.ply_container import read_ply
 from engine.gaussians.frames import rotation_matrices
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.scene_facts import SceneFacts
 
 Make = Callable[..., FlatGaussians]
 TYPES = {"<f4": "float", "<f8": "double", "<i2": "short", "<u1": "uchar"}
@@ -66,12 +62,20 @@ def assert_same_bits(actual: FlatGaussians, expected: FlatGaussians) -> None:
 
 def test_what_is_known_of_a_scene_is_kept_in_comments(make_gaussians: Make, tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
-    facts = read_near_world, read_pixel_rad, read_turned_beyond
-    write_gaussian_ply(make_gaussians(3), path, near_world=0.125, pixel_rad=1e-3, turned_beyond=0.5)
-    assert [fact(path) for fact in facts] == [0.125, 1e-3, 0.5]
+    facts = SceneFacts(near_world=0.125, pixel_rad=1e-3, turned_beyond=0.5)
+    write_gaussian_ply(make_gaussians(3), path, facts=facts)
+    assert read_facts(path) == read_facts(tmp_path) == facts
     write_gaussian_ply(make_gaussians(3), path)
-    assert [fact(path) for fact in facts] == [0, 0, 0]
-    assert read_turned_beyond(tmp_path / "scene.splat") == 0
+    assert read_facts(path) == SceneFacts()
+    assert read_facts(tmp_path / "scene.splat") == SceneFacts()
+
+
+def test_a_fact_that_is_no_number_is_refused(make_gaussians: Make, tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    write_gaussian_ply(make_gaussians(3), path, facts=SceneFacts(near_world=0.125))
+    path.write_bytes(path.read_bytes().replace(b"near_world 0.125", b"near_world close"))
+    with pytest.raises(SceneFileError, match="near_world is 'close', which is no number"):
+        read_facts(path)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

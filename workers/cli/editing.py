@@ -14,8 +14,9 @@ from pydantic import BaseModel, ValidationError
 from engine.edit.deform import DeformReport, deform_to, deformation_corners
 from engine.edit.recovery import EditOptions, EditReport, recover_edit
 from engine.errors import ConfigError, SceneFileError
-from engine.files import Mesh, export_scene, exporter_for, read_mesh
+from engine.files import ExportOptions, Mesh, export_scene, exporter_for, read_facts, read_mesh
 from engine.gaussians.model import FlatGaussians
+from engine.gaussians.scene_facts import SceneFacts
 from engine.writing import write_json
 from workers.cli.scene_files import open_scene, warn_of_losses
 
@@ -96,11 +97,13 @@ def targets_for(output: Path, sources: Sequence[Path], inputs: Sequence[Path]) -
     return tuple(targets)
 
 
-def write_scene(gaussians: FlatGaussians, target: Path, say: Say, *, warn: bool = True) -> None:
+def write_scene(
+    gaussians: FlatGaussians, facts: SceneFacts, target: Path, say: Say, *, warn: bool = True
+) -> None:
     """Write a scene in the format of its name and tell so, and with ``warn`` what the format leaves out."""
     if warn:
         warn_of_losses(gaussians, target)
-    export_scene(gaussians, target)
+    export_scene(gaussians, target, ExportOptions(facts=facts))
     say(
         f"Wrote {target}: {exporter_for(target).description.partition(';')[0]}, {len(gaussians):,} Gaussians."
     )
@@ -128,7 +131,7 @@ def run_edit(
     options: EditOptions = checked_options(EditOptions, given)
     paths = mesh_paths(meshes)
     targets = targets_for(output, paths, [source, *paths])
-    gaussians = open_scene(source, quiet=quiet)
+    gaussians, facts = open_scene(source, quiet=quiet), read_facts(source)
     say = speaker(quiet)
     reports: list[dict[str, Any]] = []
     for path, target in zip(paths, targets, strict=True):
@@ -143,7 +146,7 @@ def run_edit(
                 click.echo(line, err=True)
             else:
                 say(line)
-        write_scene(result, target, say, warn=target == targets[0])
+        write_scene(result, facts, target, say, warn=target == targets[0])
         reports.append({"mesh": str(path), "output": str(target), **asdict(report)})
     if report_path is not None:
         write_json(report_path, reports)
@@ -220,7 +223,7 @@ def run_deform(
 
     paths = mesh_paths(deformed)
     targets = targets_for(output, paths, [source, proxy_path, *paths])
-    gaussians = open_scene(source, quiet=quiet)
+    gaussians, facts = open_scene(source, quiet=quiet), read_facts(source)
     say = speaker(quiet)
     rest = read_mesh(proxy_path)
     proxy = _as_proxy(proxy_path, rest, axes, mirrored)
@@ -248,7 +251,7 @@ def run_deform(
         result, report = deform_to(gaussians, corners, binding.deform(vertices), binding.mirrored(vertices))
         for line in deform_lines(path, report):
             say(line)
-        write_scene(result, target, say, warn=target == targets[0])
+        write_scene(result, facts, target, say, warn=target == targets[0])
         reports.append({"deformed": str(path), "output": str(target), **asdict(report)})
     if report_path is not None:
         write_json(report_path, reports)

@@ -16,7 +16,7 @@ from engine.edit.material_run import (
 )
 from engine.edit.selection import chosen_by, in_mesh
 from engine.errors import ConfigError
-from engine.files import read_mesh
+from engine.files import read_facts, read_mesh
 from engine.gaussians.materials import MATERIAL_WIDTHS, require_materials
 from engine.run_folder import SCENE, is_run
 from workers.cli.editing import checked_options, speaker, targets_for, write_scene
@@ -53,7 +53,7 @@ def run_material(options: dict[str, Any]) -> None:
     if not follows(source):
         say("Viewers and octasplat render show their harmonics, which are as before; relight shows it.")
     if not to_folder:
-        write_scene(changed, output, say)
+        write_scene(changed, read_facts(source), output, say)
         return
     mesh = {"mesh": options["mesh"].name} if options["mesh"] is not None else {}
     masks = {"masks": [path.name for path in options["masks"]]} if options["masks"] else {}

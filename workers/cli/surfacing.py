@@ -16,8 +16,7 @@ from engine.colour import to_bytes
 from engine.config import read_config
 from engine.errors import ConfigError, DatasetError, OutputError
 from engine.events import Listener
-from engine.files import check_surface_path, write_surface
-from engine.files.gaussian_ply import read_near_world, read_turned_beyond
+from engine.files import check_surface_path, read_facts, write_surface
 from engine.gaussians.materials import require_materials
 from engine.gaussians.model import FlatGaussians
 from engine.rays import ImageRays
@@ -197,12 +196,12 @@ def _cameras(
         train = read_config(source / CONFIG).train
         near_world = train.near * seen.extent
         return photograph_cameras(seen, seen.train_indices, options.depth_side, near_world), train.trace
-    settings = TraceSettings(turned_beyond=read_turned_beyond(source))
+    facts = read_facts(source)
+    settings = TraceSettings(turned_beyond=facts.turned_beyond)
     if scene is not None:
         photographs = load_scene(scene)
         every = np.arange(len(photographs.views))
-        near_world = read_near_world(source)
-        return photograph_cameras(photographs, every, options.depth_side, near_world), settings
+        return photograph_cameras(photographs, every, options.depth_side, facts.near_world), settings
     return cameras_around(gaussians, options.depth_side), settings
 
 

@@ -12,12 +12,8 @@ from jaxtyping import Float64
 from engine.config import read_config
 from engine.errors import ConfigError, OutputError
 from engine.events import Listener
-from engine.files.gaussian_ply import (
-    read_gaussian_ply,
-    read_near_world,
-    read_pixel_rad,
-    read_turned_beyond,
-)
+from engine.files import read_facts
+from engine.files.gaussian_ply import read_gaussian_ply
 from engine.gaussians.model import FlatGaussians
 from engine.light.companions import companions
 from engine.light.stage import Stage
@@ -266,7 +262,7 @@ def _read_run(options: dict[str, Any]) -> Source:
         config.evaluate_background,
         viewpoints,
         config.max_side,
-        read_pixel_rad(run / SCENE),
+        read_facts(run).pixel_rad,
         run_background(run),
     )
 
@@ -274,9 +270,9 @@ def _read_run(options: dict[str, Any]) -> Source:
 def _read_file(options: dict[str, Any], say: Callable[[str], None]) -> Source:
     path: Path = options["source"]
     gaussians = open_scene(path, say)
-    near_world, trained_rad = read_near_world(path), read_pixel_rad(path)
-    settings = TraceSettings(turned_beyond=read_turned_beyond(path))
-    return Source(gaussians, settings, near_world, trained_rad=trained_rad)
+    facts = read_facts(path)
+    settings = TraceSettings(turned_beyond=facts.turned_beyond)
+    return Source(gaussians, settings, facts.near_world, trained_rad=facts.pixel_rad)
 
 
 def stage_place(

@@ -58,6 +58,7 @@ def clean(
     from engine.edit.cleaning import CleanOptions
     from engine.edit.cleaning import clean as find_clean
     from engine.errors import ConfigError
+    from engine.files import read_facts
     from engine.run_folder import is_run, run_near_zones
     from workers.cli.editing import checked_options, speaker, targets_for, write_scene
     from workers.cli.scene_files import open_scene
@@ -83,4 +84,4 @@ def clean(
                 "opacities)."
             )
         for target in targets:
-            write_scene(gaussians.select(keep), target, say)
+            write_scene(gaussians.select(keep), read_facts(source), target, say)

@@ -31,6 +31,7 @@ def crop(
     from engine.edit.choices import Selection
     from engine.edit.selection import chosen_by
     from engine.errors import ConfigError
+    from engine.files import read_facts
     from workers.cli.editing import checked_options, speaker, targets_for, write_scene
     from workers.cli.scene_files import open_scene
     from workers.cli.signals import orderly_termination
@@ -50,4 +51,4 @@ def crop(
     say = speaker(quiet)
     say(f"{source}: {int(keep.sum()):,} of {len(keep):,} Gaussians kept.")
     with orderly_termination():
-        write_scene(gaussians.select(keep), target, say)
+        write_scene(gaussians.select(keep), read_facts(source), target, say)

@@ -128,7 +128,7 @@ def export(
     """
     if up and not materials:
         raise click.UsageError("--up goes with --materials.")
-    from engine.files import ExportOptions, export_scene, exporter_for
+    from engine.files import ExportOptions, export_scene, exporter_for, read_facts
     from engine.gaussians.materials import require_materials
     from engine.gaussians.octagon import CHI2_2_99
     from workers.cli.scene_files import open_scene, warn_of_losses
@@ -159,6 +159,7 @@ def export(
         ids=not (no_ids or for_viewers),
         cores=CORES_OF_CHUNKS if for_viewers else None,
         light_up=light,
+        facts=read_facts(source),
         spz_version=4 if spz_version == "4" else 3,
     )
     if not materials:

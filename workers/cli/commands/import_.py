@@ -45,7 +45,7 @@ def import_(
     .glb with KHR_gaussian_splatting. A Gaussian with three extents loses the smallest; what that means for
     the scene is told. All other commands read the same formats.
     """
-    from engine.files import read_scene
+    from engine.files import read_facts, read_scene
     from engine.files.gaussian_ply import write_gaussian_ply
     from workers.cli.progress import show_progress
     from workers.cli.signals import orderly_termination
@@ -62,7 +62,7 @@ def import_(
                 click.echo(line, err=True)
         if sh_degree is not None and sh_degree < gaussians.sh_degree:
             gaussians.sh = gaussians.sh[:, : (sh_degree + 1) ** 2].copy()
-        write_gaussian_ply(gaussians, target)
+        write_gaussian_ply(gaussians, target, facts=read_facts(source))
     if not quiet:
         for line in _summary(report):
             click.echo(line)

@@ -25,6 +25,8 @@ def merge(sources: tuple[Path, ...], output: Path, sh_degree: int | None, quiet:
         raise click.UsageError("Name at least two scenes.")
 
     from engine.edit.selection import merge as merge_scenes
+    from engine.files import read_facts
+    from engine.gaussians.scene_facts import shared_facts
     from workers.cli.editing import speaker, targets_for, write_scene
     from workers.cli.scene_files import open_scene
     from workers.cli.signals import orderly_termination
@@ -36,4 +38,5 @@ def merge(sources: tuple[Path, ...], output: Path, sh_degree: int | None, quiet:
         for source, scene in zip(sources, scenes, strict=True):
             if missing := ", ".join(name for name in every if name not in scene.channels):
                 click.echo(f"Warning: {source}: has no channel {missing}; it is 0 there.", err=True)
-        write_scene(merge_scenes(scenes, sh_degree), target, speaker(quiet))
+        facts = shared_facts(list(zip(scenes, map(read_facts, sources), strict=True)))
+        write_scene(merge_scenes(scenes, sh_degree), facts, target, speaker(quiet))

@@ -63,6 +63,7 @@ def transform(
     import numpy as np
 
     from engine.edit import affine
+    from engine.files import read_facts
     from workers.cli.editing import speaker, targets_for, write_scene
     from workers.cli.scene_files import open_scene
     from workers.cli.signals import orderly_termination
@@ -81,4 +82,6 @@ def transform(
     if translate is not None:
         whole = affine.translation(np.array(translate)) @ whole
     with orderly_termination():
-        write_scene(affine.transform(open_scene(source, quiet=quiet), whole), target, speaker(quiet))
+        moved = affine.transform(open_scene(source, quiet=quiet), whole)
+        facts = read_facts(source).scaled(affine.mean_stretch(whole))
+        write_scene(moved, facts, target, speaker(quiet))
