@@ -159,7 +159,9 @@ def main() -> None:
             serial = np.full(len(STAGES), np.nan)
         for name, row, alone in zip(STAGES, table, serial, strict=True):
             print(f"{name:18s} | {row[0]:7.2f} | {row[1]:6.2f} | {alone:6.2f}")
-        share = f", serial {100 * serial.sum() / total[1]:.1f} % of the CPU time" if threads > 1 else ""
+        share = ""
+        if threads > 1:  # in a training the batch is drawn beside the iteration before
+            share = f", serial but for the batch {100 * serial[1:].sum() / total[1]:.1f} % of the CPU time"
         print(f"{'all':18s} | {total[0]:7.2f} | {total[1]:6.2f} | {serial.sum():6.2f}{share}")
 
 
