@@ -34,7 +34,8 @@ class MaterialSettings(BaseModel):
         facet_slope: least angle between a normal and the two facets beside it at which rays are reflected, at
             the beginning and from ``blur_until`` on; the rougher the surface, the larger.
         widened: share of the points that send a third reflected ray while training, by which roughness
-            learns from how sharply other things are mirrored; 0 leaves that to the environment.
+            learns from how sharply other things are mirrored; 0 leaves that to the environment, which long
+            trainings are better with.
         indirect: light of what stands there: ``shaded`` by the split sum, from the ``harmonics``, or
             ``none``.
         ambient: whether the irradiance is dimmed where other things hide the environment.
@@ -86,7 +87,7 @@ class MaterialSettings(BaseModel):
     parted: float = Field(2.0, ge=0)
     reflections: int = Field(3, ge=1, le=8)
     facet_slope: tuple[float, float] = (0.1, 0.01)
-    widened: float = Field(0.125, ge=0, le=1)
+    widened: float = Field(0.0, ge=0, le=1)
     indirect: Literal["shaded", "harmonics", "none"] = "shaded"
     ambient: bool = True
     bounced: bool = True
