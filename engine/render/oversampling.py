@@ -9,12 +9,14 @@ from jaxtyping import Float32
 
 from engine.colour import linear_to_srgb
 from engine.rays import ImageRays
-from engine.render.renderer import RenderedImage, background_colour, render_rays
+from engine.render.renderer import RenderedImage, background_colour, layer_at, render_rays, tile_order
 from engine.shading.protocol import ShadingModel
 from engine.trace.protocol import Tracer
 
 MOST_ACROSS = 4
 """More rays than 16 a pixel are not worth their time."""
+UNEVEN = 0.1
+"""Display values of a pixel's rays that are further apart than this are asked for more of them."""
 LINEAR = "linear"
 """The layer of a shading model that holds radiance."""
 
@@ -41,6 +43,8 @@ def pixel_means(
 ) -> PixelMeans:
     """Trace ``side`` x ``side`` rays a pixel, evenly spread, through a scene whose shading gives radiance.
 
+    Where these differ, at edges and where facets are drawn, as many again across and down take their place.
+
     Args:
         tracer: built around the Gaussians.
         image: rays through the centres of the pixels.
@@ -48,16 +52,29 @@ def pixel_means(
         side: so many rays across a pixel, and as many down.
         part: told the share that is done.
     """
-    light = np.zeros((image.height_px, image.width_px, 3))
-    coverage = np.zeros((image.height_px, image.width_px))
+    size = image.height_px, image.width_px
+    light, coverage = np.zeros((*size, 3)), np.zeros(size)
+    lowest, highest = np.full((*size, 3), np.inf, np.float32), np.zeros((*size, 3), np.float32)
     for number, (across, down) in enumerate(_offsets(side)):
-        part(number / side**2)
-        shifted = image.shifted(across, down)
-        found = render_rays(tracer, shifted, background_colour("black"), shading, number)
-        light += found.alpha[..., None] * found.layers[LINEAR]
-        coverage += found.alpha
-    linear = light / np.maximum(coverage, 1e-6)[..., None]
-    return PixelMeans(linear.astype(np.float32), (coverage / side**2).astype(np.float32))
+        part(number / (2 * side**2))
+        found = render_rays(tracer, image.shifted(across, down), background_colour("black"), shading, number)
+        light += found.alpha[..., None] * found.layers[LINEAR] / side**2
+        coverage += found.alpha / side**2
+        np.minimum(lowest, found.rgb_srgb, out=lowest)
+        np.maximum(highest, found.rgb_srgb, out=highest)
+    finer = min(2 * side, MOST_ACROSS)
+    order = tile_order(*size)
+    uneven = order[((highest - lowest).max(axis=2) > UNEVEN).reshape(-1)[order]]
+    if finer > side and len(uneven):
+        light.reshape(-1, 3)[uneven], coverage.reshape(-1)[uneven] = 0, 0
+        for number, (across, down) in enumerate(_offsets(finer)):
+            part(0.5 + number / (2 * finer**2))
+            shifted, sample = image.shifted(across, down), side**2 + number
+            linear, alpha = layer_at(tracer, shifted, uneven, shading, LINEAR, sample)
+            light.reshape(-1, 3)[uneven] += alpha[:, None] * linear / finer**2
+            coverage.reshape(-1)[uneven] += alpha / finer**2
+    mean = light / np.maximum(coverage, 1e-6)[..., None]
+    return PixelMeans(mean.astype(np.float32), coverage.astype(np.float32))
 
 
 def pixel_rad(image: ImageRays) -> float:

@@ -84,6 +84,35 @@ def render_rays(
     return out
 
 
+def layer_at(
+    tracer: Tracer,
+    image: ImageRays,
+    pixels: Int64[np.ndarray, " p"],
+    shading: ShadingModel,
+    layer: str,
+    sample: int,
+) -> tuple[Float32[np.ndarray, "p f"], Float32[np.ndarray, " p"]]:
+    """What a layer of the shading shows at some pixels of an image, and their alpha.
+
+    Args:
+        tracer: as for :func:`render_rays`.
+        image: rays of all pixels.
+        pixels: row-major numbers, neighbours side by side.
+        shading: a model with that layer.
+        layer: its name.
+        sample: as for :func:`render_rays`.
+    """
+    found, alphas = [], []
+    for start in range(0, len(pixels), RAYS_AT_ONCE):
+        chosen = pixels[start : start + RAYS_AT_ONCE]
+        rays = image.rays[chosen]
+        seen = tracer.trace(rays)
+        developed = shading.develop(Sight(rays, seen, tracer, dither=dithered(chosen, sample)))
+        found.append(developed.layers[layer])
+        alphas.append(seen.alpha)
+    return np.concatenate(found), np.concatenate(alphas)
+
+
 def front_normals(
     tracer: Tracer, image: ImageRays, depth_median: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:

@@ -10,6 +10,7 @@ from engine.colour import srgb_to_linear
 from engine.gaussians.model import concatenate
 from engine.rays import ImageRays, RayBatch
 from engine.render.oversampling import pixel_means
+from engine.render.renderer import background_colour, render_rays
 from engine.shading.deferred import Deferred
 from engine.shading.lobe import Widening, facets_of, numbers_of, pair_mean, pair_slope, roughness_slope
 from engine.shading.material_settings import MaterialSettings
@@ -140,17 +141,33 @@ def test_a_path_goes_from_mirror_to_mirror() -> None:
     assert shown[3] == pytest.approx(shown[2], abs=1e-3)
 
 
-def test_a_pixel_at_an_outline_is_covered_by_its_share() -> None:
+def half_a_row() -> tuple[CpuTracer, ImageRays, Deferred]:
+    """Nine pixels before a plate that ends in the fifth."""
     plate = wall((0, 0, 1), floor(2.0, 0.05), [0.8, 0.8, 0.8, 0.0, 1.0])
     plate = plate.select(plate.means_world[:, 0] < -0.12)
     model = Deferred(MaterialSettings(**BARE), extent_world=1.0)
     model.light.put(np.full((16, 32, 3), 0.5, np.float32))
     tracer = CpuTracer(threads=1)
     tracer.build(plate, model.features(plate))
-    x = np.linspace(-1.6, 1.6, 9)  # nine pixels; the fifth lies on the edge
+    x = np.linspace(-1.6, 1.6, 9)
     ways = np.stack([x, np.zeros(9), np.full(9, -4.0)], axis=1)[None]
+    return tracer, ImageRays.of(np.array([0, 0, 4.0]), unit(ways)), model
 
-    image = ImageRays.of(np.array([0, 0, 4.0]), unit(ways))
-    found = pixel_means(tracer, image, model, 2)
-    np.testing.assert_allclose(found.alpha[0], [1, 1, 1, 1, 0.55, 0, 0, 0, 0], atol=0.06)
+
+def test_a_pixel_at_an_outline_is_covered_by_its_share() -> None:
+    found = pixel_means(*half_a_row(), 2)
+    # 64 rays across give 0.650.
+    np.testing.assert_allclose(found.alpha[0], [1, 1, 1, 1, 0.65, 0, 0, 0, 0], atol=0.005)
     np.testing.assert_allclose(found.linear[0, :5], 0.5 * (0.8 + 0.04), atol=0.03)
+
+
+def test_pixels_whose_rays_differ_are_asked_for_more() -> None:
+    tracer, image, model = half_a_row()
+    found, many = pixel_means(tracer, image, model, 2), pixel_means(tracer, image, model, 4)
+    quarters = [(a, b) for a in (-0.25, 0.25) for b in (-0.25, 0.25)]
+    black = background_colour("black")
+    few = np.mean([render_rays(tracer, image.shifted(*at), black, model).alpha for at in quarters], axis=0)
+    assert abs(few[0, 4] - many.alpha[0, 4]) > 0.01  # two columns see the edge elsewhere than four
+    assert found.alpha[0, 4] == pytest.approx(many.alpha[0, 4], abs=1e-6)
+    even = np.arange(9) != 4
+    np.testing.assert_allclose(found.alpha[0, even], few[0, even], atol=1e-6)
