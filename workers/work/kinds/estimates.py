@@ -39,8 +39,8 @@ _FITTED_GAUSSIANS = 200_000
 _MATERIAL_RAY_CPU_SECONDS = 2.1e-5
 """For a ray with what it reflects, of a training with materials of so many Gaussians."""
 _MATERIAL_GAUSSIANS = 80_000
-_MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 2.9e-5
-"""With four rays a pixel and what they reflect: 60 pictures of 400 x 400 pixels took 275 s."""
+_MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 5.5e-5
+"""With four to sixteen rays a pixel and what they reflect: 60 pictures of 400 x 400 pixels took 550 s."""
 _SINGLE_RAY_CPU_SECONDS = 10.8e-6
 """For a ray that comes alone, as the preset paper has them."""
 _PAPER_GAUSSIANS = 60_000
@@ -157,8 +157,8 @@ def estimate_render(options: RenderJobOptions, photographs: Sequence[Sizes], cor
 
 
 def estimate_relight(options: RelightJobOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
-    """The estimate of a scene in other light; each ray of the split sum counts as a path of two."""
-    each = _PATH_CPU_SECONDS * options.rays * (1 if options.by == "path" else 0.5)
+    """The estimate of a scene in other light; a ray of the split sum counts as a path."""
+    each = _PATH_CPU_SECONDS * options.rays
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
     disk = image_bytes(options, photographs, len(options.environments))
