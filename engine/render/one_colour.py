@@ -73,6 +73,7 @@ def colours_for_cameras(
         away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
         sums[found.ids] += found.weight_sums[:, None] * _colours(gaussians.select(found.ids), away)
         weights[found.ids] += found.weight_sums
+        del seen  # its recording's memory serves the next one
     on_pass(1, steps + 2)
     means = np.where(
         weights[:, None] > 0, sums / np.maximum(weights, 1e-12)[:, None], gaussians.base_rgb_srgb
@@ -105,6 +106,7 @@ class _Normal:
             gradients = TraceGradients(np.zeros_like(seen.rgb_srgb), features=rest.astype(np.float32))
             found = self._tracer.backward(seen.hits, gradients).numpy()
             out[found.ids] += found.features
+            del seen  # its recording's memory serves the next one
         return out
 
 

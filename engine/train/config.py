@@ -43,11 +43,11 @@ class LearningRates(_Frozen):
     axes: Literal["own", "world"] = Field(
         "own", description="along and around which means and rotations take their steps"
     )
-    quat: float = Field(0.03, ge=0)
+    quat: float = Field(0.015, ge=0)
     log_scale: float = Field(0.04, ge=0)
-    opacity: float = Field(0.2, ge=0)
+    opacity: float = Field(0.1, ge=0)
     colour: float = Field(1e-2, ge=0, description="of the display colour; harmonics get it over C0")
-    sh_rest_ratio: float = Field(0.05, ge=0, description="of the constant harmonic's step")
+    sh_rest_ratio: float = Field(0.1, ge=0, description="of the constant harmonic's step")
     exposure: float = Field(2e-3, ge=0, description="of the views' log gains and offsets, where learnt")
     background: float = Field(0.01, ge=0, description="of a learnt background's display colours")
     albedo: float = Field(0.03, ge=0, description="of the logit, as for the two below")
@@ -146,7 +146,7 @@ class TrainConfig(_Frozen):
     )
     patch_side: int = Field(32, ge=16)
     fit_iterations: int = Field(100, ge=0, description="fitting before anything is added")
-    sh_degree: int = Field(2, ge=0, le=3)
+    sh_degree: int = Field(3, ge=0, le=3)
     sh_every: int = Field(100, ge=1, description="iterations between raising the degree")
     max_gaussians: int = Field(
         0,
@@ -303,6 +303,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
         "mean_final": 1e-3,
         "log_scale": 0.02,
         "opacity": 0.1,
+        "sh_rest_ratio": 0.05,
     }
     return config.model_copy(
         update={
@@ -337,11 +338,7 @@ def preset(name: str) -> TrainConfig:
         ConfigError: there is no such preset.
     """
     if name == "fast":
-        return TrainConfig(
-            iterations=1400,
-            sh_degree=1,
-            max_gaussians_auto=40_000,
-        )
+        return TrainConfig(iterations=1400, max_gaussians_auto=40_000)
     if name == "standard":
         return TrainConfig()
     if name == "high":

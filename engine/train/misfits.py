@@ -157,7 +157,8 @@ class TrainingViews:
         its = "its pose" if len(loose) == 1 else "their poses"
         return (
             f"{which} not fit the others; {its} may be wrong, or the picture blurred: {', '.join(loose)}. "
-            "The setting leave_out_misfits trains without such photographs."
+            "Poses that were given may come right where all are found anew (--poses auto); the setting "
+            "leave_out_misfits trains without such photographs."
         )
 
 

@@ -23,7 +23,7 @@ from workers.upkeep import collecting
 from workers.upkeep.collecting import collect_at_once
 
 MIB = 1 << 20
-PATIENCE_SECONDS = 60.0
+PATIENCE_SECONDS = 180.0
 
 
 def picture(size_bytes: int, name: str) -> bytes:

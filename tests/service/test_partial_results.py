@@ -111,11 +111,13 @@ def test_retry_with_other_options(talk: Callable[[Conversation], None]) -> None:
         anew = {"from": "start", "options": {"train": {"iterations": 5}}}
         now = (await http.post(f"{address}/retry", json=anew)).json()
         assert now["checkpoint"] is None and now["options"]["train"]["iterations"] == 5
-        assert now["options"]["train"]["sh_degree"] == job["options"]["train"]["sh_degree"]
+        cap = job["options"]["train"]["max_gaussians_auto"]
+        assert now["options"]["train"]["max_gaussians_auto"] == cap
         await http.post(f"{address}/cancel")
         other = {"from": "start", "options": {"preset": "standard"}}
         now = (await http.post(f"{address}/retry", json=other)).json()
-        assert now["options"]["train"]["sh_degree"] == 2 and now["options"]["exports"] == ["b.splat"]
+        assert now["options"]["train"]["max_gaussians_auto"] == 400_000 != cap
+        assert now["options"]["exports"] == ["b.splat"]
 
     talk(conversation)
 

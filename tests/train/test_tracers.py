@@ -38,7 +38,7 @@ def train(folder: Path, tracer: str, iterations: int) -> tuple[TrainState, list[
 
 
 def test_the_slow_twin_learns_the_plane(tmp_path: Path) -> None:
-    state, events = train(tmp_path, "reference", 80)
+    state, events = train(tmp_path, "reference", 110)
     held_out = [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
     losses = [event.loss for event in events if isinstance(event, TrainingProgress)]
     assert held_out[-1] > held_out[0] + 4

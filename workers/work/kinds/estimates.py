@@ -40,7 +40,7 @@ _MATERIAL_RAY_CPU_SECONDS = 2.1e-5
 """For a ray with what it reflects, of a training with materials of so many Gaussians."""
 _MATERIAL_GAUSSIANS = 80_000
 _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 5.5e-5
-"""With four to sixteen rays a pixel and what they reflect: 60 pictures of 400 x 400 pixels took 550 s."""
+"""With four to sixteen rays a pixel and what they reflect: 8 to 10 s for each picture of 400 x 400 pixels."""
 _SINGLE_RAY_CPU_SECONDS = 10.8e-6
 """For a ray that comes alone, as the preset paper has them."""
 _PAPER_GAUSSIANS = 60_000
