@@ -22,6 +22,7 @@ from service.routes import artifacts, audit, datasets, estimates, jobs, journal,
 from service.settings import ServiceSettings
 from service.state import Service
 from service.web import mount_pages
+from workers.ending import end
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.records.database import open_pool
 from workers.records.migrate import migrate
@@ -131,8 +132,7 @@ async def _running(settings: ServiceSettings) -> AsyncIterator[Service]:
         finally:
             await room.close()
             hub.close()
-            listening.cancel()
-            await asyncio.gather(listening, return_exceptions=True)
+            await end([listening])
 
 
 def _checks(settings: ServiceSettings) -> Gate:

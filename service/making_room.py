@@ -9,6 +9,7 @@ import psycopg
 from psycopg_pool import PoolTimeout
 
 from service.threads import Threads, in_thread
+from workers.ending import end
 from workers.queue.storing import Note, storing
 from workers.records.database import Pool
 from workers.store.errors import StorageError, StorageFull
@@ -67,9 +68,7 @@ class RoomMaker:
 
     async def close(self) -> None:
         """Give up what is under way."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await end(self._tasks)
 
     async def _make_if_short(self) -> None:
         try:

@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from engine.isolated_python import without_python_variables
 from workers.parent import PARENT
@@ -102,3 +102,22 @@ class KeptChild:
         code = await self._process.wait()
         self._process = None
         return code
+
+
+async def kill_late(
+    children: Sequence[KeptChild], kept: Sequence["asyncio.Task[None]"], seconds: float
+) -> None:
+    """Wait for the end of processes that were asked to stop, and kill those that still run after ``seconds``.
+
+    Args:
+        children: the processes; :meth:`KeptChild.stop` was called.
+        kept: what runs :meth:`KeptChild.keep`.
+        seconds: how long they may take.
+    """
+    _, late = await asyncio.wait(kept, timeout=seconds)
+    if late:
+        for child in children:
+            if child.pid is not None:
+                logger.warning("%s does not end and is killed", child.name)
+                child.stop()
+        await asyncio.wait(late)

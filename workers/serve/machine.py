@@ -14,11 +14,12 @@ from engine.errors import OctasplatError, OutputError
 from engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
 from engine.isolated_python import python_command
 from engine.writing import write_json
+from workers.ending import end
 from workers.isolation.abilities import tell_what_lacks
 from workers.isolation.hiding import hide_memory
 from workers.postgres.embedded import LEAST_CONNECTIONS, EmbeddedPostgres
 from workers.records.migrate import migrate
-from workers.serve.children import KeptChild
+from workers.serve.children import KeptChild, kill_late
 from workers.serve.own_token import keep_own_token
 from workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings, worker_connections
 
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 READY_SECONDS = 180.0
 LOOK_SECONDS = 1.0
 SPARE_CONNECTIONS = 40
+AFTER_GRACE_SECONDS = 60.0
+"""Processes that were asked to stop have so much longer than their jobs have for checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -144,11 +147,11 @@ async def _run(
         if work is not None:
             work.cancel()
         stop.set()
-        guard.cancel()
         # Workers first, so that they can hand back their jobs while everything else still runs.
         for child in reversed(children):
             child.stop()
-        await asyncio.gather(*kept, guard, stopped, return_exceptions=True)
+        await kill_late(children, kept, plan.settings.grace_seconds + AFTER_GRACE_SECONDS)
+        await end([guard, stopped])
 
 
 def _program(plan: Plan, module: str, *arguments: str) -> tuple[str, ...]:

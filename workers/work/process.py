@@ -22,6 +22,7 @@ from procrastinate.exceptions import ConnectorException
 import engine
 from engine.files import writable_formats
 from engine.threads import available_threads
+from workers.ending import end
 from workers.isolation.abilities import abilities, tell_what_lacks
 from workers.isolation.hiding import hide_memory
 from workers.parent import die_with_server
@@ -185,9 +186,7 @@ class _Worker:
         try:
             await self._take_jobs(chores)
         finally:
-            for chore in chores:
-                chore.cancel()
-            for outcome in await asyncio.gather(*chores, return_exceptions=True):
+            for outcome in await end(chores):
                 if isinstance(outcome, ChoreFailed):
                     logger.error("worker %s ends, as %s", self._name, outcome)
             await self._sender.close()

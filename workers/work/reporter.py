@@ -15,6 +15,7 @@ import psycopg
 from psycopg_pool import PoolTimeout
 
 from engine.events import Warned
+from workers.ending import end
 from workers.queue.attempts import Attempt, Fenced
 from workers.queue.storing import storing
 from workers.records.quotas import QuotaExceeded
@@ -145,16 +146,14 @@ class Reporter:
         async with self._flushing:  # a flush that is under way would lose what it has taken
             for task in self._tasks:
                 task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await end(self._tasks)
         with contextlib.suppress(*_IGNORED):
             await self._flush()
         await self._keep()
 
     async def close(self) -> None:
         """Stop, leaving what is left."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await end(self._tasks)
 
     def _count(self, event: dict[str, Any]) -> None:
         step, total = int(event["step"]), int(event["total_steps"])

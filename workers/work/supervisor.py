@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 from engine import versions
 from engine.errors import ConfigError, OctasplatError
+from workers.ending import end
 from workers.isolation.confining import MOST_PROCESSES
 from workers.queue.attempts import Attempt, Fenced
 from workers.queue.jobs import artifacts_of
@@ -99,11 +100,9 @@ class Supervisor:
         except DATABASE_ERRORS as error:
             raise LostDatabase(str(error)) from error
         finally:
-            for watch in watches:
-                watch.cancel()
             if self._child is not None:
                 self._child.kill()
-            await asyncio.gather(*watches, return_exceptions=True)
+            await end(watches)
             await self._reporter.close()
             await asyncio.to_thread(self._workspace.close)
             self._around.taken_bytes.pop(self._job.id, None)

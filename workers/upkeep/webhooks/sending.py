@@ -9,6 +9,7 @@ import httpx
 import psycopg
 from psycopg_pool import PoolTimeout
 
+from workers.ending import end
 from workers.records.database import Pool
 from workers.upkeep.webhooks.addresses import AddressRefused, check_url
 from workers.upkeep.webhooks.guarding import GuardedTransport
@@ -68,9 +69,7 @@ class Sender:
 
     async def close(self) -> None:
         """Give up what is under way; it will be sent again."""
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await end(self._tasks)
         await self._client.aclose()
 
     async def _send(self, delivery: Delivery, endpoint: Endpoint) -> None:
