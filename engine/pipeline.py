@@ -3,7 +3,8 @@
 Each stage leaves its result on disk and is skipped when the result is there, so that a run that was stopped
 or killed goes on where it was.
 
-    (features -> matches -> poses ->) load -> train (initialise, fit) -> scene.ply -> evaluate -> export
+    (features -> matches -> poses ->) load (-> check) -> train (initialise, fit) -> scene.ply
+    -> evaluate -> export
 """
 
 import shutil
@@ -39,7 +40,6 @@ from engine.gaussians.materials import reflective_share
 from engine.gaussians.model import FlatGaussians
 from engine.gaussians.scene_facts import SceneFacts
 from engine.plain_colours import PlainScene
-from engine.poses import find_poses
 from engine.render.environment_map import write_background, write_environment
 from engine.render.jobs import trained_pixel_rad
 from engine.run_folder import (
@@ -60,9 +60,8 @@ from engine.run_folder import (
     open_photographs,
     run_scene,
 )
+from engine.run_poses import find_missing_poses, place_misfits
 from engine.scene import Dataset, write_held_out
-from engine.scene.colmap import has_model
-from engine.scene.load import photograph_folder
 from engine.scene.near import NearZones, nearest_depths
 from engine.scene.seen import SeenSpace
 from engine.scene.views_file import ViewsRecord, read_views, write_views
@@ -149,24 +148,17 @@ def reconstruct(
     tell = broadcast([events, listener])
     try:
         try:
-            _find_poses(scene, output, config, threads, tell, should_stop)
-            with stage("load", tell):
-                dataset = open_photographs(
-                    scene,
-                    output,
-                    config,
-                    threads,
-                    tell,
-                    model_folder=found_model(output),
-                    accept=None if recorded is None else accept,
-                )
-                BatchSource(dataset, config.train)  # refuses settings that do not suit the photographs
-                write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
-                if recorded is None:
-                    write_views(output / VIEWS, dataset.record)
-                if run_scene(output) != scene.resolve() or read_config(output / CONFIG) != config:
-                    # The photographs have moved, or other files are wanted.
-                    _write_config(scene, output, config)
+            find_missing_poses(scene, output, config, threads, tell, should_stop)
+            accepted = None if recorded is None else accept
+            dataset = _load(scene, output, config, threads, tell, accepted)
+            if recorded is None:
+                if place_misfits(dataset, output, config, threads, tell, should_stop):
+                    dataset = _load(scene, output, config, threads, tell, accepted)
+                write_views(output / VIEWS, dataset.record)
+            write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])
+            if run_scene(output) != scene.resolve() or read_config(output / CONFIG) != config:
+                # The photographs have moved, or other files are wanted.
+                _write_config(scene, output, config)
         except (DatasetError, ConfigError):
             if is_new:  # so that the corrected command finds the folder free
                 (output / CONFIG).unlink()
@@ -257,22 +249,20 @@ def _write_config(scene: Path, output: Path, config: ReconstructionConfig) -> No
     write_json(output / CONFIG, content)
 
 
-def _find_poses(
+def _load(
     scene: Path,
     output: Path,
     config: ReconstructionConfig,
     threads: int,
     tell: Listener,
-    should_stop: Callable[[], bool],
-) -> None:
-    """Find the poses, if that is asked for and not done yet."""
-    if config.poses == "given" or (config.poses == "missing" and has_model(scene)):
-        return
-    if not scene.is_dir():
-        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
-    find_poses(
-        photograph_folder(scene), output / POSES, threads=threads, listener=tell, should_stop=should_stop
-    )
+    accept: Callable[[ViewsRecord], None] | None,
+) -> Dataset:
+    with stage("load", tell):
+        dataset = open_photographs(
+            scene, output, config, threads, tell, model_folder=found_model(output), accept=accept
+        )
+        BatchSource(dataset, config.train)  # refuses settings that do not suit the photographs
+    return dataset
 
 
 def _train(

@@ -294,6 +294,7 @@ def _evaluate_on(
 
 
 def _placed(output: Path) -> dict[str, object]:
-    """How many photographs have poses, where a run found these by itself."""
+    """How many photographs have poses, or which were placed anew, where a run did that by itself."""
     record = read_record(output / POSES)
-    return {"poses": {name: record[name] for name in ("placed", "photographs")}} if record else {}
+    known = {name: record[name] for name in ("placed", "photographs", "moved") if name in record}
+    return {"poses": known} if known else {}

@@ -1,6 +1,6 @@
 """Poses for photographs that have none: features, matches, mapping by COLMAP, and checks of what came out."""
 
-from engine.poses.config import PosesConfig
-from engine.poses.find import find_poses
+from engine.poses.config import Given, PosesConfig
+from engine.poses.find import find_poses, place_doubtful
 
-__all__ = ["PosesConfig", "find_poses"]
+__all__ = ["Given", "PosesConfig", "find_poses", "place_doubtful"]

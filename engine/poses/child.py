@@ -35,12 +35,18 @@ def main() -> NoReturn:
         write(event.as_dict())
 
     try:
+        from engine.poses.misplaced import place_misplaced
         from engine.poses.search import Search
 
         for number in _CRASHES:
             signal.signal(number, signal.SIG_DFL)
-        search = Search(request.images, request.names, request.work, request.config, request.threads, tell)
-        search.run(request.work / FOUND)
+        if request.given is not None:
+            place_misplaced(request, request.given, tell)
+        else:
+            search = Search(
+                request.images, request.names, request.work, request.config, request.threads, tell
+            )
+            search.run(request.work / FOUND)
         write({"kind": "done"})
     except DatasetError as error:
         write({"kind": "error", "message": str(error)})

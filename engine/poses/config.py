@@ -6,6 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 FEATURES, MATCHES, STAGE = "features", "matches", "poses"
 """The stages of the search."""
+PLACING = "placing"
+"""The last stage where poses are given, and only those in doubt are asked."""
 RECORD = "poses.json"
 """What was found, and for which photographs; beside the model's files."""
 FOUND = "found"
@@ -29,6 +31,10 @@ class PosesConfig(BaseModel):
         min_share: of the photographs that must get a pose.
         max_reprojection_px: mean error above which the result is not trusted.
         min_points: sparse points below which it is not either.
+        first_witnesses: photographs, evenly by name, that one whose pose is in doubt is matched with.
+        witnesses: the same, in all, where its pose does not fit these.
+        agreement_px: distance at which a match agrees with a pose, at the size at which features are looked
+            for.
         seed: of everything random.
     """
 
@@ -45,14 +51,36 @@ class PosesConfig(BaseModel):
     min_share: float = Field(0.5, gt=0, le=1)
     max_reprojection_px: float = Field(2.5, gt=0)
     min_points: int = Field(100, ge=10)
+    first_witnesses: int = Field(24, ge=2)
+    witnesses: int = Field(100, ge=2)
+    agreement_px: float = Field(1.5, gt=0)
     seed: int = Field(0, ge=0)
 
 
 DEFAULT_CONFIG = PosesConfig()
 
 
+class Given(BaseModel):
+    """A model of which some poses may be wrong: see :func:`engine.poses.misplaced.place_misplaced`.
+
+    Attributes:
+        model: folder of the COLMAP model.
+        names: of the request's photographs in it.
+        doubtful: which of them are in doubt.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: Path
+    names: tuple[str, ...]
+    doubtful: tuple[int, ...]
+
+
 class Request(BaseModel):
-    """What the process in which COLMAP works is asked: see :class:`engine.poses.search.Search`."""
+    """What the process in which COLMAP works is asked.
+
+    Without ``given`` see :class:`engine.poses.search.Search`.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -61,3 +89,4 @@ class Request(BaseModel):
     work: Path
     config: PosesConfig
     threads: int
+    given: Given | None = None

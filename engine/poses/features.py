@@ -32,6 +32,23 @@ _LESS_CLEAR_RATIO = 0.9
 """A match may be so near in distance to the second best one; otherwise 0.8."""
 
 
+def make_database(database: Path, photographs: Path, names: Sequence[str], *, one_camera: bool) -> None:
+    """Make a database of photographs, without features.
+
+    Args:
+        database: does not exist yet.
+        photographs: folder.
+        names: of the photographs in it; the first gets the number 1 in the database.
+        one_camera: all photographs were taken with one lens.
+    """
+    pycolmap.Database.open(database).close()  # COLMAP wants it to exist
+    pycolmap.import_images(database, photographs, _mode(one_camera), list(names))
+
+
+def _mode(one_camera: bool) -> "pycolmap.CameraMode":
+    return pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
+
+
 def find_features(
     database: Path,
     photographs: Path,
@@ -42,21 +59,18 @@ def find_features(
     one_camera: bool,
     threads: int,
     counted: Counted,
-) -> list[int]:
-    """Make the database and fill it with the features of every photograph.
+) -> None:
+    """Fill a database with the features of photographs.
 
     Args:
-        database: does not exist yet.
+        database: see :func:`make_database`.
         photographs: folder.
-        names: of the photographs in it; the first gets the number 1 in the database.
+        names: of those of its photographs that are to be looked at.
         config: settings.
         thorough: twice as many features, and fainter ones.
-        one_camera: all photographs were taken with one lens.
+        one_camera: as the database was made.
         threads: to use; -1 means all cores.
         counted: hears of photographs.
-
-    Returns:
-        Number of features by photograph.
     """
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
@@ -65,22 +79,23 @@ def find_features(
     options.sift.max_num_features = config.max_features * (2 if thorough else 1)
     if thorough:
         options.sift.peak_threshold /= 3
-    mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.AUTO
-    pycolmap.Database.open(database).close()  # COLMAP wants it to exist
-    pycolmap.import_images(database, photographs, mode, list(names))
     for start in range(0, len(names), _PHOTOGRAPHS_AT_ONCE):
         some = list(names[start : start + _PHOTOGRAPHS_AT_ONCE])
         pycolmap.extract_features(
             database,
             photographs,
             image_names=some,
-            camera_mode=mode,
+            camera_mode=_mode(one_camera),
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
         counted(start + len(some))
+
+
+def feature_counts(database: Path, photographs: int) -> list[int]:
+    """Number of features of each photograph of a database, in the order of their numbers."""
     with pycolmap.Database.open(database) as found:
-        return [found.num_keypoints_for_image(number + 1) for number in range(len(names))]
+        return [found.num_keypoints_for_image(number + 1) for number in range(photographs)]
 
 
 def match_pairs(

@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -16,7 +16,7 @@ from typing import IO, Any
 from engine.errors import Cancelled, DatasetError, PosesCrashed
 from engine.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
 from engine.isolated_python import python_command
-from engine.poses.config import DEFAULT_CONFIG, FOUND, RECORD, PosesConfig, Request
+from engine.poses.config import DEFAULT_CONFIG, FOUND, RECORD, Given, PosesConfig, Request
 from engine.poses.photographs import photographs_in, photographs_sha256
 from engine.writing import write_json
 
@@ -66,10 +66,7 @@ def find_poses(
                 f"the results, or remove {output} to find them anew."
             )
         return
-    work = output.with_name(f".{output.name}.work")
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    try:
+    with _work_folder(output) as work:
         request = Request(
             images=images.resolve(), names=tuple(names), work=work.resolve(), config=config, threads=threads
         )
@@ -77,6 +74,67 @@ def find_poses(
         record = read_record(work / FOUND)
         write_json(work / FOUND / RECORD, {**record, "photographs_sha256": sha256})
         (work / FOUND).rename(output)
+
+
+def place_doubtful(
+    images: Path,
+    files: Sequence[str],
+    given: Given,
+    output: Path,
+    *,
+    config: PosesConfig = DEFAULT_CONFIG,
+    threads: int = 0,
+    listener: Listener = ignore,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[str, ...]:
+    """Move photographs of a model that do not stand where their matches with the others say.
+
+    The stages are ``features``, ``matches``, whose steps are pairs of a photograph in doubt with another one,
+    and ``placing``, whose steps are the photographs in doubt. All other poses stay as they are.
+
+    Args:
+        images: folder of the photographs.
+        files: the photographs, below it.
+        given: the model, their names in it, and which of them are in doubt.
+        output: becomes the folder of the changed model, with ``poses.json`` beside its files; nothing is
+            written where no photograph is moved.
+        config: settings.
+        threads: to use; 0 means all cores.
+        listener: hears the progress.
+        should_stop: asked now and then; True gives up.
+
+    Returns:
+        Names of the photographs that were moved.
+
+    Raises:
+        DatasetError: COLMAP refuses to work with the photographs or the model.
+        PosesCrashed: COLMAP died.
+        Cancelled: stopped as asked.
+    """
+    with _work_folder(output) as work:
+        request = Request(
+            images=images.resolve(),
+            names=tuple(files),
+            work=work.resolve(),
+            config=config,
+            threads=threads,
+            given=given.model_copy(update={"model": given.model.resolve()}),
+        )
+        _Waiting(request, listener, should_stop).wait()
+        moved = tuple(read_record(work / FOUND)["moved"])
+        if moved:
+            (work / FOUND).rename(output)
+    return moved
+
+
+@contextmanager
+def _work_folder(output: Path) -> Iterator[Path]:
+    """An empty hidden folder beside the one for the result, until the block ends."""
+    work = output.with_name(f".{output.name}.work")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    try:
+        yield work
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -181,7 +239,8 @@ def _process(request: Request, noise: IO[bytes]) -> Iterator["subprocess.Popen[b
 
 
 def _how_it_died(code: int, stage: str, log: Path) -> str:
-    doing = {"features": "looking for features", "matches": "matching", "poses": "placing photographs"}
+    placing = "placing photographs" if stage else "starting"
+    doing = {"features": "looking for features", "matches": "matching"}.get(stage, placing)
     how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     said = next((line.strip()[:300] for line in reversed(text.splitlines()) if line.strip()), "")
@@ -191,6 +250,6 @@ def _how_it_died(code: int, stage: str, log: Path) -> str:
         else "run the same command again"
     )
     return (
-        f"COLMAP {how} while {doing.get(stage, 'starting')}{f' (it said: {said})' if said else ''}; "
+        f"COLMAP {how} while {doing}{f' (it said: {said})' if said else ''}; "
         f"{advice}, or send a COLMAP model."
     )

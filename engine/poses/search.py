@@ -1,21 +1,20 @@
 """The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
 
 import shutil
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
 from engine.errors import DatasetError
-from engine.events import Listener, StageFinished, StageProgress, StageStarted, Warned
+from engine.events import Listener, Warned
 from engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, RECORD, STAGE, PosesConfig
-from engine.poses.features import find_features, match_pairs, quick_pairs
+from engine.poses.features import feature_counts, find_features, make_database, match_pairs, quick_pairs
 from engine.poses.folds import false_pairs, pair_votes, without_pairs
 from engine.poses.mapping import map_photographs, rank
 from engine.poses.pairs import Pair, all_pairs, pairs_with
+from engine.poses.workshop import counted_stage, linked_photographs
 from engine.scene.images import read_image_info
 from engine.writing import write_json
 
@@ -52,12 +51,8 @@ class Search:
         self._config = config
         self._threads = threads or -1
         self._tell = tell
-        # COLMAP lists pairs by names with a space between, and its numbers follow the order of names.
         self._photographs = work / "photographs"
-        self._aliases = tuple(f"{k:06d}{Path(name).suffix.lower()}" for k, name in enumerate(names))
-        self._photographs.mkdir()
-        for alias, name in zip(self._aliases, self._names, strict=True):
-            (self._photographs / alias).symlink_to((images / name).resolve())
+        self._aliases = linked_photographs(images, self._names, self._photographs)
         self._one_camera = self._look_at_sizes()
         pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
 
@@ -105,7 +100,7 @@ class Search:
         self._find_features(database, thorough)
         matched = self._match(database, thorough)
         count = len(self._names)
-        with self._stage(STAGE, count) as at:
+        with counted_stage(STAGE, count, self._tell) as at:
             best = self._unfolded(
                 database, map_photographs(database, self._photographs, self._config, counted=at), at
             )
@@ -115,8 +110,9 @@ class Search:
         return best
 
     def _find_features(self, database: Path, thorough: bool) -> None:
-        with self._stage(FEATURES, len(self._names)) as at:
-            counts = find_features(
+        with counted_stage(FEATURES, len(self._names), self._tell) as at:
+            make_database(database, self._photographs, self._aliases, one_camera=self._one_camera)
+            find_features(
                 database,
                 self._photographs,
                 self._aliases,
@@ -126,6 +122,7 @@ class Search:
                 threads=self._threads,
                 counted=at,
             )
+        counts = feature_counts(database, len(self._names))
         poor = [name for name, found in zip(self._names, counts, strict=True) if found < _POOR_FEATURES]
         if poor:
             self._tell(
@@ -134,7 +131,7 @@ class Search:
 
     def _match(self, database: Path, thorough: bool) -> list[Pair]:
         pairs = everything = all_pairs(len(self._names))
-        with self._stage(MATCHES, len(everything)) as at:
+        with counted_stage(MATCHES, len(everything), self._tell) as at:
             if len(self._names) > self._config.exhaustive_up_to:
                 pairs = quick_pairs(database, self._aliases, self._config, threads=self._threads, counted=at)
             unlike = len(everything) - len(pairs)
@@ -210,13 +207,6 @@ class Search:
                 )
             )
         return len({(info.width_px, info.height_px) for info in infos}) == 1
-
-    @contextmanager
-    def _stage(self, name: str, steps: int) -> Iterator[Callable[[int], None]]:
-        began = time.monotonic()
-        self._tell(StageStarted(name, steps))
-        yield lambda done: self._tell(StageProgress(name, done, steps))
-        self._tell(StageFinished(name, time.monotonic() - began))
 
     def _check(self, best: Any) -> None:
         """Refuse a result that would only waste the training."""

@@ -180,6 +180,11 @@ class TrainConfig(_Frozen):
     leave_out_misfits: bool = Field(
         False, description="train without the views that do not fit the others, as it becomes clear which"
     )
+    place_misfits: bool = Field(
+        True,
+        description="look for photographs of a given model that stand in the wrong place, and place them "
+        "anew before the training; not before one of less than 1,000 iterations",
+    )
     misfits_after: float = Field(
         0.3, ge=0, le=1, description="share of the iterations after which checkpoints look for them"
     )
@@ -338,7 +343,7 @@ def preset(name: str) -> TrainConfig:
         ConfigError: there is no such preset.
     """
     if name == "fast":
-        return TrainConfig(iterations=1400, max_gaussians_auto=40_000)
+        return TrainConfig(iterations=1400, max_gaussians_auto=40_000, place_misfits=False)
     if name == "standard":
         return TrainConfig()
     if name == "high":

@@ -68,7 +68,10 @@ def view_fits(
 
 
 def misfits(
-    fits: ViewFits, views: Sequence[View], train_indices: Int64[np.ndarray, " t"]
+    fits: ViewFits,
+    views: Sequence[View],
+    train_indices: Int64[np.ndarray, " t"],
+    sigmas: float = FAR_BELOW_SIGMAS,
 ) -> Int64[np.ndarray, " m"]:
     """The views that are rendered far worse than the training views around them, worst first.
 
@@ -80,6 +83,7 @@ def misfits(
         fits: of views, training views among them.
         views: all views of the dataset.
         train_indices: views that are trained on.
+        sigmas: how many robust standard deviations are far.
     """
     known = np.isfinite(fits.psnr_colour_corrected)
     indices, psnr = fits.indices[known], fits.psnr_colour_corrected[known]
@@ -95,7 +99,7 @@ def misfits(
         below = usual - above
         if not trained.all():
             below[~trained] -= max(0.0, float(np.median(below[~trained])))
-        low = below > max(FAR_BELOW_DB, FAR_BELOW_SIGMAS * sigma)
+        low = below > max(FAR_BELOW_DB, sigmas * sigma)
     worst_first = np.argsort(-below, kind="stable")
     return indices[worst_first[low[worst_first]]]
 
@@ -157,8 +161,8 @@ class TrainingViews:
         its = "its pose" if len(loose) == 1 else "their poses"
         return (
             f"{which} not fit the others; {its} may be wrong, or the picture blurred: {', '.join(loose)}. "
-            "Poses that were given may come right where all are found anew (--poses auto); the setting "
-            "leave_out_misfits trains without such photographs."
+            "Given poses that are wrong come right with the setting place_misfits, or where all are found "
+            "anew (--poses auto); leave_out_misfits trains without such photographs."
         )
 
 

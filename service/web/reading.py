@@ -189,15 +189,26 @@ def _picture(job: Job, render: Artifact | None) -> str | None:
 
 def _stage_lines(job: JobView, spent: dict[str, Any]) -> list[StageLine]:
     over = job.state == "succeeded"
-    place = job.stages.index(job.stage) if job.stage in job.stages else -1
+    names = _with_further(job.stages, [*spent, *([job.stage] if job.stage else [])])
+    place = names.index(job.stage) if job.stage in names else -1
     lines = []
-    for k, name in enumerate(job.stages):
-        state = "done" if over or k < place else "now" if k == place else "later"
+    for k, name in enumerate(names):
+        past = over or k < place or (k != place and name in spent)
+        state = "done" if past else "now" if k == place else "later"
         if state == "now" and job.state not in ACTIVE:
             state = "stopped"
         seconds = spent.get(name)
         lines.append(StageLine(name, state, seconds if isinstance(seconds, int | float) else None))
     return lines
+
+
+def _with_further(expected: Sequence[str], seen: Sequence[str]) -> list[str]:
+    """Stages as they were expected, with those that came up besides where they did."""
+    names = list(expected)
+    for before, name in zip((None, *seen), seen, strict=False):
+        if name not in names:
+            names.insert(names.index(before) + 1 if before is not None else 0, name)
+    return names
 
 
 async def _dataset_names(connection: Connection, jobs: Sequence[Job]) -> dict[uuid.UUID, str]:

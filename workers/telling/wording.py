@@ -84,9 +84,11 @@ def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
     """What a finished run in ``output`` reached and where its files are."""
     metrics: dict[str, Any] = json.loads((output / "metrics.json").read_text(encoding="utf-8"))
     files = [("Report", "report.html"), ("Scene", "scene.ply"), *(("Mesh", name) for name in exports)]
-    found = metrics.get("poses")
+    poses = metrics.get("poses", {})
+    placed, moved = poses.get("placed"), len(poses.get("moved", ()))
     return [
-        *([f"Poses found for {found['placed']} of {found['photographs']} photographs"] if found else []),
+        *([f"Poses found for {placed} of {poses['photographs']} photographs"] if placed else []),
+        *([f"Placed {moved} photograph{'s' if moved > 1 else ''} anew"] if moved else []),
         mean_metrics(metrics),
         *_training_views(metrics.get("training_views") or {}),
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "

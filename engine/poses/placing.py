@@ -1,0 +1,237 @@
+"""Photographs whose given pose may be wrong, placed anew among all others; runs in COLMAP's process.
+
+Nothing but the poses of the others is taken for granted. The features of a doubtful photograph are matched
+with theirs; as these stand at known places, six matches with several of them fix the whole pose, distances
+included, as between two rigs of cameras (Stewénius, Nistér, Oskarsson and Åström, "Solutions to Minimal
+Generalized Relative Pose Problems", 2005). It is found by RANSAC and refined on the Sampson distances of all
+matches that agree, and takes the place of the given one only if far more matches agree with it: a photograph
+that is blurred, or shows a thing that has moved, stays where it is.
+
+Not done: matches among the others, so that photographs in doubt that overlap with each other alone stay.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float64, Int64
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from engine.poses.config import PosesConfig
+
+Pose = tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]
+"""Rotation and translation, camera from world."""
+
+FEWEST_PARTNERS = 3
+"""Other photographs that must agree on where one was taken ..."""
+FEWEST_MATCHES = 50
+"""... and matches with them in all, see :class:`Matches`."""
+GIVEN_SHARE = 0.5
+"""The given pose stays where it explains so many of the matches that the new one explains."""
+_REFINEMENTS = 2
+_FREEDOM = 6  # numbers of a pose
+_MOST_TRIALS = 5000
+"""Enough where a third of the matches are true; without an end, none that are would take minutes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Matches of one photograph with others whose poses are known.
+
+    Attributes:
+        rays_cam: of the features in the photograph, at a depth of 1.
+        partner_rays_cam: of those in the other ones.
+        partner: index of the other one.
+        rotations_cam_from_world: of the others.
+        translations_cam_from_world: of the others.
+    """
+
+    rays_cam: Float64[np.ndarray, "m 3"]
+    partner_rays_cam: Float64[np.ndarray, "m 3"]
+    partner: Int64[np.ndarray, " m"]
+    rotations_cam_from_world: Float64[np.ndarray, "p 3 3"]
+    translations_cam_from_world: Float64[np.ndarray, "p 3"]
+
+    def select(self, chosen: Bool[np.ndarray, " m"]) -> "Matches":
+        """Some of them."""
+        return Matches(
+            self.rays_cam[chosen],
+            self.partner_rays_cam[chosen],
+            self.partner[chosen],
+            self.rotations_cam_from_world,
+            self.translations_cam_from_world,
+        )
+
+
+def sampson_distances(
+    rotation_cam_from_world: Float64[np.ndarray, "3 3"],
+    translation_cam_from_world: Float64[np.ndarray, " 3"],
+    matches: Matches,
+) -> Float64[np.ndarray, " m"]:
+    """How far each match is from agreeing with a pose, in units of the focal length, with a sign.
+
+    To first order the distance that both features together must be moved (Hartley and Zisserman, "Multiple
+    View Geometry", section 11.4.3).
+    """
+    turned = np.einsum("ij,pkj->pik", rotation_cam_from_world, matches.rotations_cam_from_world)
+    moved = translation_cam_from_world - np.einsum("pij,pj->pi", turned, matches.translations_cam_from_world)
+    rotation, translation = turned[matches.partner], moved[matches.partner]
+    lines = np.cross(translation, np.einsum("mij,mj->mi", rotation, matches.partner_rays_cam))
+    partner_lines = np.einsum("mji,mj->mi", rotation, np.cross(matches.rays_cam, translation))
+    slopes = np.concatenate([lines[:, :2], partner_lines[:, :2]], axis=1)
+    distances: Float64[np.ndarray, " m"] = np.sum(matches.rays_cam * lines, axis=1) / np.maximum(
+        np.linalg.norm(slopes, axis=1), 1e-12
+    )
+    return distances
+
+
+def refined(
+    rotation_cam_from_world: Float64[np.ndarray, "3 3"],
+    translation_cam_from_world: Float64[np.ndarray, " 3"],
+    matches: Matches,
+    within: float,
+) -> Pose:
+    """The pose nearby with which the matches that agree with the given one to ``within`` agree best."""
+    for _ in range(_REFINEMENTS):
+        rotation, translation = rotation_cam_from_world, translation_cam_from_world
+        close = matches.select(agreeing((rotation, translation), matches, within))
+        if len(close.partner) < _FREEDOM:
+            break
+        size = float(np.median(np.linalg.norm(translation - close.translations_cam_from_world, axis=1)))
+
+        def posed(
+            step: Float64[np.ndarray, " 6"],
+            rotation: Float64[np.ndarray, "3 3"] = rotation,
+            translation: Float64[np.ndarray, " 3"] = translation,
+            size: float = max(size, 1e-12),
+        ) -> Pose:
+            return Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, translation + size * step[3:]
+
+        found = least_squares(
+            lambda step, posed=posed, close=close: _weighed(posed(step), close, within),  # type: ignore[misc]
+            np.zeros(6),
+            loss="soft_l1",
+            f_scale=0.25,
+        )
+        rotation_cam_from_world, translation_cam_from_world = posed(found.x)
+    return rotation_cam_from_world, translation_cam_from_world
+
+
+def _weighed(pose: Pose, matches: Matches, within: float) -> Float64[np.ndarray, " m"]:
+    weighed: Float64[np.ndarray, " m"] = sampson_distances(*pose, matches) / within
+    return weighed
+
+
+def matches_of(
+    number: int, model: Any, images: dict[int, Any], database: Path, sizes_px: Sequence[tuple[int, int]]
+) -> Matches | None:
+    """What a photograph has in common with others.
+
+    Args:
+        number: of the photograph in the database.
+        model: with everybody's camera.
+        images: of the model, by their numbers in the database; those whose poses are known, and this one.
+        database: with features and matches.
+        sizes_px: width and height of each photograph on disk; the cameras may be those of other sizes.
+
+    Returns:
+        The matches; None if there are none.
+    """
+    rays, partner_rays, partner = [], [], []
+    partners: list[int] = []
+    with pycolmap.Database.open(database) as source:
+
+        def rays_of(which: int, rows: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 3"]:
+            camera = model.cameras[images[which].camera_id]
+            width_px, height_px = sizes_px[which - 1]
+            scale = (camera.width / width_px, camera.height / height_px)
+            flat = camera.cam_from_img(source.read_keypoints(which)[rows, :2].astype(np.float64) * scale)
+            return np.concatenate([flat, np.ones((len(rows), 1))], axis=1)
+
+        for other in sorted(images):
+            if other == number or not source.exists_two_view_geometry(number, other):
+                continue
+            found = source.read_two_view_geometry(number, other).inlier_matches
+            pairs = np.asarray(found, dtype=np.int64).reshape(-1, 2)
+            if len(pairs) == 0:
+                continue
+            ours, theirs = rays_of(number, pairs[:, 0]), rays_of(other, pairs[:, 1])
+            known = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
+            rays.append(ours[known])
+            partner_rays.append(theirs[known])
+            partner.append(np.full(int(known.sum()), len(partners), dtype=np.int64))
+            partners.append(other)
+    if not partners:
+        return None
+    poses = [images[other].cam_from_world() for other in partners]
+    return Matches(
+        np.concatenate(rays),
+        np.concatenate(partner_rays),
+        np.concatenate(partner),
+        np.stack([pose.rotation.matrix() for pose in poses]),
+        np.stack([pose.translation for pose in poses]),
+    )
+
+
+def agreeing(pose: Pose, matches: Matches, within: float) -> Bool[np.ndarray, " m"]:
+    """Which matches agree with a pose."""
+    agrees: Bool[np.ndarray, " m"] = np.abs(sampson_distances(*pose, matches)) < within
+    return agrees
+
+
+def fits(pose: Pose, matches: Matches, within: float) -> bool:
+    """Whether a pose explains most of the matches, of which there are enough to say so."""
+    agrees = agreeing(pose, matches, within)
+    return len(agrees) >= FEWEST_MATCHES and float(agrees.mean()) > GIVEN_SHARE
+
+
+def placed_anew(matches: Matches, given: Pose, within: float, config: PosesConfig) -> Pose | None:
+    """Where the matches say that the photograph was taken, if they contradict the given pose.
+
+    Args:
+        matches: of the photograph.
+        given: the pose that they may contradict.
+        within: distance at which a match agrees with a pose, see :func:`sampson_distances`.
+        config: settings.
+
+    Returns:
+        The new pose; None where the given one stays.
+    """
+    if len(matches.partner) < FEWEST_MATCHES:
+        return None
+    count = len(matches.rotations_cam_from_world)
+    # One rig holds the others as they stand in the world, the other one the photograph; both lists are one.
+    ideal = pycolmap.Camera(model="SIMPLE_PINHOLE", width=2, height=2, params=[1.0, 0.0, 0.0])
+    known = [
+        pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+        for rotation, translation in zip(
+            matches.rotations_cam_from_world, matches.translations_cam_from_world, strict=True
+        )
+    ]
+    options = pycolmap.RANSACOptions()
+    options.max_error = within
+    options.random_seed = config.seed
+    options.max_num_trials = _MOST_TRIALS
+    found = pycolmap.estimate_generalized_relative_pose(
+        matches.partner_rays_cam[:, :2],
+        matches.rays_cam[:, :2],
+        matches.partner.tolist(),
+        [count] * len(matches.partner),
+        [*known, pycolmap.Rigid3d()],
+        [ideal] * (count + 1),
+        options,
+    )
+    if found is None:
+        return None
+    pose = found["rig2_from_rig1"]
+    new = refined(pose.rotation.matrix(), np.asarray(pose.translation), matches, within)
+    agrees = agreeing(new, matches, within)
+    agreed = int(agreeing(given, matches, within).sum())
+    partners = len(np.unique(matches.partner[agrees]))
+    if agrees.sum() < FEWEST_MATCHES or partners < FEWEST_PARTNERS or agreed > GIVEN_SHARE * agrees.sum():
+        return None
+    return new

@@ -1,0 +1,29 @@
+"""What a search for poses works with: photographs under other names, and stages that are told of."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from engine.events import Listener, StageFinished, StageProgress, StageStarted
+
+
+def linked_photographs(images: Path, names: Sequence[str], folder: Path) -> tuple[str, ...]:
+    """Make a folder of links to photographs whose names COLMAP can list and number; returns these names.
+
+    COLMAP lists pairs by names with a space between, and its numbers follow the order of names.
+    """
+    aliases = tuple(f"{k:06d}{Path(name).suffix.lower()}" for k, name in enumerate(names))
+    folder.mkdir()
+    for alias, name in zip(aliases, names, strict=True):
+        (folder / alias).symlink_to((images / name).resolve())
+    return aliases
+
+
+@contextmanager
+def counted_stage(name: str, steps: int, tell: Listener) -> Iterator[Callable[[int], None]]:
+    """A stage that is announced; yields what is to be told how many of its steps are done."""
+    began = time.monotonic()
+    tell(StageStarted(name, steps))
+    yield lambda done: tell(StageProgress(name, done, steps))
+    tell(StageFinished(name, time.monotonic() - began))

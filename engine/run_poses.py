@@ -1,0 +1,100 @@
+"""Poses of a run: found where there are none, and checked where they are given."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from engine.config import ReconstructionConfig
+from engine.errors import DatasetError, PosesCrashed
+from engine.events import Listener, StageProgress, Warned
+from engine.poses import Given, find_poses, place_doubtful
+from engine.run_folder import POSES, found_model
+from engine.scene import Dataset
+from engine.scene.colmap import find_model_folder, has_model
+from engine.scene.load import photograph_folder
+from engine.stages import stage
+from engine.train.config import iteration_count
+from engine.train.doubts import ITERATIONS as CHECK_ITERATIONS
+from engine.train.doubts import doubtful_views
+
+CHECKED_FROM, CHECKED_FROM_MINUTES = 1000, 10.0
+"""Given poses are checked before a training of so many iterations, or of so many minutes."""
+
+
+def find_missing_poses(
+    scene: Path,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Find the poses of a run's photographs, if that is asked for and not done yet.
+
+    Raises:
+        DatasetError: there are no photographs, or their poses cannot be found.
+        PosesCrashed: COLMAP died.
+        Cancelled: stopped as asked.
+    """
+    if config.poses == "given" or (config.poses == "missing" and has_model(scene)):
+        return
+    if not scene.is_dir():
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    find_poses(
+        photograph_folder(scene), output / POSES, threads=threads, listener=tell, should_stop=should_stop
+    )
+
+
+def place_misfits(
+    dataset: Dataset,
+    output: Path,
+    config: ReconstructionConfig,
+    threads: int,
+    tell: Listener,
+    should_stop: Callable[[], bool],
+) -> bool:
+    """Place photographs of a given model anew that stand in the wrong place; whether there are any.
+
+    Photographs that a short training shows to be in doubt (stage ``check``) are matched with the others;
+    those that are moved have their poses from the model in the run's ``poses/`` from then on.
+
+    Raises:
+        Cancelled: stopped as asked.
+    """
+    iterations = iteration_count(config.train, dataset.train_pixel_count)
+    is_long = iterations >= CHECKED_FROM if config.minutes is None else config.minutes >= CHECKED_FROM_MINUTES
+    if not (config.train.place_misfits and is_long) or found_model(output) is not None:
+        return False
+    with stage("check", tell, CHECK_ITERATIONS):
+        doubtful = doubtful_views(
+            dataset,
+            config.train,
+            threads=threads,
+            should_stop=should_stop,
+            progress=lambda done: tell(StageProgress("check", done, CHECK_ITERATIONS)),
+        )
+    if len(doubtful) == 0:
+        return False
+    images = photograph_folder(dataset.root)
+    given = Given(
+        model=find_model_folder(dataset.root),
+        names=tuple(view.name for view in dataset.views),
+        doubtful=tuple(doubtful.tolist()),
+    )
+    files = [view.image_path.relative_to(images).as_posix() for view in dataset.views]
+    names = [dataset.views[k].name for k in doubtful.tolist()]
+    try:
+        moved = place_doubtful(
+            images, files, given, output / POSES, threads=threads, listener=tell, should_stop=should_stop
+        )
+    except (DatasetError, PosesCrashed) as error:
+        tell(Warned(f"The poses of {', '.join(names)} are in doubt, and stay as they are: {error}"))
+        return False
+    if moved:
+        which = "This photograph" if len(moved) == 1 else f"These {len(moved)} photographs"
+        tell(
+            Warned(
+                f"{which} did not stand where matches with the others say: {', '.join(moved)}. The training "
+                "takes the poses that follow from the matches; place_misfits=false leaves given poses alone."
+            )
+        )
+    return bool(moved)

@@ -1,0 +1,129 @@
+"""Photographs that stand in the wrong place of a given model are found and moved, and no others."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from engine.config import resolve_config
+from engine.errors import Cancelled, DatasetError
+from engine.events import Event, StageFinished, StageStarted, Warned
+from engine.pipeline import reconstruct
+from engine.poses import Given, PosesConfig, place_doubtful
+from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+
+pytestmark = pytest.mark.heavy
+
+SWAPPED = ("view_003.png", "view_010.png")
+INNOCENT = "view_006.png"
+VIEWS = 24
+SETTINGS = ("iterations=1000", "rays=512", "max_gaussians=500", "probe_rays=256", "place_misfits=true")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A generated scene in which two photographs have each other's poses."""
+    root = tmp_path_factory.mktemp("swapped") / "scene"
+    write_generated_scene(
+        root, GeneratedSceneConfig(views=VIEWS, width_px=480, height_px=360, samples_per_side=1, points=1500)
+    )
+    one, other = (root / "images" / name for name in SWAPPED)
+    first = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(first)
+    return root
+
+
+def poses(model: Path) -> dict[str, np.ndarray]:
+    images = pycolmap.Reconstruction(str(model)).images.values()
+    return {image.name: image.cam_from_world().matrix() for image in images}
+
+
+def assert_swapped(before: dict[str, np.ndarray], after: dict[str, np.ndarray]) -> None:
+    """The two stand where the other one was said to be, and everybody else where they were."""
+    for name, other in (SWAPPED, SWAPPED[::-1]):
+        away = np.linalg.norm(before[name][:, 3] - before[other][:, 3])
+        np.testing.assert_allclose(after[name][:, :3], before[other][:, :3], atol=0.01)
+        assert np.linalg.norm(after[name][:, 3] - before[other][:, 3]) < 0.02 * away
+    for name in before.keys() - set(SWAPPED):
+        np.testing.assert_allclose(after[name], before[name], atol=1e-12)
+
+
+def test_those_that_matches_contradict_are_moved(scene: Path, tmp_path: Path) -> None:
+    model = scene / "sparse" / "0"
+    before = poses(model)
+    names = tuple(sorted(before))
+    doubtful = tuple(names.index(name) for name in (*SWAPPED, INNOCENT))
+    given = Given(model=model, names=names, doubtful=doubtful)
+    events: list[Event] = []
+    found = tmp_path / "found"
+    moved = place_doubtful(scene / "images", names, given, found, threads=2, listener=events.append)
+    assert moved == SWAPPED
+    assert_swapped(before, poses(found))
+    begun = [(event.stage, event.total_steps) for event in events if isinstance(event, StageStarted)]
+    assert begun == [("features", VIEWS), ("matches", 3 * (VIEWS - 3)), ("placing", 2)]
+    observed = pycolmap.Reconstruction(str(found))
+    for image in observed.images.values():
+        if image.name in SWAPPED:
+            assert image.num_points3D == 0
+    again = tmp_path / "again"
+    place_doubtful(scene / "images", names, given, again, threads=1)
+    for path in found.iterdir():
+        assert (again / path.name).read_bytes() == path.read_bytes()
+
+
+def test_nothing_is_written_where_all_stand_right(scene: Path, tmp_path: Path) -> None:
+    model = scene / "sparse" / "0"
+    names = tuple(sorted(poses(model)))
+    given = Given(model=model, names=names, doubtful=(names.index(INNOCENT),))
+    config = PosesConfig(first_witnesses=8)
+    assert place_doubtful(scene / "images", names, given, tmp_path / "none", config=config) == ()
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_model_that_colmap_cannot_read_is_told(scene: Path, tmp_path: Path) -> None:
+    given = Given(model=tmp_path / "gone", names=("view_000.png", "view_001.png"), doubtful=(0,))
+    with pytest.raises(DatasetError, match="COLMAP cannot find poses"):
+        place_doubtful(scene / "images", given.names, given, tmp_path / "none")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_run_finds_them_by_itself(scene: Path, tmp_path: Path) -> None:
+    config = resolve_config("fast", settings={"exports": ()}, assignments=SETTINGS)
+    events: list[Event] = []
+    output = tmp_path / "run"
+    with pytest.raises(Cancelled, match="while looking for photographs in the wrong place"):
+        reconstruct(
+            scene, output, config, threads=2, listener=events.append,
+            should_stop=lambda: any(isinstance(e, StageStarted) and e.stage == "check" for e in events),
+        )  # fmt: skip
+    events.clear()
+    reconstruct(scene, output, config, resume=True, threads=2, listener=events.append)
+    stages = [event.stage for event in events if isinstance(event, StageFinished)]
+    assert stages[:5] == ["load", "check", "features", "matches", "placing"]
+    assert stages[5:] == ["load", "train", "evaluate", "export"]
+    told = [event.message for event in events if isinstance(event, Warned)]
+    assert any("did not stand where" in text and all(name in text for name in SWAPPED) for text in told)
+    assert_swapped(poses(scene / "sparse" / "0"), poses(output / "poses"))
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["poses"] == {"moved": list(SWAPPED)}
+    assert not set(metrics["training_views"]["misfits"]) & set(SWAPPED)
+
+    # Where the poses are there already, nothing is asked again.
+    for name in ("scene.ply", "metrics.json"):
+        (output / name).unlink()
+    shutil.rmtree(output / "checkpoints")
+    events.clear()
+    reconstruct(scene, output, config, resume=True, threads=2, listener=events.append)
+    stages = [event.stage for event in events if isinstance(event, StageFinished)]
+    assert stages == ["load", "train", "evaluate", "export"]
+    as_given = resolve_config(
+        "fast", settings={"exports": ()}, assignments=[*SETTINGS, "place_misfits=false"]
+    )
+    events.clear()
+    reconstruct(scene, tmp_path / "given", as_given, threads=2, listener=events.append)
+    assert not any(isinstance(event, StageStarted) and event.stage == "check" for event in events)
+    assert not (tmp_path / "given" / "poses").exists()
