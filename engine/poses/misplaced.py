@@ -10,7 +10,7 @@ from engine.events import Listener
 from engine.poses.config import FEATURES, FOUND, MATCHES, PLACING, RECORD, Given, Request
 from engine.poses.features import find_features, make_database, match_pairs
 from engine.poses.placing import Matches, Pose, fits, matches_of, placed_anew
-from engine.poses.workshop import counted_stage, linked_photographs
+from engine.poses.workshop import linked_photographs, stage_of
 from engine.scene.images import read_image_info
 from engine.writing import write_json
 
@@ -36,7 +36,7 @@ def place_misplaced(request: Request, given: Given, tell: Listener) -> None:
     if left and more:
         hearing.ask(left, more)
     moved: dict[int, Pose] = {}
-    with counted_stage(PLACING, len(left), tell) as at:
+    with stage_of(PLACING, len(left), tell) as at:
         for done, k in enumerate(left):
             if (new := hearing.new_pose(k)) is not None:
                 moved[k] = new
@@ -75,7 +75,7 @@ class _Hearing:
     def ask(self, doubtful: Sequence[int], witnesses: Sequence[int]) -> None:
         """Match photographs in doubt with others."""
         new = sorted({*doubtful, *witnesses} - self._seen)
-        with counted_stage(FEATURES, len(new), self._tell) as at:
+        with stage_of(FEATURES, len(new), self._tell) as at:
             find_features(
                 self._database,
                 self._photographs,
@@ -88,7 +88,7 @@ class _Hearing:
             )
         self._seen.update(new)
         pairs = sorted((min(a, b), max(a, b)) for a in doubtful for b in witnesses)
-        with counted_stage(MATCHES, len(pairs), self._tell) as at:
+        with stage_of(MATCHES, len(pairs), self._tell) as at:
             match_pairs(
                 self._database,
                 self._aliases,

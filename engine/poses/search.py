@@ -14,7 +14,7 @@ from engine.poses.features import feature_counts, find_features, make_database, 
 from engine.poses.folds import false_pairs, pair_votes, without_pairs
 from engine.poses.mapping import map_photographs, rank
 from engine.poses.pairs import Pair, all_pairs, pairs_with
-from engine.poses.workshop import counted_stage, linked_photographs
+from engine.poses.workshop import linked_photographs, stage_of
 from engine.scene.images import read_image_info
 from engine.writing import write_json
 
@@ -100,7 +100,7 @@ class Search:
         self._find_features(database, thorough)
         matched = self._match(database, thorough)
         count = len(self._names)
-        with counted_stage(STAGE, count, self._tell) as at:
+        with stage_of(STAGE, count, self._tell) as at:
             best = self._unfolded(
                 database, map_photographs(database, self._photographs, self._config, counted=at), at
             )
@@ -110,7 +110,7 @@ class Search:
         return best
 
     def _find_features(self, database: Path, thorough: bool) -> None:
-        with counted_stage(FEATURES, len(self._names), self._tell) as at:
+        with stage_of(FEATURES, len(self._names), self._tell) as at:
             make_database(database, self._photographs, self._aliases, one_camera=self._one_camera)
             find_features(
                 database,
@@ -131,7 +131,7 @@ class Search:
 
     def _match(self, database: Path, thorough: bool) -> list[Pair]:
         pairs = everything = all_pairs(len(self._names))
-        with counted_stage(MATCHES, len(everything), self._tell) as at:
+        with stage_of(MATCHES, len(everything), self._tell) as at:
             if len(self._names) > self._config.exhaustive_up_to:
                 pairs = quick_pairs(database, self._aliases, self._config, threads=self._threads, counted=at)
             unlike = len(everything) - len(pairs)

@@ -1,11 +1,11 @@
 """What a search for poses works with: photographs under other names, and stages that are told of."""
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from engine.events import Listener, StageFinished, StageProgress, StageStarted
+from engine.events import Listener
+from engine.stages import counted_stage
 
 
 def linked_photographs(images: Path, names: Sequence[str], folder: Path) -> tuple[str, ...]:
@@ -21,9 +21,7 @@ def linked_photographs(images: Path, names: Sequence[str], folder: Path) -> tupl
 
 
 @contextmanager
-def counted_stage(name: str, steps: int, tell: Listener) -> Iterator[Callable[[int], None]]:
-    """A stage that is announced; yields what is to be told how many of its steps are done."""
-    began = time.monotonic()
-    tell(StageStarted(name, steps))
-    yield lambda done: tell(StageProgress(name, done, steps))
-    tell(StageFinished(name, time.monotonic() - began))
+def stage_of(name: str, steps: int, tell: Listener) -> Iterator[Callable[[int], None]]:
+    """A stage whose steps are known beforehand; yields what is to be told how many are done."""
+    with counted_stage(name, tell, steps) as count:
+        yield lambda done: count(done, steps)

@@ -22,6 +22,7 @@ from service.web.routing import local_address
 from workers.queue.jobs import NewJob, create_job
 from workers.queue.procrastinate_slips import ProcrastinateSlips
 from workers.records.database import open_pool
+from workers.records.journal import add_event
 from workers.records.rows import Artifact, DatasetFile
 from workers.records.tokens import add_token
 
@@ -54,10 +55,32 @@ def talk(database: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call
     return run
 
 
-async def make_job(database: str, **values: str) -> uuid.UUID:
+async def make_job(database: str, **values: object) -> uuid.UUID:
     async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
         fields = {"owner": "local", "kind": "reconstruct", "options": {}, "queue": "nobody", **values}
         return (await create_job(connection, ProcrastinateSlips(), NewJob(**fields))).id
+
+
+def test_stages_that_nobody_expected_are_shown_where_they_came(
+    talk: Callable[..., None], database: str
+) -> None:
+    async def conversation(http: httpx.AsyncClient) -> None:
+        job_id = await make_job(database, options={"poses": "given"})
+        async with open_pool(database, max_size=1, wait_seconds=10) as pool, pool.connection() as connection:
+            await connection.execute(
+                "UPDATE jobs SET state = 'running', attempt = 1, stage = 'matches' WHERE id = %s", [job_id]
+            )
+            for name in ("load", "check", "features"):
+                await add_event(connection, job_id, 1, "stage_finished", {"stage": name, "seconds": 2.0})
+        page = (await http.get(f"/jobs/{job_id}")).text
+        listed = re.search(r'<ol class="stages".*?</ol>', page, re.DOTALL)
+        assert listed is not None
+        stages = re.findall(r'<li class="(\w+)"[^>]*>(\w+)', listed[0])
+        done, later = (("load", "check", "features"), ("train", "evaluate", "export"))
+        wanted = [*(("done", name) for name in done), ("now", "matches"), *(("later", n) for n in later)]
+        assert stages == wanted
+
+    talk(conversation)
 
 
 def test_the_policy_allows_no_script_but_ours(talk: Callable[..., None]) -> None:
