@@ -13,6 +13,7 @@ from jaxtyping import Int64
 
 from engine.errors import Cancelled
 from engine.scene import Dataset
+from engine.threads import use_threads
 from engine.trace.make import make_tracer
 from engine.train.config import TrainConfig
 from engine.train.first_state import first_state
@@ -64,7 +65,7 @@ def doubtful_views(
             trainer = Trainer(
                 dataset,
                 trial,
-                first_state(dataset, trial, threads=threads),
+                first_state(dataset, trial, threads=use_threads(threads)),
                 folder=Path(folder),
                 fingerprint="",
                 listener=lambda _event: None,

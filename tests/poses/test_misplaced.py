@@ -97,11 +97,11 @@ def test_a_run_finds_them_by_itself(scene: Path, tmp_path: Path) -> None:
     output = tmp_path / "run"
     with pytest.raises(Cancelled, match="while looking for photographs in the wrong place"):
         reconstruct(
-            scene, output, config, threads=2, listener=events.append,
+            scene, output, config, listener=events.append,
             should_stop=lambda: any(isinstance(e, StageStarted) and e.stage == "check" for e in events),
         )  # fmt: skip
     events.clear()
-    reconstruct(scene, output, config, resume=True, threads=2, listener=events.append)
+    reconstruct(scene, output, config, resume=True, threads=0, listener=events.append)
     stages = [event.stage for event in events if isinstance(event, StageFinished)]
     assert stages[:5] == ["load", "check", "features", "matches", "placing"]
     assert stages[5:] == ["load", "train", "evaluate", "export"]
