@@ -23,8 +23,8 @@ from engine.train.trainer import Trainer
 ITERATIONS = 200
 DOUBT_SIGMAS = 3.0
 """Nearer to the others than what is called a misfit after a long training, as matches have the last word."""
-MOST_IN_DOUBT = 0.25
-"""No larger share of the views is in doubt; the worst are."""
+MOST_IN_DOUBT, MOST_SHARE_IN_DOUBT = 20, 0.25
+"""No more views are in doubt, nor a larger share of all; the worst are."""
 _SETTINGS: dict[str, object] = {
     "iterations": ITERATIONS,
     "max_gaussians": 10_000,
@@ -83,4 +83,5 @@ def doubtful_views(
     tracer.build(gaussians, trainer.shading.features(gaussians))
     fits = view_fits(dataset, np.arange(len(dataset.views)), trial, tracer, trainer.shading)
     doubtful = misfits(fits, dataset.views, dataset.train_indices, DOUBT_SIGMAS)
-    return np.sort(doubtful[: int(MOST_IN_DOUBT * len(dataset.views))])
+    most = min(MOST_IN_DOUBT, int(MOST_SHARE_IN_DOUBT * len(dataset.views)))
+    return np.sort(doubtful[:most])
