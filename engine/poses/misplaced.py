@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from engine.errors import DatasetError
 from engine.events import Listener
 from engine.poses.config import FEATURES, FOUND, MATCHES, PLACING, RECORD, Given, Request
 from engine.poses.features import find_features, make_database, match_pairs
@@ -71,6 +72,13 @@ class _Hearing:
         self._one_camera = len(set(self._sizes_px)) == 1
         self._seen: set[int] = set()
         make_database(self._database, self._photographs, self._aliases, one_camera=self._one_camera)
+        with pycolmap.Database.open(self._database) as made:
+            numbers = {image.name: image.image_id for image in made.read_all_images()}
+        if list(numbers.values()) != list(range(1, len(self._aliases) + 1)):
+            unread = [
+                n for n, alias in zip(request.names, self._aliases, strict=True) if alias not in numbers
+            ]
+            raise DatasetError(f"COLMAP cannot read {', '.join(unread[:3])}.")
 
     def ask(self, doubtful: Sequence[int], witnesses: Sequence[int]) -> None:
         """Match photographs in doubt with others."""
