@@ -73,11 +73,10 @@ class _Hearing:
         self._seen: set[int] = set()
         make_database(self._database, self._photographs, self._aliases, one_camera=self._one_camera)
         with pycolmap.Database.open(self._database) as made:
-            numbers = {image.name: image.image_id for image in made.read_all_images()}
-        if list(numbers.values()) != list(range(1, len(self._aliases) + 1)):
-            unread = [
-                n for n, alias in zip(request.names, self._aliases, strict=True) if alias not in numbers
-            ]
+            known = {image.name: image.image_id for image in made.read_all_images()}
+        numbers = [known.get(alias) for alias in self._aliases]
+        if numbers != list(range(1, len(numbers) + 1)):  # those after one that is missing would be others
+            unread = [name for name, number in zip(request.names, numbers, strict=True) if number is None]
             raise DatasetError(f"COLMAP cannot read {', '.join(unread[:3])}.")
 
     def ask(self, doubtful: Sequence[int], witnesses: Sequence[int]) -> None:
