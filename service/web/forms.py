@@ -60,7 +60,7 @@ _CHOICES = {
 }
 _HELPS = {
     "preset": "fast is a first look, standard is better, paper has the published settings and is slow.",
-    "poses": "Where the camera poses come from.",
+    "poses": "Where the camera poses come from; those of a model that matches contradict are found anew.",
     "max_side": "Photographs are shrunk to this; empty keeps their size.",
     "minutes": "Decides iterations and Gaussians by the machine's pace; empty leaves them to the preset.",
     "train.iterations": "More takes longer and gets sharper; 0 asks the photographs' pixels.",

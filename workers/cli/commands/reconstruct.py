@@ -31,7 +31,8 @@ _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
 @click.option(
     "--poses",
     type=click.Choice(["given", "auto", "missing"]),
-    help="Take the poses of the COLMAP model, find them, or find them if it is missing.  [default: given]",
+    help="Take the poses of the COLMAP model (photographs far from where matches put them are moved, see "
+    "place_misfits), find all, or find them if it is missing.  [default: given]",
 )
 @click.option("--max-side", type=int, metavar="PX", help="Shrink photographs to this longer side.")
 @click.option(
