@@ -6,7 +6,7 @@ waits for clocks and browsers. What is not listed takes less than ten seconds an
 
 _NAMES = """
 test_other_cpus.py test_two_hosts.py test_pages.py
-test_known_geometry.py test_chaos_short.py test_find.py
+test_known_geometry.py test_chaos_short.py test_find.py test_misplaced.py
 test_docker_steps.py test_reconstruction.py test_cut_off.py test_bare_folder.py test_worker_recovery.py
 test_tracers.py test_openapi_fuzz.py test_bare_photographs.py test_pipeline_resume.py test_partial_results.py
 test_dataset.py test_finite_differences.py test_full_disk.py test_kept_place.py test_job_limits.py

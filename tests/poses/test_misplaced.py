@@ -91,20 +91,32 @@ def test_a_model_that_colmap_cannot_read_is_told(scene: Path, tmp_path: Path) ->
     assert not any(tmp_path.iterdir())
 
 
-def test_a_run_finds_them_by_itself(scene: Path, tmp_path: Path) -> None:
-    config = resolve_config("fast", settings={"exports": ()}, assignments=SETTINGS)
-    events: list[Event] = []
-    output = tmp_path / "run"
-    with pytest.raises(Cancelled, match="while looking for photographs in the wrong place"):
+def stages_until(last: str, scene: Path, output: Path, *settings: str) -> list[str]:
+    """Begin a run or go on with one, and stop it in the stage ``last``; returns those that had begun."""
+    config = resolve_config("fast", settings={"exports": ()}, assignments=[*SETTINGS, *settings])
+    begun: list[str] = []
+
+    def note(event: Event) -> None:
+        if isinstance(event, StageStarted):
+            begun.append(event.stage)
+
+    with pytest.raises(Cancelled, match="--resume"):
         reconstruct(
-            scene, output, config, listener=events.append,
-            should_stop=lambda: any(isinstance(e, StageStarted) and e.stage == "check" for e in events),
-        )  # fmt: skip
-    events.clear()
-    reconstruct(scene, output, config, resume=True, threads=0, listener=events.append)
+            scene, output, config, resume=True, listener=note, should_stop=lambda: begun[-1:] == [last]
+        )
+    return begun
+
+
+def test_a_run_finds_them_by_itself(scene: Path, tmp_path: Path) -> None:
+    output = tmp_path / "run"
+    assert stages_until("check", scene, output) == ["load", "check"]
+    asked = ["check", "features", "matches", "placing"]
+    assert stages_until("matches", scene, output) == ["load", *asked[:3]]
+    events: list[Event] = []
+    config = resolve_config("fast", settings={"exports": ()}, assignments=SETTINGS)
+    reconstruct(scene, output, config, resume=True, listener=events.append)
     stages = [event.stage for event in events if isinstance(event, StageFinished)]
-    assert stages[:5] == ["load", "check", "features", "matches", "placing"]
-    assert stages[5:] == ["load", "train", "evaluate", "export"]
+    assert stages == ["load", *asked, "load", "train", "evaluate", "export"]
     told = [event.message for event in events if isinstance(event, Warned)]
     assert any("did not stand where" in text and all(name in text for name in SWAPPED) for text in told)
     assert_swapped(poses(scene / "sparse" / "0"), poses(output / "poses"))
@@ -113,17 +125,9 @@ def test_a_run_finds_them_by_itself(scene: Path, tmp_path: Path) -> None:
     assert not set(metrics["training_views"]["misfits"]) & set(SWAPPED)
 
     # Where the poses are there already, nothing is asked again.
-    for name in ("scene.ply", "metrics.json"):
-        (output / name).unlink()
+    (output / "scene.ply").unlink()
     shutil.rmtree(output / "checkpoints")
-    events.clear()
-    reconstruct(scene, output, config, resume=True, threads=2, listener=events.append)
-    stages = [event.stage for event in events if isinstance(event, StageFinished)]
-    assert stages == ["load", "train", "evaluate", "export"]
-    as_given = resolve_config(
-        "fast", settings={"exports": ()}, assignments=[*SETTINGS, "place_misfits=false"]
-    )
-    events.clear()
-    reconstruct(scene, tmp_path / "given", as_given, threads=2, listener=events.append)
-    assert not any(isinstance(event, StageStarted) and event.stage == "check" for event in events)
-    assert not (tmp_path / "given" / "poses").exists()
+    assert stages_until("train", scene, output) == ["load", "train"]
+    as_given = tmp_path / "given"
+    assert stages_until("train", scene, as_given, "place_misfits=false") == ["load", "train"]
+    assert not (as_given / "poses").exists()
