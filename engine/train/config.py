@@ -343,7 +343,7 @@ def preset(name: str) -> TrainConfig:
         ConfigError: there is no such preset.
     """
     if name == "fast":
-        return TrainConfig(iterations=1400, max_gaussians_auto=40_000, place_misfits=False)
+        return TrainConfig(iterations=1400, max_gaussians_auto=40_000)
     if name == "standard":
         return TrainConfig()
     if name == "high":
@@ -354,6 +354,7 @@ def preset(name: str) -> TrainConfig:
             sh_degree=0,
             rays=8192,
             stop_early=0.0,
+            place_misfits=False,
             window_rays=1,
             max_gaussians_auto=350_000,
             initial_points=30_000,
