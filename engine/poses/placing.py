@@ -96,34 +96,28 @@ def refined(
     within: float,
 ) -> Pose:
     """The pose nearby with which the matches that agree with the given one to ``within`` agree best."""
+    pose = rotation_cam_from_world, translation_cam_from_world
     for _ in range(_REFINEMENTS):
-        rotation, translation = rotation_cam_from_world, translation_cam_from_world
-        close = matches.select(agreeing((rotation, translation), matches, within))
+        close = matches.select(agreeing(pose, matches, within))
         if len(close.partner) < _FREEDOM:
             break
-        size = float(np.median(np.linalg.norm(translation - close.translations_cam_from_world, axis=1)))
-
-        def posed(
-            step: Float64[np.ndarray, " 6"],
-            rotation: Float64[np.ndarray, "3 3"] = rotation,
-            translation: Float64[np.ndarray, " 3"] = translation,
-            size: float = max(size, 1e-12),
-        ) -> Pose:
-            return Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, translation + size * step[3:]
-
-        found = least_squares(
-            lambda step, posed=posed, close=close: _weighed(posed(step), close, within),  # type: ignore[misc]
-            np.zeros(6),
-            loss="soft_l1",
-            f_scale=0.25,
-        )
-        rotation_cam_from_world, translation_cam_from_world = posed(found.x)
-    return rotation_cam_from_world, translation_cam_from_world
+        pose = _least_distant(pose, close, within)
+    return pose
 
 
-def _weighed(pose: Pose, matches: Matches, within: float) -> Float64[np.ndarray, " m"]:
-    weighed: Float64[np.ndarray, " m"] = sampson_distances(*pose, matches) / within
-    return weighed
+def _least_distant(pose: Pose, matches: Matches, within: float) -> Pose:
+    """The pose near to one from which all of some matches are least distant."""
+    rotation, translation = pose
+    size = float(np.median(np.linalg.norm(translation - matches.translations_cam_from_world, axis=1)))
+
+    def moved(step: Float64[np.ndarray, " 6"]) -> Pose:
+        return Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, translation + size * step[3:]
+
+    def distances(step: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, " m"]:
+        weighed: Float64[np.ndarray, " m"] = sampson_distances(*moved(step), matches) / within
+        return weighed
+
+    return moved(least_squares(distances, np.zeros(_FREEDOM), loss="soft_l1", f_scale=0.25).x)
 
 
 def matches_of(
@@ -145,13 +139,16 @@ def matches_of(
     partners: list[int] = []
     with pycolmap.Database.open(database) as source:
 
-        def rays_of(which: int, rows: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 3"]:
+        def rays_of(which: int) -> Float64[np.ndarray, "f 3"]:
             camera = model.cameras[images[which].camera_id]
             width_px, height_px = sizes_px[which - 1]
             scale = (camera.width / width_px, camera.height / height_px)
-            flat = camera.cam_from_img(source.read_keypoints(which)[rows, :2].astype(np.float64) * scale)
-            return np.concatenate([flat, np.ones((len(rows), 1))], axis=1)
+            flat = camera.cam_from_img(source.read_keypoints(which)[:, :2].astype(np.float64) * scale)
+            return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
 
+        if not source.exists_keypoints(number):
+            return None  # nothing in it can be recognised
+        all_ours = rays_of(number)
         for other in sorted(images):
             if other == number or not source.exists_two_view_geometry(number, other):
                 continue
@@ -159,7 +156,7 @@ def matches_of(
             pairs = np.asarray(found, dtype=np.int64).reshape(-1, 2)
             if len(pairs) == 0:
                 continue
-            ours, theirs = rays_of(number, pairs[:, 0]), rays_of(other, pairs[:, 1])
+            ours, theirs = all_ours[pairs[:, 0]], rays_of(other)[pairs[:, 1]]
             known = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
             rays.append(ours[known])
             partner_rays.append(theirs[known])

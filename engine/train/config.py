@@ -183,7 +183,7 @@ class TrainConfig(_Frozen):
     place_misfits: bool = Field(
         True,
         description="look for photographs of a given model that stand in the wrong place, and place them "
-        "anew before the training; not before one of less than 1,000 iterations",
+        "anew before the training; not before one of less than 1,000 iterations or 10 minutes",
     )
     misfits_after: float = Field(
         0.3, ge=0, le=1, description="share of the iterations after which checkpoints look for them"
