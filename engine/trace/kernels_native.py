@@ -5,7 +5,11 @@ from typing import Any
 
 import llvmlite.ir as ir
 from numba import njit, types
+from numba.core import cgutils
 from numba.extending import intrinsic
+
+LINE = 64
+"""Bytes of a cache line."""
 
 
 def lean(**options: Any) -> Callable[[Any], Any]:
@@ -80,3 +84,28 @@ def next_from_counter(typingctx, address):
         return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "monotonic")
 
     return signature, codegen
+
+
+@intrinsic
+def prefetch(typingctx, address):
+    """Ask for the cache line at ``address``, which is read some dozen operations later."""
+    signature = types.void(types.uintp)
+
+    def codegen(context, builder, sig, args):
+        pointer = ir.IntType(8).as_pointer()
+        i32 = ir.IntType(32)
+        function_type = ir.FunctionType(ir.VoidType(), [pointer, i32, i32, i32])
+        function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
+        hint = [ir.Constant(i32, 0), ir.Constant(i32, 3), ir.Constant(i32, 1)]
+        builder.call(function, [builder.inttoptr(args[0], pointer), *hint])
+        return context.get_dummy_value()
+
+    return signature, codegen
+
+
+@lean(forceinline=True)
+def ask_for(address, size):
+    """:func:`prefetch` for so many bytes."""
+    for begin in range(0, size, LINE):
+        prefetch(address + begin)
+    prefetch(address + size - 1)

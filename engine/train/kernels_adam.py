@@ -8,13 +8,17 @@ from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from engine.trace.kernels_native import lean
+from engine.trace.kernels_native import ask_for, float32_pointer, lean
 
 LANES = 16
 GEOMETRY = 3 + 4 + 2 + 1
 """Columns of mean, quaternion, scales and opacity."""
 CHUNK = 512
 """Gaussians that a thread takes at a time."""
+AHEAD = 8
+"""Gaussians between asking for their moments and harmonics and taking their step: rows of those that were hit
+are too far apart for the processor to foresee.
+"""
 LEAST_SHARE = 1e-3
 """Numbers between 0 and 1 stay this far from both, so that they can come back."""
 
@@ -31,30 +35,18 @@ def _update(
 
 
 @intrinsic
-def step_lanes(typingctx, values, gradients, rates, first, second, count, numbers):
-    """One step for the first ``count`` of sixteen float32 at each address, in float32.
+def step_lanes(typingctx, values, gradients, rates, first, second, numbers):
+    """One step for sixteen float32 at each address, in float32.
 
     ``numbers`` are what both moments are multiplied by, both betas, one minus each, and epsilon.
     """
     address, single = types.uintp, types.float32
-    signature = types.void(*(address,) * 5, types.int64, types.UniTuple(single, 7))
+    signature = types.void(*(address,) * 5, types.UniTuple(single, 7))
 
     def codegen(context, builder, sig, args):
-        *places, count, numbers = args
+        *places, numbers = args
         kind = ir.VectorType(ir.FloatType(), LANES)
         lanes = ir.VectorType(ir.IntType(32), LANES)
-        pointer = ir.IntType(8).as_pointer()
-        mask_kind = ir.VectorType(ir.IntType(1), LANES)
-        load = cgutils.get_or_insert_function(
-            builder.module,
-            ir.FunctionType(kind, [pointer, ir.IntType(32), mask_kind, kind]),
-            f"llvm.masked.load.v{LANES}f32.p0",
-        )
-        store = cgutils.get_or_insert_function(
-            builder.module,
-            ir.FunctionType(ir.VoidType(), [kind, pointer, ir.IntType(32), mask_kind]),
-            f"llvm.masked.store.v{LANES}f32.p0",
-        )
         root = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(kind, [kind]), f"llvm.sqrt.v{LANES}f32"
         )
@@ -70,17 +62,14 @@ def step_lanes(typingctx, values, gradients, rates, first, second, count, number
 
         numbers = [everywhere(number, kind) for number in cgutils.unpack_tuple(builder, numbers)]
         correction1, correction2, beta1, beta2, rest1, rest2, epsilon = numbers
-        count = everywhere(builder.trunc(count, ir.IntType(32)), lanes)
-        mask = builder.icmp_signed("<", ir.Constant(lanes, list(range(LANES))), count)
-        zero, align = ir.Constant(kind, [0.0] * LANES), _word(4)
-        places = [builder.inttoptr(place, pointer) for place in places]
-        value, gradient, rate, m, v = (builder.call(load, [at, align, mask, zero]) for at in places)
+        places = [builder.inttoptr(place, kind.as_pointer()) for place in places]
+        value, gradient, rate, m, v = (builder.load(at, align=4) for at in places)
         m = builder.fadd(times(beta1, m), times(rest1, gradient), flags=("contract",))
         v = builder.fadd(times(beta2, v), times(times(rest2, gradient), gradient), flags=("contract",))
         below = builder.fadd(builder.call(root, [times(v, correction2)]), epsilon)
         step = builder.fdiv(times(rate, times(m, correction1)), below)
         for found, at in ((builder.fsub(value, step), 0), (m, 3), (v, 4)):
-            builder.call(store, [found, places[at], align, mask])
+            builder.store(found, places[at], align=4)
         return context.get_dummy_value()
 
     return signature, codegen
@@ -88,6 +77,31 @@ def step_lanes(typingctx, values, gradients, rates, first, second, count, number
 
 def _word(value):
     return ir.Constant(ir.IntType(32), value)
+
+
+@lean()
+def copy_few(source, target, count):
+    """Copy so many float32 from one address to another."""
+    read, write = float32_pointer(source), float32_pointer(target)
+    for k in range(count):
+        write[k] = read[k]
+
+
+@lean()
+def step_few(values, gradients, rates, first, second, count, room, numbers):
+    """:func:`step_lanes` for the first ``count`` alone, within ``room`` for 64 float32.
+
+    Vectors of which some lanes are stored take some processors as long as twenty whole ones.
+    """
+    line = LANES * 4
+    copy_few(values, room, count)
+    copy_few(gradients, room + line, count)
+    copy_few(first, room + 2 * line, count)
+    copy_few(second, room + 3 * line, count)
+    step_lanes(room, room + line, rates, room + 2 * line, room + 3 * line, numbers)
+    copy_few(room, values, count)
+    copy_few(room + 2 * line, first, count)
+    copy_few(room + 3 * line, second, count)
 
 
 @lean(fastmath={"contract"})
@@ -135,7 +149,8 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
     g_means, g_quats, g_log_scales, g_logits, g_sh = gradients
     rate_mean, mean_by_size, own_axes, rate_quat, rate_log_scale, rate_opacity, rates_sh, mean_steps = rates
     opacity_weight, scale_weight, min_log_scale, max_log_scale = regular
-    values, by_values, by_rates, axes = room[0], room[1], room[2], room[3:]
+    values, by_values, by_rates, axes = room[0], room[1], room[2], room[3:6]
+    few_at = room[6:].ctypes.data
     scale_0, scale_1 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
     rate = rate_mean
     if mean_by_size:
@@ -166,18 +181,19 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
     first_at = first.ctypes.data + i * first.shape[1] * 4
     second_at = second.ctypes.data + i * second.shape[1] * 4
     values_at, by_values_at, by_rates_at = values.ctypes.data, by_values.ctypes.data, by_rates.ctypes.data
-    step_lanes(values_at, by_values_at, by_rates_at, first_at, second_at, GEOMETRY, numbers)
+    step_few(values_at, by_values_at, by_rates_at, first_at, second_at, GEOMETRY, few_at, numbers)
     columns = sh.shape[1] * 3
     for column in range(0, columns, LANES):
-        step_lanes(
-            sh.ctypes.data + (i * columns + column) * 4,
-            g_sh.ctypes.data + (k * columns + column) * 4,
-            rates_sh.ctypes.data + column * 4,
-            first_at + (GEOMETRY + column) * 4,
-            second_at + (GEOMETRY + column) * 4,
-            columns - column,
-            numbers,
-        )
+        sh_at = sh.ctypes.data + (i * columns + column) * 4
+        by_sh_at = g_sh.ctypes.data + (k * columns + column) * 4
+        rates_at = rates_sh.ctypes.data + column * 4
+        sh_first_at = first_at + (GEOMETRY + column) * 4
+        sh_second_at = second_at + (GEOMETRY + column) * 4
+        left = columns - column
+        if left >= LANES:
+            step_lanes(sh_at, by_sh_at, rates_at, sh_first_at, sh_second_at, numbers)
+        else:
+            step_few(sh_at, by_sh_at, rates_at, sh_first_at, sh_second_at, left, few_at, numbers)
     if own_axes:
         turn(i, quats, values)
         for axis in range(3):
@@ -200,7 +216,14 @@ def step_gaussian(k, i, room, state, gaussian, gradients, rates, regular, correc
 def step_chunk(begin, end, ids, steps, powers, room, state, gaussian, gradients, rates, regular, corrections):
     """:func:`step_gaussian` for rows ``begin`` to ``end``."""
     first, second, beta1, beta2, epsilon = state
+    sh = gaussian[4]
+    moments_bytes, sh_bytes = first.shape[1] * 4, sh.shape[1] * 12
     for k in range(begin, end):
+        if k + AHEAD < end:
+            ahead = ids[k + AHEAD]
+            ask_for(first.ctypes.data + ahead * moments_bytes, moments_bytes)
+            ask_for(second.ctypes.data + ahead * moments_bytes, moments_bytes)
+            ask_for(sh.ctypes.data + ahead * sh_bytes, sh_bytes)
         i = ids[k]
         steps[i] += 1
         c1, c2 = 1.0 / (1.0 - powers[0, steps[i]]), 1.0 / (1.0 - powers[1, steps[i]])
@@ -227,14 +250,15 @@ def adam_step(
     ``rate_mean`` is in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric
     mean of its two scales. With ``own_axes`` means and quaternions are stepped along and around the
     Gaussian's normal and the two axes in its plane, each with moments of its own; the first column of the
-    quaternion's is then unused. ``rates_sh`` are those of the harmonics' coefficients, one after the other.
+    quaternion's is then unused. ``rates_sh`` are those of the harmonics' coefficients, one after the other,
+    in whole vectors of ``LANES``.
 
     ``opacity_weight`` and ``scale_weight`` add the gradients of their regularisers. ``mean_steps`` receives
     each mean's step, world units, and ``corrections`` what both moments are multiplied by.
     """
     count = len(ids)
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        room = np.zeros((6, LANES), np.float32)
+        room = np.zeros((10, LANES), np.float32)
         step_chunk(
             chunk * CHUNK, min(count, (chunk + 1) * CHUNK), ids, steps, powers, room,
             (first, second, beta1, beta2, epsilon),

@@ -13,7 +13,7 @@ from engine.gaussians.model import SH_C0, FlatGaussians
 from engine.gaussians.rows import join_rows, row_arrays, select_rows
 from engine.trace.protocol import GaussianGradients
 from engine.train.config import LearningRates, LossWeights
-from engine.train.kernels_adam import GEOMETRY, adam_shares, adam_step
+from engine.train.kernels_adam import GEOMETRY, LANES, adam_shares, adam_step
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -98,7 +98,8 @@ class Adam:
         decay = rates.decay**progress
         colour = rates.colour / SH_C0 * decay
         mean_unit = extent if rates.mean_of == "extent" else 1.0
-        rates_sh = np.full(3 * gaussians.sh.shape[1], colour * rates.sh_rest_ratio, np.float32)
+        vectors = -(-3 * gaussians.sh.shape[1] // LANES)
+        rates_sh = np.full(vectors * LANES, colour * rates.sh_rest_ratio, np.float32)
         rates_sh[:3] = colour
         adam_step(
             gradients.ids, self.steps, _powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length()),

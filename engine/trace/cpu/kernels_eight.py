@@ -16,7 +16,7 @@ from engine.trace.cpu.kernels_lanes import (
     INT8,
     LONG8,
     MASK8,
-    compress,
+    Gapless,
     distances_of,
     first_lanes,
     gather,
@@ -71,24 +71,20 @@ def meet_block(
         before = builder.fcmp_ordered("<", t, splat(builder, t_max, FLOAT))
         met = builder.and_(met, builder.and_(behind, before))
 
-        def write(value, array, size):
-            packed = compress(builder, value, met)
-            store(builder, packed, offset(builder, array, tail, size))
-
+        gapless = Gapless(context, builder, met)
         places = builder.add(splat(builder, tail, I64), ir.Constant(LONG8, list(range(LANES))))
-        distance = builder.zext(compress(builder, builder.bitcast(t, INT8), met), LONG8)
+        distance = builder.zext(gapless.packed(builder.bitcast(t, INT8)), LONG8)
         key = builder.or_(builder.shl(distance, ir.Constant(LONG8, [32] * LANES)), places)
         store(builder, key, offset(builder, keys, tail, 8))
-        write(((u * u + v * v) * -0.5).value, powers, 8)
-        write(builder.fptrunc(rows[ALPHA_0].value, FLOAT8), opacities, 4)
-        write(builder.fptrunc(u.value, FLOAT8), us, 4)
-        write(builder.fptrunc(v.value, FLOAT8), vs, 4)
+        gapless.put(((u * u + v * v) * -0.5).value, offset(builder, powers, tail, 8))
         number = builder.add(
             splat(builder, builder.trunc(first, I32), I32), ir.Constant(INT8, list(range(LANES)))
         )
-        write(number, numbers, 4)
-        bits = builder.zext(builder.bitcast(met, ir.IntType(LANES)), I64)
-        return builder.ctpop(bits)
+        opacity = builder.fptrunc(rows[ALPHA_0].value, FLOAT8)
+        u, v = builder.fptrunc(u.value, FLOAT8), builder.fptrunc(v.value, FLOAT8)
+        for value, array in ((opacity, opacities), (u, us), (v, vs), (number, numbers)):
+            gapless.put(value, offset(builder, array, tail, 4))
+        return gapless.count()
 
     return signature, codegen
 
@@ -145,10 +141,13 @@ def sort_few(typingctx, keys, count, sorted_keys):
                 more = builder.add(so_far, ir.Constant(LONG8, [1] * LANES))
                 smaller = builder.icmp_unsigned("<", other, mine)
                 builder.store(builder.select(smaller, more, so_far), below)
-            places = builder.mul(builder.load(below), ir.Constant(LONG8, [8] * LANES))
-            where = builder.inttoptr(builder.add(places, splat(builder, sorted_keys, I64)), pointers)
+            # What is beyond the last goes behind it, so that no lane asks whether it may be stored.
             valid = lanes_below(builder, builder.sub(count, first))
-            builder.call(scatter, [mine, where, ir.Constant(I32, 8), valid])
+            beyond = builder.add(splat(builder, first, I64), ir.Constant(LONG8, list(range(LANES))))
+            places = builder.select(valid, builder.load(below), beyond)
+            places = builder.mul(places, ir.Constant(LONG8, [8] * LANES))
+            where = builder.inttoptr(builder.add(places, splat(builder, sorted_keys, I64)), pointers)
+            builder.call(scatter, [mine, where, ir.Constant(I32, 8), ir.Constant(MASK8, [1] * LANES)])
         same = cgutils.alloca_once(builder, MASK8)
         builder.store(ir.Constant(MASK8, [0] * LANES), same)
         with cgutils.for_range(builder, blocks) as block:

@@ -77,14 +77,81 @@ def load(builder, address, kind):
     return builder.load(builder.inttoptr(address, kind.as_pointer()), align=4)
 
 
-def compress(builder, value, mask):
-    """The lanes of ``mask`` without gaps, in order; what follows them is undefined."""
-    element = {FLOAT: "f32", DOUBLE: "f64", I32: "i32"}[value.type.element]
-    kind = ir.FunctionType(value.type, [value.type, MASK8, value.type])
-    function = cgutils.get_or_insert_function(
-        builder.module, kind, f"llvm.experimental.vector.compress.v8{element}"
-    )
-    return builder.call(function, [value, mask, ir.Constant(value.type, ir.Undefined)])
+def moves_lanes(context):
+    """Whether lanes without gaps are to be made by AVX2's moves, see :class:`Gapless`."""
+    features = context.codegen().magic_tuple()[2].split(",")
+    return "+avx2" in features and "+avx512f" not in features
+
+
+class Gapless:
+    """Stores the lanes of a mask without gaps, in order; what follows them is undefined.
+
+    AVX-512 has an instruction for that. AVX2 has none, and what a compiler makes up takes longer than all the
+    rest of a test of eight; but it moves lanes of 32 bits to wherever a vector says, and there is room for
+    such a vector for each of the 256 masks.
+    """
+
+    def __init__(self, context, builder, mask):
+        self.builder, self.mask = builder, mask
+        self.bits = builder.zext(builder.bitcast(mask, ir.IntType(LANES)), I64)
+        self.moves = moves_lanes(context)
+        if self.moves:
+            self.order = self._order(8, self.bits)
+            self.lower = builder.and_(self.bits, ir.Constant(I64, 15))
+            self.upper = builder.lshr(self.bits, ir.Constant(I64, 4))
+
+    def count(self):
+        """How many lanes there are in the mask."""
+        return self.builder.ctpop(self.bits)
+
+    def packed(self, value):
+        """Eight lanes of 32 bits."""
+        if not self.moves:
+            return self._compressed(value)
+        return self._moved(value, self.order)
+
+    def put(self, value, address):
+        """Store eight lanes of 32 or 64 bits."""
+        builder = self.builder
+        if not self.moves or value.type.element is not DOUBLE:
+            store(builder, self.packed(value), address)
+            return
+        four = ir.VectorType(DOUBLE, 4)
+        for first, bits in ((0, self.lower), (4, self.upper)):
+            half = builder.shuffle_vector(
+                value, ir.Constant(DOUBLE8, ir.Undefined),
+                ir.Constant(ir.VectorType(I32, 4), list(range(first, first + 4))),
+            )  # fmt: skip
+            moved = self._moved(builder.bitcast(half, INT8), self._order(4, bits))
+            store(builder, builder.bitcast(moved, four), address)
+            address = offset(builder, address, builder.ctpop(bits), 8)
+
+    def _compressed(self, value):
+        element = {FLOAT: "f32", DOUBLE: "f64", I32: "i32"}[value.type.element]
+        kind = ir.FunctionType(value.type, [value.type, MASK8, value.type])
+        function = cgutils.get_or_insert_function(
+            self.builder.module, kind, f"llvm.experimental.vector.compress.v8{element}"
+        )
+        return self.builder.call(function, [value, self.mask, ir.Constant(value.type, ir.Undefined)])
+
+    def _moved(self, value, order):
+        builder = self.builder
+        kind = ir.FunctionType(INT8, [INT8, INT8])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx2.permd")
+        moved = builder.call(function, [builder.bitcast(value, INT8), order])
+        return builder.bitcast(moved, value.type)
+
+    def _order(self, lanes, bits):
+        """Where each lane comes from, from a table over the masks of so many lanes."""
+        builder, words = self.builder, LANES // lanes
+        rows = []
+        for mask in range(1 << lanes):
+            chosen = [k for k in range(lanes) if mask >> k & 1]
+            chosen += [0] * (lanes - len(chosen))
+            rows.append(ir.Constant(INT8, [words * k + word for k in chosen for word in range(words)]))
+        table = ir.Constant(ir.ArrayType(INT8, len(rows)), rows)
+        at = cgutils.global_constant(builder.module, f"gapless.{lanes}", table)
+        return builder.load(builder.gep(at, [ir.Constant(I64, 0), bits]), align=4)
 
 
 def offset(builder, address, place, size):

@@ -45,11 +45,9 @@ from engine.trace.cpu.kernels_simd import (
     ellipses_in_pyramid,
     float32_bits,
     lowest_bit,
-    prefetch,
 )
 from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
-from engine.trace.cpu.memory import LINE
-from engine.trace.kernels_native import lean
+from engine.trace.kernels_native import LINE, ask_for, lean, prefetch
 
 STACK = 1024
 """Words for the nodes that wait, two each; a walk goes down at once, so that seven wait on each level."""
@@ -299,11 +297,9 @@ def gather_candidates(tree, pyramid, origin, farthest, walk, candidates):
             child = first_child + lowest_bit(waiting)
             waiting &= waiting - 1
             if level > 0:
-                at, lines = nodes_at + (level_starts[level - 1] + child) * NODE_BYTES, NODE_BYTES // LINE
+                ask_for(nodes_at + (level_starts[level - 1] + child) * NODE_BYTES, NODE_BYTES)
             else:
-                at, lines = blocks_at + child * BLOCK_BYTES, (BLOCK_BYTES + LINE - 1) // LINE
-            for line in range(lines):
-                prefetch(at + line * LINE)
+                ask_for(blocks_at + child * BLOCK_BYTES, BLOCK_BYTES)
         while mask != 0:
             child = first_child + lowest_bit(mask)
             mask &= mask - 1

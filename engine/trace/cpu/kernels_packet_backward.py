@@ -18,14 +18,13 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from numba import njit, prange
 
 from engine.trace.cpu.kernels_eight_backward import add_row, replay_hits, walk_through
-from engine.trace.cpu.kernels_packet import AHEAD
+from engine.trace.cpu.kernels_packet import AHEAD, RECORD_BYTES
 from engine.trace.cpu.kernels_rays import first_place, ray_origin, side_shown
 from engine.trace.cpu.kernels_records import rotation_columns
 from engine.trace.cpu.kernels_sh import slope_by_mean, write_view
-from engine.trace.cpu.kernels_simd import prefetch
 from engine.trace.cpu.kernels_single_backward import Moments, write_gradients
 from engine.trace.cpu.kernels_tree import WIDTH
-from engine.trace.kernels_native import lean, next_from_counter
+from engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch
 
 # --- row of sums of a packet's rays for one of its Gaussians, float32, one cache line ---
 H, HU, HV, HUU, HUV, HVV, HUUU, HVVV = range(8)  # the last two: h u (u^2 + v^2), h v (u^2 + v^2)
@@ -216,7 +215,12 @@ def sum_chunk(first, last, rays, packets, parameters, scene, limits, by_gaussian
     basis_count, feature_count = out.sh.shape[1], out.features.shape[1]
     words = rows.sums.view(np.int32)
     with_geometry = rows.geometry.shape[1] > 0
+    sh_bytes = scene.sh.shape[1] * 12
     for segment in range(first, last):
+        if segment + AHEAD < last:
+            ahead = by_gaussian.ids[starts[segment + AHEAD]]
+            prefetch(scene.records.ctypes.data + ahead * RECORD_BYTES)
+            ask_for(scene.sh.ctypes.data + ahead * sh_bytes, sh_bytes)
         i = by_gaussian.ids[starts[segment]]
         sums[:] = 0.0
         out.sh[segment, :, :] = np.float32(0.0)

@@ -41,7 +41,7 @@ from engine.trace.cpu.kernels_rays import (
 from engine.trace.cpu.kernels_sh import colour, write_view
 from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit
 from engine.trace.cpu.kernels_tree import WIDTH
-from engine.trace.kernels_native import lean, next_from_counter
+from engine.trace.kernels_native import ask_for, lean, next_from_counter
 
 RANKED = 96
 """Hits that are sorted by counting, for each, the smaller ones, eight at once: quadratic, but without a
@@ -151,6 +151,15 @@ def know_alphas(candidates, first, last, alpha_max):
         write_alphas(candidates.alphas.ctypes.data, candidates.opacities.ctypes.data, place, alpha_max)
 
 
+@lean(forceinline=True)
+def ask_for_colours(new, numbers, ids, sh):
+    """Ask for the harmonics of the hits ``new`` at once, so that memory is not waited for one by one."""
+    sh_bytes = sh.shape[1] * 12
+    while new != 0:
+        ask_for(sh.ctypes.data + ids[numbers[lowest_bit(new)]] * sh_bytes, sh_bytes)
+        new &= new - 1
+
+
 @lean(fastmath={"contract"})
 def show(shown, i, scene, limits, origin, basis):
     """What Gaussian ``i`` shows to rays from ``origin``."""
@@ -225,6 +234,8 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
                 scratch.weights.ctypes.data, scratch.numbers.ctypes.data, scratch.slots.ctypes.data,
                 scratch.depths.ctypes.data,
             )  # fmt: skip
+            if new & (new - 1) != 0:
+                ask_for_colours(new, scratch.numbers, ids, forward.scene.sh)
             while new != 0:
                 k = lowest_bit(new)
                 new &= new - 1

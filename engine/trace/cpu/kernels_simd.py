@@ -199,23 +199,6 @@ def lowest_bit(typingctx, mask):
     return signature, codegen
 
 
-@intrinsic
-def prefetch(typingctx, address):
-    """Ask for the cache line at ``address``, which is read some dozen operations later."""
-    signature = types.void(types.uintp)
-
-    def codegen(context, builder, sig, args):
-        pointer = ir.IntType(8).as_pointer()
-        i32 = ir.IntType(32)
-        function_type = ir.FunctionType(ir.VoidType(), [pointer, i32, i32, i32])
-        function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0")
-        hint = [ir.Constant(i32, 0), ir.Constant(i32, 3), ir.Constant(i32, 1)]
-        builder.call(function, [builder.inttoptr(args[0], pointer), *hint])
-        return context.get_dummy_value()
-
-    return signature, codegen
-
-
 def _reinterpret(source, target):
     @intrinsic
     def reinterpret(typingctx, value):

@@ -9,10 +9,8 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import DTypeLike
 
 from engine.trace.cpu.bundles import OutputGradients, Outputs, RawGradients
+from engine.trace.kernels_native import LINE
 from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
-
-LINE = 64
-"""Bytes of a cache line."""
 
 
 def aligned_empty(shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
