@@ -5,10 +5,15 @@ iterations to carry Gaussians there. Here random pixels of the training views ta
 seen around them as guesses; each guess is judged by how well a small patch, moved into neighbouring views,
 matches what they show. What agrees becomes a point, and serves as a guess in the next round.
 
+A twig before a house has no sparse points around it but the house's. Pixels that match badly at these depths
+are therefore tried at others, from near to far. More of what is found so is wrong, as one of many depths soon
+matches by chance: such points are marked, so that they can begin as small Gaussians, which hide little.
+
 A plane sweep on a few planes a pixel, after "A Space-Sweep Approach to True Multi-Image Matching"
 (https://doi.org/10.1109/CVPR.1996.517097).
 """
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -18,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from engine.scene import Dataset
 from engine.train.first_background import FirstBackground
+from engine.train.kernels_patches import patch_differences
 
 GUESSES = 6
 """Depths tried for a pixel: those of the nearest points in the image."""
@@ -25,7 +31,17 @@ NEIGHBOURS = 4
 """Views in which a guess is judged; the better half of them counts, since the rest may be hidden."""
 ROUNDS = 2
 STEP_PX = 2
-OFFSETS_PX = STEP_PX * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]], np.int64)
+OFFSETS_PX = STEP_PX * np.array([[x, y] for x in (0, 1, -1) for y in (0, 1, -1)], np.int64)
+SWEPT = 24
+"""Depths that are tried besides, in equal ratios from near to far, each moved at random within its step."""
+DOUBTFUL = 0.01
+"""Pixels that match better than that at the depth of a point are not tried at others."""
+CLEARLY = 0.7
+"""A depth that no point suggests must match so much better."""
+NEAREST, NEAR_SHARE = 10, 0.5
+"""The sweep begins at this share of the depth of so many nearest points, of which fewer may be wrong."""
+FARTHEST, FAR_SHARE = 0.98, 1.5
+"""It ends at so many times the depth that this share of the points lies before."""
 MAX_COST = 0.06
 """Mean difference of colour, in display values, above which no guess counts as right."""
 AS_WELL = 0.005
@@ -47,6 +63,56 @@ MAJORITY = 0.3
 """Share of the views looking there that must agree: a point in free space hides other things in most."""
 
 
+@dataclass(frozen=True, eq=False)
+class LiftedPoints:
+    """Points from pixels.
+
+    Attributes:
+        xyz_world: where they are.
+        rgb_srgb: display colours.
+        swept: whether no point around suggested the depth; more of these are wrong.
+    """
+
+    xyz_world: Float32[np.ndarray, "n 3"]
+    rgb_srgb: Float32[np.ndarray, "n 3"]
+    swept: Bool[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.xyz_world)
+
+    def __getitem__(self, which: np.ndarray) -> "LiftedPoints":
+        """Some of them, by number or by a mask."""
+        return LiftedPoints(self.xyz_world[which], self.rgb_srgb[which], self.swept[which])
+
+    @classmethod
+    def joined(cls, parts: Sequence["LiftedPoints"]) -> "LiftedPoints":
+        """One part after the other; none of no parts."""
+        nothing = np.empty((0, 3), np.float32)
+        parts = [cls(nothing, nothing, np.empty(0, np.bool_)), *parts]
+        return cls(
+            np.concatenate([part.xyz_world for part in parts]),
+            np.concatenate([part.rgb_srgb for part in parts]),
+            np.concatenate([part.swept for part in parts]),
+        )
+
+
+@dataclass(frozen=True)
+class _Photographs:
+    """The photographs as if all were exposed alike."""
+
+    dataset: Dataset
+    gains: Float32[np.ndarray, " v"] | None
+
+    def pixels(
+        self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
+    ) -> tuple[Float32[np.ndarray, "r 3"], Float32[np.ndarray, " r"], Float32[np.ndarray, " r"]]:
+        """Straight display colour, alpha and weight of pixels."""
+        rgb, alpha, weight = self.dataset.pixels(view, y, x)
+        if self.gains is not None:
+            rgb = np.clip(rgb * self.gains[view][:, None], 0, 1)
+        return rgb, alpha, weight
+
+
 @dataclass(frozen=True)
 class _Patches:
     """Pixels of one view with the pixels around them."""
@@ -58,6 +124,10 @@ class _Patches:
     y: Int64[np.ndarray, " n"]
     x: Int64[np.ndarray, " n"]
 
+    def __getitem__(self, which: Int64[np.ndarray, " k"]) -> "_Patches":
+        origin, *rows = vars(self).values()
+        return _Patches(origin, *(row[which] for row in rows))
+
 
 def dense_points(
     dataset: Dataset,
@@ -66,39 +136,41 @@ def dense_points(
     *,
     threads: int = 1,
     behind: FirstBackground | None = None,
-) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-    """About ``count`` points or fewer, and their display colours, beside those of the sparse model.
+    gains: Float32[np.ndarray, " v"] | None = None,
+) -> LiftedPoints:
+    """About ``count`` points or fewer beside those of the sparse model.
 
-    The sparse model must have points. Masked and transparent pixels, and those that show what is ``behind``
-    everything, give none. ``threads`` work on the views side by side, which changes no point.
+    Args:
+        dataset: the photographs; the sparse model must have points. Masked and transparent pixels give none.
+        count: points wanted.
+        rng: draws the pixels.
+        threads: work on the views side by side, which changes no point.
+        behind: what is behind everything; pixels that show it give no points.
+        gains: factors on the display colours of each view, after which all are exposed alike; None for 1.
     """
+    photographs = _Photographs(dataset, gains)
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
-    points, colours = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.float32)]
+    lifted = LiftedPoints.joined([])
     for round_number in range(ROUNDS):
         # Pixels that no guess fits are lost: draw some more.
-        wanted = round(1.6 * (count - sum(map(len, points))) / (ROUNDS - round_number))
+        wanted = round(1.6 * (count - len(lifted)) / (ROUNDS - round_number))
         per_view = rng.multinomial(max(0, wanted), _areas(dataset))
         generators = rng.spawn(len(per_view))  # one a view, so that their order does not matter
         jobs = list(zip(dataset.train_indices.tolist(), per_view.tolist(), generators, strict=True))
 
-        def lift(
-            job: tuple[int, int, np.random.Generator], known: np.ndarray = known
-        ) -> tuple[np.ndarray, ...]:
+        def lift(job: tuple[int, int, np.random.Generator], known: np.ndarray = known) -> LiftedPoints:
             index, samples, generator = job
-            return _lift(dataset, index, samples, known, neighbours[index], generator, behind)
+            return _lift(photographs, index, samples, known, neighbours[index], generator, behind)
 
         with ThreadPoolExecutor(threads) as pool:
-            found, seen = map(np.concatenate, zip(*pool.map(lift, jobs), strict=True))
-            kept = _elected(dataset, found, seen, pool)
-        points.append(found[kept])
-        colours.append(seen[kept])
-        known = np.concatenate([known, points[-1]])
-    xyz, rgb = np.concatenate(points), np.concatenate(colours)
-    if len(xyz) > count:
-        keep = np.sort(rng.choice(len(xyz), count, replace=False))
-        xyz, rgb = xyz[keep], rgb[keep]
-    return xyz, rgb
+            found = LiftedPoints.joined(list(pool.map(lift, jobs)))
+            found = found[_elected(photographs, found, pool)]
+        lifted = LiftedPoints.joined([lifted, found])
+        known = np.concatenate([known, found.xyz_world])
+    if len(lifted) > count:
+        lifted = lifted[np.sort(rng.choice(len(lifted), count, replace=False))]
+    return lifted
 
 
 def _areas(dataset: Dataset) -> Float64[np.ndarray, " t"]:
@@ -126,41 +198,69 @@ def _neighbouring_views(dataset: Dataset, points: Float64[np.ndarray, "n 3"]) ->
 
 
 def _lift(
-    dataset: Dataset,
+    photographs: _Photographs,
     index: int,
     samples: int,
     points: Float64[np.ndarray, "k 3"],
     neighbours: list[int],
     rng: np.random.Generator,
     behind: FirstBackground | None,
-) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+) -> LiftedPoints:
     """Points for random pixels of one view."""
-    nothing = np.empty((0, 3), np.float32)
+    dataset, nothing = photographs.dataset, LiftedPoints.joined([])
     projected_px, depths = _project(dataset, index, points)
     inside = _inside(dataset, index, projected_px) & (depths > 0)
     if samples == 0 or not neighbours or inside.sum() < GUESSES:
-        return nothing, nothing
-    patches = _draw(dataset, index, samples, rng)
+        return nothing
+    patches = _draw(photographs, index, samples, rng)
     if len(patches.y) == 0:
-        return nothing, nothing
+        return nothing
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
     _, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
-    guesses = depths[inside][nearest]
-    costs = np.stack([_cost(dataset, patches, guesses[:, g], neighbours) for g in range(GUESSES)], axis=1)
-    best = np.argmin(costs, axis=1)
-    rows = np.arange(len(best))
-    good = costs[rows, best] < MAX_COST
+    depth, cost = _best_of(photographs, patches, depths[inside][nearest], neighbours)
+    doubtful = np.flatnonzero(cost > DOUBTFUL)
+    more = _sweep(depths[inside], len(doubtful), rng)
+    other, other_cost = _best_of(photographs, patches[doubtful], more, neighbours)
+    swept = np.zeros(len(depth), np.bool_)
+    swept[doubtful] = other_cost < CLEARLY * np.minimum(cost[doubtful], MAX_COST)
+    chosen = swept[doubtful]
+    depth[swept], cost[swept] = other[chosen], other_cost[chosen]
+    good = cost < MAX_COST
     if behind is not None:
-        at_infinity = _cost(dataset, patches, np.full(len(rows), INFINITY * guesses.max()), neighbours)
-        as_well = at_infinity < costs[rows, best] + AS_WELL
+        at_infinity = _cost(photographs, patches, np.full(len(depth), INFINITY * depth.max()), neighbours)
+        as_well = at_infinity < cost + AS_WELL
         good &= ~(as_well & behind.may_show(patches.directions_world[:, 0]))
-    distance = guesses[rows, best] * patches.depth_factors[:, 0]
+    distance = depth * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
-    return xyz[good].astype(np.float32), patches.rgb_srgb[good, 0]
+    return LiftedPoints(xyz.astype(np.float32), patches.rgb_srgb[:, 0], swept)[good]
 
 
-def _draw(dataset: Dataset, index: int, samples: int, rng: np.random.Generator) -> _Patches:
+def _best_of(
+    photographs: _Photographs,
+    patches: _Patches,
+    guesses: Float64[np.ndarray, "n g"],
+    neighbours: list[int],
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """The guess of each patch that matches best, and how much it differs from what the neighbours show."""
+    costs = np.stack([_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
+    best = np.argmin(costs, axis=1)[:, None]
+    return np.take_along_axis(guesses, best, 1)[:, 0], np.take_along_axis(costs, best, 1)[:, 0]
+
+
+def _sweep(
+    depths: Float64[np.ndarray, " k"], count: int, rng: np.random.Generator
+) -> Float64[np.ndarray, "n g"]:
+    """Depths for ``count`` pixels of a view whose points lie at ``depths``."""
+    ordered = np.sort(depths)
+    near = NEAR_SHARE * ordered[min(NEAREST, len(ordered) - 1)]
+    far = FAR_SHARE * ordered[int(FARTHEST * (len(ordered) - 1))]
+    steps = (np.arange(SWEPT) + rng.random((count, SWEPT))) / SWEPT
+    return np.asarray(near * (far / near) ** steps)
+
+
+def _draw(photographs: _Photographs, index: int, samples: int, rng: np.random.Generator) -> _Patches:
     """Random pixels that count, away from the border, with those around them."""
+    dataset = photographs.dataset
     view = dataset.views[index]
     y = rng.integers(STEP_PX, max(STEP_PX + 1, view.height_px - STEP_PX), samples)
     x = rng.integers(STEP_PX, max(STEP_PX + 1, view.width_px - STEP_PX), samples)
@@ -169,7 +269,7 @@ def _draw(dataset: Dataset, index: int, samples: int, rng: np.random.Generator) 
     which = np.full(all_y.size, index)
     rays = dataset.rays(which, all_y.reshape(-1), all_x.reshape(-1))
     origins, directions = rays.origins_world, rays.directions_world
-    rgb, alpha, weight = dataset.pixels(which, all_y.reshape(-1), all_x.reshape(-1))
+    rgb, alpha, weight = photographs.pixels(which, all_y.reshape(-1), all_x.reshape(-1))
     counts = ((weight > 0) & (alpha > 0.5)).reshape(all_y.shape).all(axis=1)
     directions = directions.astype(np.float64).reshape(*all_y.shape, 3)
     # Distance along a ray of a point at depth 1 along the camera's axis.
@@ -185,46 +285,44 @@ def _draw(dataset: Dataset, index: int, samples: int, rng: np.random.Generator) 
 
 
 def _cost(
-    dataset: Dataset, patches: _Patches, depths: Float64[np.ndarray, " n"], neighbours: list[int]
+    photographs: _Photographs, patches: _Patches, depths: Float64[np.ndarray, " n"], neighbours: list[int]
 ) -> Float64[np.ndarray, " n"]:
     """How much the patches, moved to the given depths, differ from what the neighbouring views show there."""
+    dataset = photographs.dataset
     distances = depths[:, None] * patches.depth_factors
     points = patches.origin_world + distances[:, :, None] * patches.directions_world
     count, offsets = distances.shape
     costs = np.full((len(neighbours), count), np.inf)
-    own = patches.rgb_srgb - patches.rgb_srgb.mean(axis=1, keepdims=True)
     for k, other in enumerate(neighbours):
         where_px, depth = _project(dataset, other, points.reshape(-1, 3))
-        inside = (_inside(dataset, other, where_px) & (depth > 0)).reshape(count, offsets).all(axis=1)
-        if not inside.any():
+        shown = (_inside(dataset, other, where_px) & (depth > 0)).reshape(count, offsets)
+        inside = np.flatnonzero(shown.all(axis=1))
+        if not len(inside):
             continue
         chosen = np.floor(where_px.reshape(count, offsets, 2)[inside]).astype(np.int64).reshape(-1, 2)
-        rgb, _, _ = dataset.pixels(np.full(len(chosen), other), chosen[:, 1], chosen[:, 0])
-        theirs = rgb.reshape(-1, offsets, 3)
-        level = np.abs(theirs.mean(axis=1) - patches.rgb_srgb[inside].mean(axis=1)).mean(axis=1)
-        texture = np.abs(theirs - theirs.mean(axis=1, keepdims=True) - own[inside]).mean(axis=(1, 2))
-        costs[k, inside] = texture + LEVEL_WEIGHT * level
+        rgb, _, _ = photographs.pixels(np.full(len(chosen), other), chosen[:, 1], chosen[:, 0])
+        differences = np.empty(len(inside))
+        patch_differences(patches.rgb_srgb, rgb.reshape(-1, offsets, 3), inside, LEVEL_WEIGHT, differences)
+        costs[k, inside] = differences
     costs.sort(axis=0)
     used = costs[: max(1, (len(neighbours) + 1) // 2)]
     return np.asarray(used.mean(axis=0))
 
 
 def _elected(
-    dataset: Dataset,
-    xyz_world: Float32[np.ndarray, "n 3"],
-    rgb_srgb: Float32[np.ndarray, "n 3"],
-    pool: ThreadPoolExecutor,
+    photographs: _Photographs, points: LiftedPoints, pool: ThreadPoolExecutor
 ) -> Bool[np.ndarray, " n"]:
     """Whether enough of the views that look towards each point show its colour there."""
-    agree, looking = np.zeros(len(xyz_world), np.int64), np.zeros(len(xyz_world), np.int64)
-    train = dataset.train_indices
+    agree, looking = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+    dataset = photographs.dataset
+    train, xyz_world = dataset.train_indices, points.xyz_world.astype(np.float64)
 
     def vote(index: int) -> tuple[np.ndarray, np.ndarray]:
-        where_px, depth = _project(dataset, index, xyz_world.astype(np.float64))
+        where_px, depth = _project(dataset, index, xyz_world)
         inside = np.flatnonzero(_inside(dataset, index, where_px) & (depth > 0))
         pixel = np.floor(where_px[inside]).astype(np.int64)
-        rgb, _, _ = dataset.pixels(np.full(len(inside), index), pixel[:, 1], pixel[:, 0])
-        return inside, np.abs(rgb - rgb_srgb[inside]).mean(axis=1) < AGREES
+        rgb, _, _ = photographs.pixels(np.full(len(inside), index), pixel[:, 1], pixel[:, 0])
+        return inside, np.abs(rgb - points.rgb_srgb[inside]).mean(axis=1) < AGREES
 
     jury = train[np.unique(np.linspace(0, len(train) - 1, JURY).astype(np.int64))].tolist()
     for inside, agrees in pool.map(vote, jury):
@@ -244,5 +342,6 @@ def _project(
 
 def _inside(dataset: Dataset, index: int, where_px: Float64[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     view = dataset.views[index]
+    x, y = where_px[:, 0], where_px[:, 1]  # what is not-a-number lies nowhere
     with np.errstate(invalid="ignore"):
-        return np.asarray(((where_px >= 0) & (where_px < [view.width_px, view.height_px])).all(axis=1))
+        return np.asarray((x >= 0) & (y >= 0) & (x < view.width_px) & (y < view.height_px))

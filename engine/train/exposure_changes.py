@@ -3,7 +3,7 @@
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from engine.scene.model import Observations
 from engine.train.batches import TrainingData
@@ -53,6 +53,12 @@ def log_brightness(dataset: TrackedPhotographs) -> Float64[np.ndarray, " v"]:
     if known.any():
         brightness[known] = views[known] - np.median(views[known])
     return brightness
+
+
+def evening_gains(dataset: TrackedPhotographs) -> Float32[np.ndarray, " v"]:
+    """Factors on the display colours of each view that make all about as bright; 1 where none is known."""
+    brightness = log_brightness(dataset)
+    return np.exp(-np.where(np.isfinite(brightness), brightness, 0.0)).astype(np.float32)
 
 
 def exposure_changes(brightness: Float64[np.ndarray, " v"]) -> str | None:

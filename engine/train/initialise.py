@@ -17,6 +17,7 @@ from engine.scene import Dataset
 from engine.shading.material_settings import MaterialSettings
 from engine.train.config import TrainConfig, most_gaussians
 from engine.train.dense_points import dense_points
+from engine.train.exposure_changes import evening_gains
 from engine.train.first_background import FirstBackground
 
 MIN_POINTS = 50
@@ -24,6 +25,8 @@ MIN_POINTS = 50
 NEIGHBOURS = 3
 MAX_ANGLE = 0.3
 """Largest scale as seen from the nearest camera, in radians."""
+SWEPT_ANGLE = 0.015
+"""That of points at depths that no other point suggested: where these are wrong, they hide little."""
 FARTHEST = 50.0
 """Points farther from the cameras than this many extents are matching errors."""
 
@@ -41,9 +44,12 @@ def initial_gaussians(
     if len(points.xyz_world) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
         xyz, rgb = points.xyz_world, points.rgb_srgb
+        most = np.full(len(xyz), MAX_ANGLE)
         if config.lift_pixels and len(xyz) < limit:
-            more_xyz, more_rgb = dense_points(dataset, limit - len(xyz), rng, threads=threads, behind=behind)
-            xyz, rgb = np.concatenate([xyz, more_xyz]), np.concatenate([rgb, more_rgb])
+            gains = evening_gains(dataset) if config.exposure is True else None
+            more = dense_points(dataset, limit - len(xyz), rng, threads=threads, behind=behind, gains=gains)
+            xyz, rgb = np.concatenate([xyz, more.xyz_world]), np.concatenate([rgb, more.rgb_srgb])
+            most = np.concatenate([most, np.where(more.swept, SWEPT_ANGLE, MAX_ANGLE)])
         return from_points(
             xyz,
             rgb,
@@ -53,6 +59,7 @@ def initial_gaussians(
             opacity=config.initial_opacity,
             rng=rng,
             plane_points=config.plane_points,
+            most_angles=most,
         )
     view, y, x = dataset.sample_pixels(rng, limit)
     rays = dataset.rays(view, y, x)
@@ -89,12 +96,14 @@ def from_points(
     opacity: float,
     rng: np.random.Generator,
     plane_points: int = 8,
+    most_angles: Float64[np.ndarray, " n"] | None = None,
 ) -> FlatGaussians:
     """Flat Gaussians on sparse points.
 
     The scales are the mean distance to the three nearest points; the normal is that of the plane through
     the ``plane_points`` nearest where they lie on one, else it looks at the cameras. More than ``limit``
-    points are thinned at random.
+    points are thinned at random. ``most_angles`` are the largest scales as seen from the nearest camera,
+    radians; None for ``MAX_ANGLE``.
     """
     centre = np.median(camera_centres_world, axis=0)
     far = np.linalg.norm(xyz_world - centre, axis=1) > FARTHEST * extent
@@ -118,7 +127,8 @@ def from_points(
     )
     # One point alone in front of a camera would hide everything.
     to_camera = cKDTree(camera_centres_world).query(points)[0]
-    spacing = np.minimum(spacing, np.maximum(MAX_ANGLE * to_camera, 1e-5 * extent))
+    most = MAX_ANGLE if most_angles is None else most_angles[keep]
+    spacing = np.minimum(spacing, np.maximum(most * to_camera, 1e-5 * extent))
     normals = _unit(centre - points)
     if wanted == plane_points + 1:
         around = points[neighbours]
