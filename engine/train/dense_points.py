@@ -7,7 +7,8 @@ matches what they show. What agrees becomes a point, and serves as a guess in th
 
 A twig before a house has no sparse points around it but the house's. Pixels that match badly at these depths
 are therefore tried at others, from near to far. More of what is found so is wrong, as one of many depths soon
-matches by chance: such points are marked, so that they can begin as small Gaussians, which hide little.
+matches by chance: such points need more views that agree, and others beside them; and they are marked, so
+that they can begin as small Gaussians, which hide little.
 
 A plane sweep on a few planes a pixel, after "A Space-Sweep Approach to True Multi-Image Matching"
 (https://doi.org/10.1109/CVPR.1996.517097).
@@ -38,7 +39,7 @@ DOUBTFUL = 0.01
 """Pixels that match better than that at the depth of a point are not tried at others."""
 CLEARLY = 0.7
 """A depth that no point suggests must match so much better."""
-NEAREST, NEAR_SHARE = 10, 0.5
+NEAREST, NEAR_SHARE = 10, 0.7
 """The sweep begins at this share of the depth of so many nearest points, of which fewer may be wrong."""
 FARTHEST, FAR_SHARE = 0.98, 1.5
 """It ends at so many times the depth that this share of the points lies before."""
@@ -61,6 +62,11 @@ AGREES = 0.12
 """Largest mean difference of colour, in display values, of a view that agrees."""
 MAJORITY = 0.3
 """Share of the views looking there that must agree: a point in free space hides other things in most."""
+SWEPT_AGREES, SWEPT_MAJORITY = 0.1, 0.4
+"""The same of points at depths that no other point suggested."""
+LONELY = 0.1
+"""Such a point farther than that from the three nearest others, of its distance to the nearest camera, has
+nothing beside it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +172,7 @@ def dense_points(
         with ThreadPoolExecutor(threads) as pool:
             found = LiftedPoints.joined(list(pool.map(lift, jobs)))
             found = found[_elected(photographs, found, pool)]
+        found = found[~(found.swept & _lonely(dataset, found.xyz_world, known))]
         lifted = LiftedPoints.joined([lifted, found])
         known = np.concatenate([known, found.xyz_world])
     if len(lifted) > count:
@@ -309,10 +316,23 @@ def _cost(
     return np.asarray(used.mean(axis=0))
 
 
+def _lonely(
+    dataset: Dataset, xyz_world: Float32[np.ndarray, "n 3"], known: Float64[np.ndarray, "k 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether nothing lies beside a point, neither of the others nor of those known."""
+    if not len(xyz_world):
+        return np.empty(0, np.bool_)
+    distances, _ = cKDTree(np.concatenate([known, xyz_world])).query(xyz_world, 4)  # itself first
+    cameras = cKDTree(np.stack([dataset.views[i].origin_world for i in dataset.train_indices]))
+    return np.asarray(distances[:, 1:].mean(axis=1) > LONELY * cameras.query(xyz_world)[0])
+
+
 def _elected(
     photographs: _Photographs, points: LiftedPoints, pool: ThreadPoolExecutor
 ) -> Bool[np.ndarray, " n"]:
     """Whether enough of the views that look towards each point show its colour there."""
+    limits = np.where(points.swept, SWEPT_AGREES, AGREES)
+    majority = np.where(points.swept, SWEPT_MAJORITY, MAJORITY)
     agree, looking = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     dataset = photographs.dataset
     train, xyz_world = dataset.train_indices, points.xyz_world.astype(np.float64)
@@ -322,13 +342,13 @@ def _elected(
         inside = np.flatnonzero(_inside(dataset, index, where_px) & (depth > 0))
         pixel = np.floor(where_px[inside]).astype(np.int64)
         rgb, _, _ = photographs.pixels(np.full(len(inside), index), pixel[:, 1], pixel[:, 0])
-        return inside, np.abs(rgb - points.rgb_srgb[inside]).mean(axis=1) < AGREES
+        return inside, np.abs(rgb - points.rgb_srgb[inside]).mean(axis=1) < limits[inside]
 
     jury = train[np.unique(np.linspace(0, len(train) - 1, JURY).astype(np.int64))].tolist()
     for inside, agrees in pool.map(vote, jury):
         looking[inside] += 1
         agree[inside] += agrees
-    return np.asarray(agree >= MAJORITY * np.maximum(looking, 1))
+    return np.asarray(agree >= majority * np.maximum(looking, 1))
 
 
 def _project(
