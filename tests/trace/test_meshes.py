@@ -41,7 +41,8 @@ def test_limits_choose_what_is_met(cube: TriangleScene) -> None:
     t_min = f32([0.0, 2.5, 4.5, 0.0, 2.5])
     t_max = f32([np.inf, np.inf, np.inf, 1.5, 3.5])
     rays = RayBatch(origins, along, t_min, t_max)
-    assert cube.closest(rays).distances.tolist() == [2.0, 4.0, np.inf, np.inf, np.inf]
+    # Embree's reciprocals are rounded otherwise on other processors.
+    np.testing.assert_allclose(cube.closest(rays).distances, [2.0, 4.0, np.inf, np.inf, np.inf], rtol=1e-6)
     assert cube.closest(rays).hit.tolist() == [True, True, False, False, False]
     assert cube.occluded(rays).tolist() == [True, True, False, False, False]
     assert cube.closest(rays).faces[2] == -1
