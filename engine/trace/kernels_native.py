@@ -105,7 +105,6 @@ def prefetch(typingctx, address):
 
 @lean(forceinline=True)
 def ask_for(address, size):
-    """:func:`prefetch` for so many bytes."""
-    for begin in range(0, size, LINE):
-        prefetch(address + begin)
-    prefetch(address + size - 1)
+    """:func:`prefetch` for all lines of so many bytes."""
+    for line in range(address // LINE * LINE, address + size, LINE):
+        prefetch(line)

@@ -91,7 +91,7 @@ def copy_few(source, target, count):
 def step_few(values, gradients, rates, first, second, count, room, numbers):
     """:func:`step_lanes` for the first ``count`` alone, within ``room`` for 64 float32.
 
-    Vectors of which some lanes are stored take some processors as long as twenty whole ones.
+    Storing some lanes of a vector is slow on processors with AVX2 alone.
     """
     line = LANES * 4
     copy_few(values, room, count)
