@@ -7,8 +7,8 @@ matches what they show. What agrees becomes a point, and serves as a guess in th
 
 A twig before a house has no sparse points around it but the house's. Pixels that match badly at these depths
 are therefore tried at others, from near to far. More of what is found so is wrong, as one of many depths soon
-matches by chance: such points need more views that agree, and others beside them, else the pixel keeps the
-depth that was suggested; and they are marked, so that they can begin as small Gaussians, which hide little.
+matches by chance: such points need more views that agree, and others beside them; and they are marked, so
+that they can begin as small Gaussians, which hide little.
 
 A plane sweep on a few planes a pixel, after "A Space-Sweep Approach to True Multi-Image Matching"
 (https://doi.org/10.1109/CVPR.1996.517097).
@@ -165,22 +165,14 @@ def dense_points(
         generators = rng.spawn(len(per_view))  # one a view, so that their order does not matter
         jobs = list(zip(dataset.train_indices.tolist(), per_view.tolist(), generators, strict=True))
 
-        def lift(
-            job: tuple[int, int, np.random.Generator], known: np.ndarray = known
-        ) -> tuple[LiftedPoints, np.ndarray]:
+        def lift(job: tuple[int, int, np.random.Generator], known: np.ndarray = known) -> LiftedPoints:
             index, samples, generator = job
             return _lift(photographs, index, samples, known, neighbours[index], generator, behind)
 
         with ThreadPoolExecutor(threads) as pool:
-            parts, rows = zip(*pool.map(lift, jobs), strict=True)
-            firsts = np.cumsum(per_view) - per_view
-            pixel = np.concatenate([row + first for row, first in zip(rows, firsts, strict=True)])
-            found = LiftedPoints.joined(parts)
-            elected = _elected(photographs, found, pool)
-        found, pixel = found[elected], pixel[elected]
-        kept = ~(found.swept & _lonely(dataset, found.xyz_world, known))
-        kept &= found.swept | ~np.isin(pixel, pixel[kept & found.swept])
-        found = found[kept]
+            found = LiftedPoints.joined(list(pool.map(lift, jobs)))
+            found = found[_elected(photographs, found, pool)]
+        found = found[~(found.swept & _lonely(dataset, found.xyz_world, known))]
         lifted = LiftedPoints.joined([lifted, found])
         known = np.concatenate([known, found.xyz_world])
     if len(lifted) > count:
@@ -220,12 +212,9 @@ def _lift(
     neighbours: list[int],
     rng: np.random.Generator,
     behind: FirstBackground | None,
-) -> tuple[LiftedPoints, Int64[np.ndarray, " n"]]:
-    """Points for random pixels of one view, and the number of each one's pixel: some have two.
-
-    Of these one is swept, and to be taken if it is right.
-    """
-    dataset, nothing = photographs.dataset, (LiftedPoints.joined([]), np.empty(0, np.int64))
+) -> LiftedPoints:
+    """Points for random pixels of one view."""
+    dataset, nothing = photographs.dataset, LiftedPoints.joined([])
     projected_px, depths = _project(dataset, index, points)
     inside = _inside(dataset, index, projected_px) & (depths > 0)
     if samples == 0 or not neighbours or inside.sum() < GUESSES:
@@ -239,21 +228,18 @@ def _lift(
     doubtful = np.flatnonzero(cost > DOUBTFUL)
     more = _sweep(depths[inside], len(doubtful), rng)
     other, other_cost = _best_of(photographs, patches[doubtful], more, neighbours)
-    clearly = other_cost < CLEARLY * np.minimum(cost[doubtful], MAX_COST)
-    suggested = np.flatnonzero(cost < MAX_COST)
-    pixel = np.concatenate([suggested, doubtful[clearly]])
-    swept = np.arange(len(pixel)) >= len(suggested)
-    depth = np.concatenate([depth[suggested], other[clearly]])
-    distance = depth * patches.depth_factors[pixel, 0]
-    xyz = patches.origin_world + distance[:, None] * patches.directions_world[pixel, 0]
-    lifted = LiftedPoints(xyz.astype(np.float32), patches.rgb_srgb[pixel, 0], swept)
-    if behind is None:
-        return lifted, pixel
-    far_away = np.full(len(patches.y), INFINITY * depths[inside].max())
-    at_infinity = _cost(photographs, patches, far_away, neighbours)[pixel]
-    as_well = at_infinity < np.concatenate([cost[suggested], other_cost[clearly]]) + AS_WELL
-    good = ~(as_well & behind.may_show(patches.directions_world[pixel, 0]))
-    return lifted[good], pixel[good]
+    swept = np.zeros(len(depth), np.bool_)
+    swept[doubtful] = other_cost < CLEARLY * np.minimum(cost[doubtful], MAX_COST)
+    chosen = swept[doubtful]
+    depth[swept], cost[swept] = other[chosen], other_cost[chosen]
+    good = cost < MAX_COST
+    if behind is not None:
+        at_infinity = _cost(photographs, patches, np.full(len(depth), INFINITY * depth.max()), neighbours)
+        as_well = at_infinity < cost + AS_WELL
+        good &= ~(as_well & behind.may_show(patches.directions_world[:, 0]))
+    distance = depth * patches.depth_factors[:, 0]
+    xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
+    return LiftedPoints(xyz.astype(np.float32), patches.rgb_srgb[:, 0], swept)[good]
 
 
 def _best_of(
