@@ -7,14 +7,15 @@ matches what they show. What agrees becomes a point, and serves as a guess in th
 
 A twig before a house has no sparse points around it but the house's. Pixels that match badly at these depths
 are therefore tried at others, from near to far. More of what is found so is wrong, as one of many depths soon
-matches by chance: such points need more views that agree, and others beside them; and they are marked, so
-that they can begin as small Gaussians, which hide little.
+matches by chance, most of all where neighbouring photographs are far apart. Such points need more views that
+agree; they count where known points lie close by, or where pixels of other views found the same place and no
+other depth matches about as well; and they are marked, so that they can begin as small Gaussians, which hide
+little.
 
 A plane sweep on a few planes a pixel, after "A Space-Sweep Approach to True Multi-Image Matching"
 (https://doi.org/10.1109/CVPR.1996.517097).
 """
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -25,12 +26,13 @@ from scipy.spatial import cKDTree
 from engine.scene import Dataset
 from engine.train.first_background import FirstBackground
 from engine.train.kernels_patches import patch_differences
+from engine.train.lifted_points import Evidence, LiftedPoints, borne_out
 
 GUESSES = 6
 """Depths tried for a pixel: those of the nearest points in the image."""
 NEIGHBOURS = 4
 """Views in which a guess is judged; the better half of them counts, since the rest may be hidden."""
-ROUNDS = 2
+ROUNDS = 3
 STEP_PX = 2
 OFFSETS_PX = STEP_PX * np.array([[x, y] for x in (0, 1, -1) for y in (0, 1, -1)], np.int64)
 SWEPT = 24
@@ -64,42 +66,8 @@ MAJORITY = 0.3
 """Share of the views looking there that must agree: a point in free space hides other things in most."""
 SWEPT_AGREES, SWEPT_MAJORITY = 0.1, 0.4
 """The same of points at depths that no other point suggested."""
-LONELY = 0.1
-"""Such a point farther than that from the three nearest others, of its distance to the nearest camera, has
-nothing beside it."""
-
-
-@dataclass(frozen=True, eq=False)
-class LiftedPoints:
-    """Points from pixels.
-
-    Attributes:
-        xyz_world: where they are.
-        rgb_srgb: display colours.
-        swept: whether no point around suggested the depth; more of these are wrong.
-    """
-
-    xyz_world: Float32[np.ndarray, "n 3"]
-    rgb_srgb: Float32[np.ndarray, "n 3"]
-    swept: Bool[np.ndarray, " n"]
-
-    def __len__(self) -> int:
-        return len(self.xyz_world)
-
-    def __getitem__(self, which: np.ndarray) -> "LiftedPoints":
-        """Some of them, by number or by a mask."""
-        return LiftedPoints(self.xyz_world[which], self.rgb_srgb[which], self.swept[which])
-
-    @classmethod
-    def joined(cls, parts: Sequence["LiftedPoints"]) -> "LiftedPoints":
-        """One part after the other; none of no parts."""
-        nothing = np.empty((0, 3), np.float32)
-        parts = [cls(nothing, nothing, np.empty(0, np.bool_)), *parts]
-        return cls(
-            np.concatenate([part.xyz_world for part in parts]),
-            np.concatenate([part.rgb_srgb for part in parts]),
-            np.concatenate([part.swept for part in parts]),
-        )
+BEHIND = 1.2
+"""Such points beyond so many times the depth that others suggest are wrong: something nearer was known."""
 
 
 @dataclass(frozen=True)
@@ -165,14 +133,19 @@ def dense_points(
         generators = rng.spawn(len(per_view))  # one a view, so that their order does not matter
         jobs = list(zip(dataset.train_indices.tolist(), per_view.tolist(), generators, strict=True))
 
-        def lift(job: tuple[int, int, np.random.Generator], known: np.ndarray = known) -> LiftedPoints:
+        def lift(
+            job: tuple[int, int, np.random.Generator], known: np.ndarray = known
+        ) -> tuple[LiftedPoints, Evidence]:
             index, samples, generator = job
             return _lift(photographs, index, samples, known, neighbours[index], generator, behind)
 
         with ThreadPoolExecutor(threads) as pool:
-            found = LiftedPoints.joined(list(pool.map(lift, jobs)))
-            found = found[_elected(photographs, found, pool)]
-        found = found[~(found.swept & _lonely(dataset, found.xyz_world, known))]
+            parts = list(pool.map(lift, jobs))
+            found = LiftedPoints.joined([points for points, _ in parts])
+            evidence = Evidence.joined([e for _, e in parts])
+            elected = _elected(photographs, found, pool)
+        found, evidence = found[elected], evidence[elected]
+        found = found[~found.swept | borne_out(found, evidence, known)]
         lifted = LiftedPoints.joined([lifted, found])
         known = np.concatenate([known, found.xyz_world])
     if len(lifted) > count:
@@ -212,9 +185,10 @@ def _lift(
     neighbours: list[int],
     rng: np.random.Generator,
     behind: FirstBackground | None,
-) -> LiftedPoints:
+) -> tuple[LiftedPoints, Evidence]:
     """Points for random pixels of one view."""
-    dataset, nothing = photographs.dataset, LiftedPoints.joined([])
+    dataset = photographs.dataset
+    nothing = LiftedPoints.joined([]), Evidence(np.empty(0, np.int64), np.empty(0), np.empty(0))
     projected_px, depths = _project(dataset, index, points)
     inside = _inside(dataset, index, projected_px) & (depths > 0)
     if samples == 0 or not neighbours or inside.sum() < GUESSES:
@@ -224,22 +198,24 @@ def _lift(
         return nothing
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
     _, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
-    depth, cost = _best_of(photographs, patches, depths[inside][nearest], neighbours)
+    depth, cost, rivalry = _best_of(photographs, patches, depths[inside][nearest], neighbours)
     doubtful = np.flatnonzero(cost > DOUBTFUL)
     more = _sweep(depths[inside], len(doubtful), rng)
-    other, other_cost = _best_of(photographs, patches[doubtful], more, neighbours)
+    other, other_cost, other_rivalry = _best_of(photographs, patches[doubtful], more, neighbours)
     swept = np.zeros(len(depth), np.bool_)
     swept[doubtful] = other_cost < CLEARLY * np.minimum(cost[doubtful], MAX_COST)
     chosen = swept[doubtful]
-    depth[swept], cost[swept] = other[chosen], other_cost[chosen]
     good = cost < MAX_COST
+    good[swept] = other[chosen] < BEHIND * depth[swept]
+    depth[swept], cost[swept], rivalry[swept] = other[chosen], other_cost[chosen], other_rivalry[chosen]
     if behind is not None:
         at_infinity = _cost(photographs, patches, np.full(len(depth), INFINITY * depth.max()), neighbours)
         as_well = at_infinity < cost + AS_WELL
         good &= ~(as_well & behind.may_show(patches.directions_world[:, 0]))
     distance = depth * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
-    return LiftedPoints(xyz.astype(np.float32), patches.rgb_srgb[:, 0], swept)[good]
+    lifted = LiftedPoints(xyz.astype(np.float32), patches.rgb_srgb[:, 0], swept)
+    return lifted[good], Evidence(np.full(len(depth), index), distance, rivalry)[good]
 
 
 def _best_of(
@@ -247,11 +223,16 @@ def _best_of(
     patches: _Patches,
     guesses: Float64[np.ndarray, "n g"],
     neighbours: list[int],
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """The guess of each patch that matches best, and how much it differs from what the neighbours show."""
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """The best guess of each patch, how much it differs from what the neighbours show, and its rivalry."""
     costs = np.stack([_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
     best = np.argmin(costs, axis=1)[:, None]
-    return np.take_along_axis(guesses, best, 1)[:, 0], np.take_along_axis(costs, best, 1)[:, 0]
+    cost = np.take_along_axis(costs, best, 1)[:, 0]
+    beside = np.abs(np.arange(guesses.shape[1]) - best) <= 1
+    rival = np.where(beside, np.inf, costs).min(axis=1, initial=np.inf)
+    with np.errstate(invalid="ignore"):  # of what nobody shows nothing is asked
+        rivalry = cost / np.maximum(rival, 1e-12)
+    return np.take_along_axis(guesses, best, 1)[:, 0], cost, rivalry
 
 
 def _sweep(
@@ -314,17 +295,6 @@ def _cost(
     costs.sort(axis=0)
     used = costs[: max(1, (len(neighbours) + 1) // 2)]
     return np.asarray(used.mean(axis=0))
-
-
-def _lonely(
-    dataset: Dataset, xyz_world: Float32[np.ndarray, "n 3"], known: Float64[np.ndarray, "k 3"]
-) -> Bool[np.ndarray, " n"]:
-    """Whether nothing lies beside a point, neither of the others nor of those known."""
-    if not len(xyz_world):
-        return np.empty(0, np.bool_)
-    distances, _ = cKDTree(np.concatenate([known, xyz_world])).query(xyz_world, 4)  # itself first
-    cameras = cKDTree(np.stack([dataset.views[i].origin_world for i in dataset.train_indices]))
-    return np.asarray(distances[:, 1:].mean(axis=1) > LONELY * cameras.query(xyz_world)[0])
 
 
 def _elected(

@@ -13,9 +13,10 @@ from engine.render.images import write_png
 from engine.scene import Dataset
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.scene.generated.arrangement import still_life
-from engine.train.dense_points import LiftedPoints, dense_points
+from engine.train.dense_points import dense_points
 from engine.train.exposure_changes import evening_gains
 from engine.train.first_background import first_background
+from engine.train.lifted_points import LiftedPoints
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def assert_same(first: LiftedPoints, second: LiftedPoints) -> None:
 def test_points_lie_on_the_surfaces(dataset: Dataset, surface: cKDTree) -> None:
     lifted = dense_points(dataset, 3000, np.random.default_rng(0))
     xyz, rgb = lifted.xyz_world, lifted.rgb_srgb
-    assert 1300 < len(xyz) <= 3000
+    assert 1500 < len(xyz) <= 3000
     assert xyz.dtype == rgb.dtype == np.float32
     off, _ = surface.query(xyz.astype(np.float64))
     # The room is 7 m wide; the table has a radius of 1 m.
@@ -88,13 +89,13 @@ def test_things_without_any_point_of_the_model_are_found(
 ) -> None:
     bare, gone = without_points_of_the_table(dataset, tmp_path)
     assert len(gone) > 200 and len(bare.points) == len(dataset.points) - len(gone)
-    lifted = dense_points(bare, 3000, np.random.default_rng(0))
+    lifted = dense_points(bare, 20_000, np.random.default_rng(0))
     near = np.linalg.norm(lifted.xyz_world[:, :2], axis=1) < 1.0
     off, _ = surface.query(lifted.xyz_world.astype(np.float64))
     right = off < 0.1
-    assert (near & right).sum() > 150
-    assert lifted.swept.sum() > 100
-    assert right[lifted.swept].mean() > 0.95
+    assert (near & right).sum() > 3000
+    assert (near & right & lifted.swept).sum() > 100
+    assert right[lifted.swept].mean() > 0.75 and right.mean() > 0.85
 
 
 def test_photographs_that_are_exposed_otherwise_match_when_evened(dataset: Dataset, tmp_path: Path) -> None:
