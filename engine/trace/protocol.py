@@ -104,6 +104,7 @@ class TraceGradients:
     """Gradients of a loss with respect to the outputs of a trace; None means zero.
 
     ``ray_errors`` is no gradient: any non-negative number a ray, shared out to its Gaussians by weight.
+    ``least_weight`` is none, either: Gaussians whose weights alpha T on all rays add up to less are left out.
     """
 
     rgb_srgb: Float32[np.ndarray, "r 3"]
@@ -113,6 +114,7 @@ class TraceGradients:
     normal_world: Float32[np.ndarray, "r 3"] | None = None
     features: Float32[np.ndarray, "r f"] | None = None
     ray_errors: Float32[np.ndarray, " r"] | None = None
+    least_weight: float = 0.0
 
     @property
     def with_geometry(self) -> bool:
@@ -123,6 +125,8 @@ class TraceGradients:
 @dataclass
 class GaussianGradients:
     """Gradients of the raw parameters of the ``u`` Gaussians that were hit, in ascending order of id.
+
+    Those that weighed less than was asked for are left out.
 
     ``weight_sums`` is the sum of the weights alpha T over all rays, ``error_sums`` that of the weights times
     the rays' errors, ``hit_counts`` the number of rays.

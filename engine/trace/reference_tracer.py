@@ -11,6 +11,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
 from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, TraceResult, TraceSettings
 from engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
+from engine.trace.sums import heavier
 
 PAIRS_AT_ONCE = 1 << 17
 """Rays times Gaussians of one piece; each pair takes about a kilobyte while its gradient is kept."""
@@ -104,13 +105,14 @@ class ReferenceTracer:
         ids, counts = np.unique(np.concatenate([np.empty(0, np.int64), *hits.ids]), return_counts=True)
         rows = {name: total[ids].astype(np.float32) for name, total in zip(_PARAMETERS, sums, strict=True)}
         rows["features"] = np.ascontiguousarray(rows["features"][:, :-1])
-        return GaussianGradients(
+        everything = GaussianGradients(
             ids=ids.astype(np.int32),
             **rows,
             weight_sums=weights[ids].astype(np.float32),
             error_sums=errors[ids].astype(np.float32),
             hit_counts=counts.astype(np.int32),
         )
+        return heavier(everything, gradients.least_weight)
 
     def _parameters(self) -> ReferenceParameters:
         assert self._gaussians is not None, "build first"

@@ -1,4 +1,4 @@
-"""Gradients of several recordings of the same Gaussians, added up."""
+"""Gradients of several recordings of the same Gaussians, added up, and those of Gaussians that matter."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -25,3 +25,11 @@ def add_gradients(parts: Sequence[GaussianGradients]) -> GaussianGradients:
             total[place[part.ids]] += getattr(part, name)
         sums[name] = total
     return GaussianGradients(ids=ids, **sums)
+
+
+def heavier(gradients: GaussianGradients, least_weight: float) -> GaussianGradients:
+    """Those of the Gaussians whose weights add up to ``least_weight`` or more; of all, the same object."""
+    enough = gradients.weight_sums >= least_weight
+    if enough.all():
+        return gradients
+    return GaussianGradients(**{name: rows[enough] for name, rows in vars(gradients).items()})

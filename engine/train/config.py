@@ -203,6 +203,11 @@ class TrainConfig(_Frozen):
         le=1,
         description="share of the iterations after which states are averaged; the mean is exported",
     )
+    least_weight: float = Field(
+        0.03,
+        ge=0,
+        description="Gaussians whose weights on the rays of an iteration add up to less keep still in it",
+    )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
     trace: TraceSettings = TraceSettings()
@@ -327,6 +332,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "rays_a_pixel": 8,
             "step_back_db": 0.3,
             "average_after": 0.8,
+            "least_weight": 0.0,
             "stop_early": 0.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
@@ -353,6 +359,7 @@ def preset(name: str) -> TrainConfig:
             iterations=10_000,
             sh_degree=0,
             rays=8192,
+            least_weight=0.0,
             stop_early=0.0,
             place_misfits=False,
             window_rays=1,

@@ -11,7 +11,7 @@ import numpy as np
 from engine.errors import TrainingFailure
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import GaussianGradients, Tracer
-from engine.trace.sums import add_gradients
+from engine.trace.sums import add_gradients, heavier
 from engine.train.batches import Batch
 from engine.train.config import LossWeights, TrainConfig
 from engine.train.densify import Densifier
@@ -57,6 +57,7 @@ def differentiate(
     *,
     progress: float,
     with_errors: bool = False,
+    least_weight: float = 0.0,
 ) -> Differentiated:
     """The loss of the Gaussians that ``tracer`` holds, and its gradients; changes nothing.
 
@@ -67,6 +68,7 @@ def differentiate(
         weights: of the loss terms.
         progress: share of the training that is done.
         with_errors: share the rays' errors out to their Gaussians.
+        least_weight: Gaussians whose weights over all rays add up to less get no gradients.
     """
     seen = tracer.trace(batch.rays, record=True)
     assert seen.hits is not None
@@ -81,9 +83,12 @@ def differentiate(
     recorded = [(seen.hits, by_seen), *back.further]
     if batch.sight_lines is not None:
         recorded.append(blocked_term(batch.sight_lines, tracer, weights.blocked))
+    if len(recorded) == 1:  # what several say of a Gaussian has to be added up first
+        recorded = [(seen.hits, replace(by_seen, least_weight=least_weight))]
+    gaussians = add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded])
     return Differentiated(
         loss=loss,
-        gaussians=add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded]),
+        gaussians=heavier(gaussians, least_weight),
         shading=back.parameters,
         hits_per_ray=float(seen.hit_counts.mean()),
     )
@@ -117,8 +122,9 @@ def iterate(
     tracer, shading = machinery.tracer, machinery.shading
     densifier = machinery.densifier
     found = differentiate(
-        batch, tracer, shading, config.loss, progress=progress, with_errors=densifier.wants_errors
-    )
+        batch, tracer, shading, config.loss,
+        progress=progress, with_errors=densifier.wants_errors, least_weight=config.least_weight,
+    )  # fmt: skip
     if not np.isfinite(found.loss.value):
         raise TrainingFailure(
             f"The loss became {found.loss.value} at iteration {state.iteration + 1}; lower the learning "

@@ -176,6 +176,25 @@ def test_errors_are_shared_out_by_weight(tracer: Tracer) -> None:
     assert found.hit_counts.tolist() == [1, 2]
 
 
+def test_gaussians_that_hardly_weigh_are_left_out(tracer: Tracer, rng: np.random.Generator) -> None:
+    cloud = make_cloud(rng, 40)
+    rays = mixed_rays(rng)
+    tracer.build(cloud)
+    given = random_gradients(rng, len(rays), 0)
+    hits = tracer.trace(rays, record=True).hits
+    assert hits is not None
+    all_of_them = tracer.backward(hits, given).numpy()
+    least = float(np.median(all_of_them.weight_sums))
+    given.least_weight = least
+    some = tracer.backward(hits, given).numpy()
+    enough = all_of_them.weight_sums >= least
+    assert 0 < enough.sum() < len(enough)
+    for name, rows in vars(all_of_them).items():
+        assert getattr(some, name).tobytes() == rows[enough].tobytes(), name
+    given.least_weight = 1e9
+    assert len(tracer.backward(hits, given).numpy().ids) == 0
+
+
 def test_changed_parameters_are_read_when_told(tracer: Tracer, rng: np.random.Generator) -> None:
     cloud, features = make_cloud(rng, 150, size=0.15), f32(rng.random((150, 2)))
     tracer.build(cloud, features)

@@ -42,6 +42,7 @@ class Rows(NamedTuple):
 
     firsts: Int64[np.ndarray, " p1"]
     ids: Int32[np.ndarray, " e"]
+    weights: Float32[np.ndarray, " e"]
     sums: Float32[np.ndarray, "e 16"]
     geometry: Float32[np.ndarray, "e _"]
     features: Float32[np.ndarray, "e f"]
@@ -173,6 +174,7 @@ def replay_packet(packet, memory, rays, packets, hits, kept, counts, parameters,
             replay_ray(r, slot_base, base, memory, hits, kept, counts, features, limits, g, rows)
     for slot in range(slots):
         words[base + slot, PACKET] = packet
+        rows.weights[base + slot] = rows.sums[base + slot, W]
         for channel in range(3):  # a colour clamped at zero gets no gradient
             if kept.slot_rgb[slot_base + slot, channel] <= 0.0:
                 rows.sums[base + slot, RED + channel] = np.float32(0.0)
@@ -203,9 +205,21 @@ def replay_packets(
         replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows)
 
 
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def sum_weights(by_gaussian, weights, out):
+    """What each Gaussian that was hit weighed, from the ``weights`` of the rows."""
+    for segment in prange(len(out)):
+        total = 0.0
+        for k in range(by_gaussian.starts[segment], by_gaussian.starts[segment + 1]):
+            total += weights[by_gaussian.order[k]]
+        out[segment] = total
+
+
 @lean(fastmath={"contract"})
-def sum_chunk(first, last, rays, packets, parameters, scene, limits, by_gaussian, rows, out, sums, basis):
-    """Sum the rows of the Gaussians ``first`` to ``last`` in packet order; the sums become gradients.
+def sum_chunk(
+    first, last, rays, packets, parameters, scene, limits, by_gaussian, which, rows, out, sums, basis
+):
+    """Sum the rows of the Gaussians ``which[first:last]`` in packet order; the sums become gradients.
 
     ``sums`` is room for one row, ``basis`` for harmonics. The frame is taken in float64 from the raw
     parameters: float32 axes would cost needles digits.
@@ -216,16 +230,17 @@ def sum_chunk(first, last, rays, packets, parameters, scene, limits, by_gaussian
     words = rows.sums.view(np.int32)
     with_geometry = rows.geometry.shape[1] > 0
     sh_bytes = scene.sh.shape[1] * 12
-    for segment in range(first, last):
-        if segment + AHEAD < last:
-            ahead = by_gaussian.ids[starts[segment + AHEAD]]
+    for place in range(first, last):
+        if place + AHEAD < last:
+            ahead = by_gaussian.ids[starts[which[place + AHEAD]]]
             prefetch(scene.records.ctypes.data + ahead * RECORD_BYTES)
             ask_for(scene.sh.ctypes.data + ahead * sh_bytes, sh_bytes)
+        segment = which[place]
         i = by_gaussian.ids[starts[segment]]
         sums[:] = 0.0
-        out.sh[segment, :, :] = np.float32(0.0)
+        out.sh[place, :, :] = np.float32(0.0)
         for f in range(feature_count):
-            out.features[segment, f] = np.float32(0.0)
+            out.features[place, f] = np.float32(0.0)
         r1, r2, r3 = rotation_columns(
             np.float64(quats[i, 0]), np.float64(quats[i, 1]),
             np.float64(quats[i, 2]), np.float64(quats[i, 3]),
@@ -262,30 +277,31 @@ def sum_chunk(first, last, rays, packets, parameters, scene, limits, by_gaussian
             view = write_view(basis, basis_count, x, y, z)
             for j in range(basis_count):
                 for channel in range(3):
-                    out.sh[segment, j, channel] += basis[j] * by_colour[channel]
+                    out.sh[place, j, channel] += basis[j] * by_colour[channel]
             if basis_count > 1:
                 by_x, by_y, by_z = slope_by_mean(scene.sh, i, basis_count, view, by_colour)
                 m0, m1, m2 = m0 + by_x, m1 + by_y, m2 + by_z
             for f in range(feature_count):
-                out.features[segment, f] += rows.features[row, f]
-        out.ids[segment] = i
+                out.features[place, f] += rows.features[row, f]
+        out.ids[place] = i
         moments = Moments(
             sums[H], sums[HU], sums[HV], sums[HUU], sums[HUV], sums[HVV],
             tau, tau_u, tau_v, n0, n1, n2, m0, m1, m2,
         )  # fmt: skip
         frame = r1, r2, r3, s2, s3
-        write_gradients(segment, i, frame, parameters.quats, scene.records, moments, out)
-        out.weights[segment] = sums[W]
-        out.errors[segment] = sums[ERROR]
-        out.counts[segment] = np.int32(sums[COUNT])
+        write_gradients(place, i, frame, parameters.quats, scene.records, moments, out)
+        out.weights[place] = sums[W]
+        out.errors[place] = sums[ERROR]
+        out.counts[place] = np.int32(sums[COUNT])
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def sum_packets(rays, packets, parameters, scene, limits, by_gaussian, rows, chunks, out):
-    """:func:`sum_chunk` on all Gaussians that were hit."""
-    segments = len(by_gaussian.starts) - 1
-    per_chunk = (segments + chunks - 1) // chunks
+def sum_packets(rays, packets, parameters, scene, limits, by_gaussian, which, rows, chunks, out):
+    """:func:`sum_chunk` on the Gaussians that are numbers ``which`` of those that were hit."""
+    per_chunk = (len(which) + chunks - 1) // chunks
     for chunk in prange(chunks):
-        first, last = chunk * per_chunk, min(segments, (chunk + 1) * per_chunk)
+        first, last = chunk * per_chunk, min(len(which), (chunk + 1) * per_chunk)
         sums, basis = np.empty(ROW_WORDS, np.float64), np.empty(16, np.float64)
-        sum_chunk(first, last, rays, packets, parameters, scene, limits, by_gaussian, rows, out, sums, basis)
+        sum_chunk(
+            first, last, rays, packets, parameters, scene, limits, by_gaussian, which, rows, out, sums, basis
+        )

@@ -23,6 +23,7 @@ from engine.trace.cpu.kernels_packet_backward import (
     Rows,
     replay_packets,
     sum_packets,
+    sum_weights,
 )
 from engine.trace.cpu.kernels_packet_forward import absorb_packets, trace_packets
 from engine.trace.cpu.kernels_rays import SPARE
@@ -130,28 +131,40 @@ class PacketTracer:
         )  # fmt: skip
 
     def backward(
-        self, recording: CpuRecording, gradients: OutputGradients, scene: Scene, parameters: Parameters
+        self,
+        recording: CpuRecording,
+        gradients: OutputGradients,
+        scene: Scene,
+        parameters: Parameters,
+        least_weight: float,
     ) -> GaussianGradients:
-        """Gradients of the raw parameters: summed within each packet, then over packets in their order."""
+        """Gradients of the raw parameters: summed within each packet, then over packets in their order.
+
+        Gaussians whose weights add up to less than ``least_weight`` are left out before the sums.
+        """
         firsts = np.concatenate([[0], np.cumsum(recording.kept.slot_counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
         geometry = GEOMETRY_WORDS if gradients.with_geometry else 0
-        ids, sums, by_geometry, features = self._pool.empty(
+        ids, weights, sums, by_geometry, features = self._pool.empty(
             ((count,), np.int32),
+            ((count,), np.float32),
             ((count, ROW_WORDS), np.float32),
             ((count, geometry), np.float32),
             ((count, feature_count), np.float32),
         )
-        rows = Rows(firsts, ids, sums, by_geometry, features)
+        rows = Rows(firsts, ids, weights, sums, by_geometry, features)
         rays, packets = Rays.of(recording.rays), recording.packets
         replay_packets(
             rays, packets, recording.hits, recording.kept, recording.counts, parameters, scene.features,
             self._limits, gradients, self._threads, np.zeros(1, np.int64), rows,
         )  # fmt: skip
         by_gaussian = ByGaussian(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
-        out = empty_gradients(len(by_gaussian.starts) - 1, basis_count, feature_count)
+        met = np.empty(len(by_gaussian.starts) - 1, np.float32)
+        sum_weights(by_gaussian, rows.weights, met)
+        which = np.flatnonzero(met >= least_weight)
+        out = empty_gradients(len(which), basis_count, feature_count)
         sum_packets(
-            rays, packets, parameters, scene, self._limits, by_gaussian, rows,
+            rays, packets, parameters, scene, self._limits, by_gaussian, which, rows,
             SUM_CHUNKS * self._threads, raw_gradients(out),
         )  # fmt: skip
         return out

@@ -16,7 +16,7 @@ from engine.trace.cpu.packets import PacketTracer, Ways, find_packets
 from engine.trace.cpu.recording import CpuRecording
 from engine.trace.cpu.single_rays import SingleRayTracer
 from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, TraceResult, TraceSettings
-from engine.trace.sums import add_gradients
+from engine.trace.sums import add_gradients, heavier
 
 MAX_RAYS_PER_TRACE = 1 << 28
 
@@ -131,12 +131,11 @@ class CpuTracer:
         given = output_gradients(gradients, len(hits.rays), self._features.shape[1])
         parameters = Parameters.of(self._gaussians)
         if len(hits.alone) == 0:
-            return self._packets.backward(hits, given, self._scene, parameters)
-        by_singles = self._singles.backward(hits, given, self._scene, parameters)
-        if len(hits.packets) == 0:
-            return by_singles
-        by_packets = self._packets.backward(hits, given, self._scene, parameters)
-        return add_gradients([by_packets, by_singles])
+            return self._packets.backward(hits, given, self._scene, parameters, gradients.least_weight)
+        parts = [self._singles.backward(hits, given, self._scene, parameters)]
+        if len(hits.packets):
+            parts.insert(0, self._packets.backward(hits, given, self._scene, parameters, 0.0))
+        return heavier(add_gradients(parts), gradients.least_weight)
 
     @property
     def _scene(self) -> Scene:
