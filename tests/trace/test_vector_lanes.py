@@ -15,10 +15,10 @@ from engine.trace.cpu.kernels_lanes import DOUBLE8, INT8, MASK8, Gapless, load
 from engine.trace.cpu.kernels_simd import boxes_in_pyramid, ellipses_in_pyramid
 
 ADDRESS, DOUBLE, SINGLE, WORD = types.uintp, types.float64, types.float32, types.int64
-MEET = (ADDRESS, DOUBLE, DOUBLE, DOUBLE, SINGLE, SINGLE, WORD, WORD, *(ADDRESS,) * 6)
+MEET = (ADDRESS, *(SINGLE,) * 5, WORD, WORD, *(ADDRESS,) * 6)
 KERNELS = {
     "meet_block": (kernels_eight.meet_block, MEET),
-    "write_alphas": (kernels_eight.write_alphas, (ADDRESS, ADDRESS, WORD, DOUBLE)),
+    "write_alphas": (kernels_eight.write_alphas, (ADDRESS, ADDRESS, WORD, SINGLE)),
     "sort_few": (kernels_eight.sort_few, (ADDRESS, WORD, ADDRESS)),
     "weigh_next": (
         kernels_eight.weigh_next,

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
+from engine.trace.cpu.kernels_rays import ray_slopes
 from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
 
 BINS = 64
@@ -23,18 +24,15 @@ _GRAZING = 1e-6
 
 
 @njit(error_model="numpy")
-def write_bins(directions, first, last, frame, below):
+def write_bins(rays, first, last, frame, below):
     """Bins per slope into the frame, and the bits of the rays in bins before i into ``below[axis, i]``."""
     frame[13] = BINS / (frame[10] - frame[9])
     frame[14] = BINS / (frame[12] - frame[11])
     below[:] = 0
     for r in range(first, last):
-        d0, d1, d2 = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
-        inverse = 1.0 / (d0 * frame[0] + d1 * frame[1] + d2 * frame[2])
+        a, b, _per_axis = ray_slopes(rays, r, frame)
         bit = np.uint64(1) << np.uint64(r - first)
-        for axis in range(2):
-            k = 3 + 3 * axis
-            slope = (d0 * frame[k] + d1 * frame[k + 1] + d2 * frame[k + 2]) * inverse
+        for axis, slope in enumerate((a, b)):
             place = (slope - frame[9 + 2 * axis]) * frame[13 + axis]
             below[axis, np.int64(min(max(place, 0.0), BINS - 1.0)) + 1] |= bit
     for i in range(BINS):
@@ -62,8 +60,8 @@ def footprints(typingctx, block, frame, ox, oy, oz, bins, distances):
             broadcast(builder, builder.load(builder.gep(words, [ir.Constant(I64, k)])))
             for k in range(FRAME_WORDS)
         ]
-        m = [rows[k] - broadcast(builder, o) for k, o in enumerate((ox, oy, oz))]
-        u, v = [rows[3 + k] for k in range(3)], [rows[6 + k] for k in range(3)]
+        m = [rows[k].doubles() - broadcast(builder, o) for k, o in enumerate((ox, oy, oz))]
+        u, v = [rows[3 + k].doubles() for k in range(3)], [rows[6 + k].doubles() for k in range(3)]
         middle, u_axis, v_axis = dot(m, f[0:3]), dot(u, f[0:3]), dot(v, f[0:3])
         depth2, reach2 = middle * middle, u_axis * u_axis + v_axis * v_axis
         in_front = (depth2 > reach2 * 1.1) & (middle > 0.0)

@@ -25,8 +25,11 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
 5. Backwards, the rays of a packet sum their shares of a Gaussian in one row of moments, which is enough as
    all share o (:mod:`engine.trace.cpu.kernels_packet_backward`). Rows are sorted and summed by Gaussian.
 
-Steps 1 to 3 leave out only what no ray meets; a hit itself is computed in float64 from the record. So a ray
-has the same hits in any packet and alone, up to the last digits of float64.
+Steps 1 to 3 leave out only what no ray meets. Rows are computed in float64 from the record, in the packet's
+frame, and rounded to float32, in which rays are tested: what is lost is 1e-7 of a slope against the axis, the
+last digit of a direction in float32. So a ray has the same hits in any packet and alone but at the edges of
+octagons, at distances that differ in the last digits of float32; and edge on, where a distance is as
+uncertain as the record's normal, by up to a slope times 4e-7 over the cosine.
 """
 
 import math
@@ -39,7 +42,7 @@ from numba import njit
 from engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X, ROWS
 from engine.trace.cpu.kernels_footprint import BINS, FRAME_WORDS, footprints, rays_between, write_bins
 from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
-from engine.trace.cpu.kernels_rays import ray_origin, record_vector
+from engine.trace.cpu.kernels_rays import ray_origin, ray_slopes, record_vector
 from engine.trace.cpu.kernels_simd import (
     boxes_in_pyramid,
     ellipses_in_pyramid,
@@ -51,7 +54,7 @@ from engine.trace.kernels_native import LINE, ask_for, lean, prefetch
 
 STACK = 1024
 """Words for the nodes that wait, two each; a walk goes down at once, so that seven wait on each level."""
-ROW_BYTES, NODE_BYTES, BLOCK_BYTES = ROWS * WIDTH * 8, BOX_ROWS * WIDTH * 4, LEAF_ROWS * WIDTH * 4
+ROW_BYTES, NODE_BYTES, BLOCK_BYTES = ROWS * WIDTH * 4, BOX_ROWS * WIDTH * 4, LEAF_ROWS * WIDTH * 4
 AHEAD = 8
 """Candidates between asking for a record and reading it: about as long as memory takes to answer."""
 RECORD_BYTES = RECORD_WORDS * 4
@@ -59,7 +62,7 @@ CHUNK = 128
 """Candidates that a ray tests before it composites what lies safely in front of the rest.
 
 Small enough that rays which end early leave most candidates untested, large enough that the sorting of a
-ray's hits, once a chunk, does not show; a chunk's rows (12 kB) stay in the first cache.
+ray's hits, once a chunk, does not show; a chunk's rows (6 kB) stay in the first cache.
 """
 WORD = 64
 """Blocks whose bits make one word of a ray's."""
@@ -128,11 +131,11 @@ class Candidates(NamedTuple):
     near: Float32[np.ndarray, " c1"]
     block_rays: UInt64[np.ndarray, " b"]
     ray_blocks: UInt64[np.ndarray, "w 64"]
-    rows: Float64[np.ndarray, "b 12 8"]
+    rows: Float32[np.ndarray, "b 12 8"]
     slot_of: Int32[np.ndarray, " c"]
     shown: Float64[np.ndarray, "c 8"]
     pending: UInt64[np.ndarray, " c8"]
-    alphas: Float64[np.ndarray, " c8"]
+    alphas: Float32[np.ndarray, " c8"]
     opacities: Float32[np.ndarray, " c8"]
     us: Float32[np.ndarray, " c8"]
     vs: Float32[np.ndarray, " c8"]
@@ -181,11 +184,11 @@ def new_candidates(room):
         np.empty(room + 1, np.float32),
         np.empty(room // WIDTH, np.uint64),
         np.empty((room // (WIDTH * WORD) + 1, WORD), np.uint64),
-        aligned_doubles(room * ROWS).reshape((room // WIDTH, ROWS, WIDTH)),
+        aligned_doubles(room * ROWS // 2).view(np.float32).reshape((room // WIDTH, ROWS, WIDTH)),
         np.empty(room, np.int32),
         aligned_doubles(room * SHOWN).reshape((room, SHOWN)),
         np.empty(room + WIDTH, np.uint64),
-        np.empty(room + WIDTH, np.float64),
+        np.empty(room + WIDTH, np.float32),
         np.empty(room + WIDTH, np.float32),
         np.empty(room + WIDTH, np.float32),
         np.empty(room + WIDTH, np.float32),
@@ -224,9 +227,9 @@ def packet_starts(origins, directions, most, least_cosine, starts):
 
 
 @lean()
-def write_pyramid(directions, first, last, pyramid):
+def write_pyramid(rays, first, last, pyramid):
     """The pyramid around rays ``first`` to ``last``."""
-    planes, frame = pyramid.planes, pyramid.frame
+    planes, frame, directions = pyramid.planes, pyramid.frame, rays.directions
     x = y = z = 0.0
     for r in range(first, last):
         x += directions[r, 0]
@@ -242,13 +245,13 @@ def write_pyramid(directions, first, last, pyramid):
     scale = 1.0 / math.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
     e0, e1, e2 = e0 * scale, e1 * scale, e2 * scale
     f0, f1, f2 = y * e2 - z * e1, z * e0 - x * e2, x * e1 - y * e0
+    frame[0], frame[1], frame[2] = x, y, z
+    frame[3], frame[4], frame[5] = e0, e1, e2
+    frame[6], frame[7], frame[8] = f0, f1, f2
     a_low = b_low = np.inf
     a_high = b_high = -np.inf
     for r in range(first, last):
-        d0, d1, d2 = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
-        inverse = 1.0 / (d0 * x + d1 * y + d2 * z)
-        a = (d0 * e0 + d1 * e1 + d2 * e2) * inverse
-        b = (d0 * f0 + d1 * f1 + d2 * f2) * inverse
+        a, b, _per_axis = ray_slopes(rays, r, frame)
         a_low, a_high, b_low, b_high = min(a_low, a), max(a_high, a), min(b_low, b), max(b_high, b)
     a_low, a_high = a_low - SLOPE_ROOM, a_high + SLOPE_ROOM
     b_low, b_high = b_low - SLOPE_ROOM, b_high + SLOPE_ROOM
@@ -261,11 +264,8 @@ def write_pyramid(directions, first, last, pyramid):
     for side in range(SIDES):
         for axis in range(3):
             rows[side, 3 + axis] = 3 + axis if planes[side, axis] > 0.0 else axis
-    frame[0], frame[1], frame[2] = x, y, z
-    frame[3], frame[4], frame[5] = e0, e1, e2
-    frame[6], frame[7], frame[8] = f0, f1, f2
     frame[9], frame[10], frame[11], frame[12] = a_low, a_high, b_low, b_high
-    write_bins(directions, first, last, frame, pyramid.below)
+    write_bins(rays, first, last, frame, pyramid.below)
 
 
 @lean(fastmath={"contract"})
@@ -335,7 +335,7 @@ def gather_candidates(tree, pyramid, origin, farthest, walk, candidates):
 @njit(error_model="numpy")
 def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
     """Candidates of the packet of rays ``first`` to ``last``, and how many; room grows as needed."""
-    write_pyramid(rays.directions, first, last, pyramid)
+    write_pyramid(rays, first, last, pyramid)
     one_end = len(rays.t_max) == 1
     farthest = rays.t_max[0 if one_end else first]
     if not one_end:
@@ -349,11 +349,20 @@ def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
     return candidates, count
 
 
+@lean(forceinline=True, fastmath={"contract"})
+def write_turned(block, row, lane, frame, x, y, z):
+    """A vector along the axis, e and f of a packet's ``frame``, as three rows of a lane."""
+    for axis in range(3):
+        k = 3 * axis
+        block[row + axis, lane] = np.float32(x * frame[k] + y * frame[k + 1] + z * frame[k + 2])
+
+
 @lean(fastmath={"contract"})
-def write_rows(candidates, count, scene, origin, coloured):
+def write_rows(candidates, count, scene, origin, frame, coloured):
     """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit.
 
-    Harmonics are asked for if hits will be ``coloured``.
+    Differences and turns into the packet's ``frame`` are taken in float64, and only what comes of them is
+    rounded. Harmonics are asked for if hits will be ``coloured``.
     """
     ox, oy, oz = origin
     rows, ids, records, sh = candidates.rows, candidates.ids, scene.records, scene.sh
@@ -367,9 +376,9 @@ def write_rows(candidates, count, scene, origin, coloured):
         block, lane = rows[k // WIDTH], k % WIDTH
         if k >= count:
             for row in range(ROWS):
-                block[row, lane] = 0.0
-            block[N_X, lane] = 1.0
-            block[INNER, lane] = -1.0
+                block[row, lane] = np.float32(0.0)
+            block[N_X, lane] = np.float32(1.0)
+            block[INNER, lane] = np.float32(-1.0)
             continue
         record = records[ids[k]]
         x, y, z = record[MEAN] - ox, record[MEAN + 1] - oy, record[MEAN + 2] - oz
@@ -379,13 +388,13 @@ def write_rows(candidates, count, scene, origin, coloured):
         height = x * n0 + y * n1 + z * n2
         xa = x * a0 + y * a1 + z * a2
         xb = x * b0 + y * b1 + z * b2
-        block[N_X, lane], block[N_X + 1, lane], block[N_X + 2, lane] = n0, n1, n2
-        block[A_X, lane] = height * a0 - xa * n0
-        block[A_X + 1, lane] = height * a1 - xa * n1
-        block[A_X + 2, lane] = height * a2 - xa * n2
-        block[B_X, lane] = height * b0 - xb * n0
-        block[B_X + 1, lane] = height * b1 - xb * n1
-        block[B_X + 2, lane] = height * b2 - xb * n2
-        block[N_0, lane] = height
+        write_turned(block, N_X, lane, frame, n0, n1, n2)
+        write_turned(
+            block, A_X, lane, frame, height * a0 - xa * n0, height * a1 - xa * n1, height * a2 - xa * n2
+        )
+        write_turned(
+            block, B_X, lane, frame, height * b0 - xb * n0, height * b1 - xb * n1, height * b2 - xb * n2
+        )
+        block[N_0, lane] = np.float32(height)
         block[INNER, lane] = record[INNER_RADIUS]
         block[ALPHA_0, lane] = record[OPACITY]

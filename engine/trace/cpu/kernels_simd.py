@@ -1,7 +1,8 @@
 """Eight lanes at a time: the tests of a packet as explicit vectors.
 
-Loop vectorisers leave these short loops scalar. The intrinsics emit vectors of eight doubles, which the
-compiler maps to whatever the processor has; no flag allows it to change a result.
+Loop vectorisers leave these short loops scalar. The intrinsics emit vectors of eight float32, one register
+of AVX2, or of eight doubles, which the compiler maps to whatever the processor has; no flag allows it to
+change a result.
 """
 
 import llvmlite.ir as ir
@@ -16,7 +17,7 @@ FLOAT8 = ir.VectorType(ir.FloatType(), LANES)
 
 
 class Vector:
-    """A vector value with the operators that the formulas need."""
+    """A vector value with the operators that the formulas need; numbers become lanes of its own type."""
 
     def __init__(self, builder, value):
         self.builder, self.value = builder, value
@@ -24,7 +25,7 @@ class Vector:
     def _other(self, other):
         if isinstance(other, Vector):
             return other.value
-        return ir.Constant(DOUBLE8, [float(other)] * LANES)
+        return ir.Constant(self.value.type, [float(other)] * LANES)
 
     def __add__(self, other):
         return Vector(self.builder, self.builder.fadd(self.value, self._other(other), flags=("contract",)))
@@ -37,6 +38,12 @@ class Vector:
 
     def __truediv__(self, other):
         return Vector(self.builder, self.builder.fdiv(self.value, self._other(other)))
+
+    def __rtruediv__(self, other):
+        return Vector(self.builder, self.builder.fdiv(self._other(other), self.value))
+
+    def __rsub__(self, other):
+        return Vector(self.builder, self.builder.fsub(self._other(other), self.value, flags=("contract",)))
 
     def _compare(self, operator, other):
         return Vector(self.builder, self.builder.fcmp_ordered(operator, self.value, self._other(other)))
@@ -60,10 +67,11 @@ class Vector:
         return Vector(self.builder, self.builder.not_(self.value))
 
     def __abs__(self):
-        integers = ir.VectorType(I64, LANES)
-        no_sign = ir.Constant(integers, [0x7FFFFFFFFFFFFFFF] * LANES)
+        width = 64 if self.value.type == DOUBLE8 else 32
+        integers = ir.VectorType(ir.IntType(width), LANES)
+        no_sign = ir.Constant(integers, [(1 << (width - 1)) - 1] * LANES)
         bits = self.builder.and_(self.builder.bitcast(self.value, integers), no_sign)
-        return Vector(self.builder, self.builder.bitcast(bits, DOUBLE8))
+        return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
 
     def larger(self, other):
         """The larger of two lanes; the second where they cannot be compared."""
@@ -75,13 +83,19 @@ class Vector:
 
     def where(self, yes, no):
         """Lanes of ``yes`` where this comparison holds, else those of ``no``."""
-        return Vector(self.builder, self.builder.select(self.value, self._other(yes), self._other(no)))
+        lanes = yes if isinstance(yes, Vector) else no  # at least one of the two is a vector
+        return Vector(self.builder, self.builder.select(self.value, lanes._other(yes), lanes._other(no)))
 
     def root(self):
         """Square roots."""
-        function_type = ir.FunctionType(DOUBLE8, [DOUBLE8])
-        function = cgutils.get_or_insert_function(self.builder.module, function_type, "llvm.sqrt.v8f64")
+        kind = self.value.type
+        name = "llvm.sqrt.v8f64" if kind == DOUBLE8 else "llvm.sqrt.v8f32"
+        function = cgutils.get_or_insert_function(self.builder.module, ir.FunctionType(kind, [kind]), name)
         return Vector(self.builder, self.builder.call(function, [self.value]))
+
+    def doubles(self):
+        """The same numbers of float32 lanes as doubles."""
+        return Vector(self.builder, self.builder.fpext(self.value, DOUBLE8))
 
     def integers(self):
         """Towards zero, as int32; the lanes must fit."""
@@ -96,7 +110,7 @@ class Lanes:
     """Loads and stores rows of eight lanes at an address."""
 
     def __init__(self, builder, address, element):
-        self.builder, self.size = builder, 8 if element is DOUBLE8 else 4
+        self.builder, self.size = builder, 8 if element == DOUBLE8 else 4
         self.element = element
         self.address = address
 
@@ -110,20 +124,18 @@ class Lanes:
         return self.builder.inttoptr(address, self.element.as_pointer())
 
     def __getitem__(self, row):
-        value = self.builder.load(self._pointer(row), align=4)
-        if self.element is FLOAT8:
-            value = self.builder.fpext(value, DOUBLE8)
-        return Vector(self.builder, value)
+        return Vector(self.builder, self.builder.load(self._pointer(row), align=4))
 
     def __setitem__(self, row, vector):
-        self.builder.store(vector.value, self._pointer(row), align=8)
+        self.builder.store(vector.value, self._pointer(row), align=4)
 
 
 def broadcast(builder, scalar):
-    """A vector of eight times the same double."""
-    one = builder.insert_element(ir.Constant(DOUBLE8, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
+    """A vector of eight times the same float32 or double."""
+    nothing = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
+    one = builder.insert_element(nothing, scalar, ir.Constant(ir.IntType(32), 0))
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return Vector(builder, builder.shuffle_vector(one, ir.Constant(DOUBLE8, ir.Undefined), zeros))
+    return Vector(builder, builder.shuffle_vector(one, nothing, zeros))
 
 
 @intrinsic
@@ -143,7 +155,7 @@ def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
             distance = None
             for axis in range(3):
                 normal, row = _plane(builder, args[1], side, axis)
-                term = (rows[row] - o[axis]) * normal
+                term = (rows[row].doubles() - o[axis]) * normal
                 distance = term if distance is None else distance + term
             here = distance >= 0.0
             inside = here if inside is None else inside & here
@@ -164,8 +176,8 @@ def ellipses_in_pyramid(typingctx, block, planes, ox, oy, oz):
     def codegen(context, builder, sig, args):
         rows = Lanes(builder, args[0], FLOAT8)
         o = [broadcast(builder, component) for component in args[2:]]
-        centre = [rows[axis] - o[axis] for axis in range(3)]
-        legs = [rows[3 + k] for k in range(6)]
+        centre = [rows[axis].doubles() - o[axis] for axis in range(3)]
+        legs = [rows[3 + k].doubles() for k in range(6)]
         inside = None
         for side in range(5):
             n = [_plane(builder, args[1], side, axis)[0] for axis in range(3)]
