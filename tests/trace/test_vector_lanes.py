@@ -11,6 +11,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from engine.trace.cpu import kernels_eight, kernels_eight_backward, kernels_lanes
+from engine.trace.cpu.kernels_footprint import footprints
 from engine.trace.cpu.kernels_lanes import DOUBLE8, INT8, MASK8, Gapless, load
 from engine.trace.cpu.kernels_simd import boxes_in_pyramid, ellipses_in_pyramid
 
@@ -33,8 +34,9 @@ KERNELS = {
         (*(ADDRESS,) * 7, WORD, DOUBLE, SINGLE, *(ADDRESS,) * 4),
     ),
     "add_row": (kernels_eight_backward.add_row, (ADDRESS, ADDRESS)),
-    "boxes_in_pyramid": (boxes_in_pyramid, (ADDRESS, ADDRESS, *(DOUBLE,) * 3)),
-    "ellipses_in_pyramid": (ellipses_in_pyramid, (ADDRESS, ADDRESS, *(DOUBLE,) * 3)),
+    "boxes_in_pyramid": (boxes_in_pyramid, (ADDRESS, ADDRESS, *(SINGLE,) * 3)),
+    "ellipses_in_pyramid": (ellipses_in_pyramid, (ADDRESS, ADDRESS, *(SINGLE,) * 3)),
+    "footprints": (footprints, (ADDRESS, ADDRESS, *(SINGLE,) * 3, ADDRESS, ADDRESS)),
 }
 CPUS = {
     # Whole registers, and products fused with sums, as the assembly of each writes them.

@@ -19,17 +19,17 @@ from engine.trace.cpu.kernels_eight import (
 from engine.trace.cpu.kernels_hit import MEAN, NORMAL
 from engine.trace.cpu.kernels_packet import (
     CHUNK,
+    RECORD_BYTES,
     ROW_BYTES,
     SHOWN,
     START_ROOM,
     WORD,
     find_candidates,
     new_candidates,
-    new_pyramid,
-    new_walk,
     write_rows,
 )
 from engine.trace.cpu.kernels_packet_order import keep_candidates, sort_candidates
+from engine.trace.cpu.kernels_packet_walk import new_pyramid, new_walk
 from engine.trace.cpu.kernels_rays import (
     first_place,
     ray_limits,
@@ -41,7 +41,7 @@ from engine.trace.cpu.kernels_rays import (
 from engine.trace.cpu.kernels_sh import colour, write_view
 from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit
 from engine.trace.cpu.kernels_tree import WIDTH
-from engine.trace.kernels_native import ask_for, lean, next_from_counter
+from engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch
 
 RANKED = 96
 """Hits that are sorted by counting, for each, the smaller ones, eight at once: quadratic, but without a
@@ -154,11 +154,13 @@ def know_alphas(candidates, first, last, alpha_max):
 
 
 @lean(forceinline=True)
-def ask_for_colours(new, numbers, ids, sh):
-    """Ask for the harmonics of the hits ``new`` at once, so that memory is not waited for one by one."""
-    sh_bytes = sh.shape[1] * 12
+def ask_for_colours(new, numbers, ids, scene):
+    """Ask for what the hits ``new`` show at once, so that memory is not waited for one by one."""
+    sh_at, sh_bytes = scene.sh.ctypes.data, scene.sh.shape[1] * 12
     while new != 0:
-        ask_for(sh.ctypes.data + ids[numbers[lowest_bit(new)]] * sh_bytes, sh_bytes)
+        i = ids[numbers[lowest_bit(new)]]
+        prefetch(scene.records.ctypes.data + i * RECORD_BYTES)
+        ask_for(sh_at + i * sh_bytes, sh_bytes)
         new &= new - 1
 
 
@@ -237,7 +239,7 @@ def trace_ray(r, bit, place, slots, slot_base, origin, frame, forward, candidate
                 scratch.depths.ctypes.data,
             )  # fmt: skip
             if new & (new - 1) != 0:
-                ask_for_colours(new, scratch.numbers, ids, forward.scene.sh)
+                ask_for_colours(new, scratch.numbers, ids, forward.scene)
             while new != 0:
                 k = lowest_bit(new)
                 new &= new - 1

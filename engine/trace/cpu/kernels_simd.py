@@ -14,6 +14,12 @@ LANES = 8
 I64 = ir.IntType(64)
 DOUBLE8 = ir.VectorType(ir.DoubleType(), LANES)
 FLOAT8 = ir.VectorType(ir.FloatType(), LANES)
+SIDES = 5
+"""Planes of a pyramid: four through its sides, one through its apex across the axis."""
+PLANE_WORDS = 9
+ROUNDING = 2e-6
+"""Room for rounding where candidates are sought in float32, as a fraction of the numbers that go in: some
+thirty roundings, while a sum of three products with differences and normals has eight."""
 
 
 class Vector:
@@ -138,25 +144,34 @@ def broadcast(builder, scalar):
     return Vector(builder, builder.shuffle_vector(one, nothing, zeros))
 
 
+def size_of(vectors):
+    """Sum of the magnitudes of several vectors."""
+    total = abs(vectors[0])
+    for vector in vectors[1:]:
+        total = total + abs(vector)
+    return total
+
+
 @intrinsic
 def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
     """Bit k: box k of a node reaches into the pyramid with apex o and the five inward ``planes``.
 
-    Row s of the planes is a normal of three doubles and three int64, the rows of the node that hold the box's
-    farthest corner along it.
+    Row s of the planes is a normal, its positive parts and its negative ones, float32. A box turned inside
+    out, whose corners are infinite, is in no pyramid.
     """
-    signature = types.int64(types.uintp, types.uintp, types.float64, types.float64, types.float64)
+    signature = types.int64(types.uintp, types.uintp, *(types.float32,) * 3)
 
     def codegen(context, builder, sig, args):
         rows = Lanes(builder, args[0], FLOAT8)
         o = [broadcast(builder, component) for component in args[2:]]
+        low, high = ([rows[first + axis] - o[axis] for axis in range(3)] for first in (0, 3))
+        room = size_of([abs(a).larger(abs(b)) for a, b in zip(low, high, strict=True)]) * ROUNDING
         inside = None
-        for side in range(5):
-            distance = None
-            for axis in range(3):
-                normal, row = _plane(builder, args[1], side, axis)
-                term = (rows[row].doubles() - o[axis]) * normal
-                distance = term if distance is None else distance + term
+        for side in range(SIDES):
+            distance = room
+            for axis in range(3):  # that of the corner farthest along the normal
+                distance = distance + high[axis] * _plane(builder, args[1], side, 3 + axis)
+                distance = distance + low[axis] * _plane(builder, args[1], side, 6 + axis)
             here = distance >= 0.0
             inside = here if inside is None else inside & here
         return inside.mask()
@@ -166,22 +181,22 @@ def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
 
 @intrinsic
 def ellipses_in_pyramid(typingctx, block, planes, ox, oy, oz):
-    """Bit k: ellipse k of a block of leaves reaches into the pyramid.
+    """Bit k: ellipse k of a block of leaves reaches into the pyramid; see :func:`boxes_in_pyramid`.
 
     Its farthest point inwards along a normal lies sqrt(u^2 + v^2) beyond its centre, u and v being its legs
     along the normal.
     """
-    signature = types.int64(types.uintp, types.uintp, types.float64, types.float64, types.float64)
+    signature = types.int64(types.uintp, types.uintp, *(types.float32,) * 3)
 
     def codegen(context, builder, sig, args):
         rows = Lanes(builder, args[0], FLOAT8)
-        o = [broadcast(builder, component) for component in args[2:]]
-        centre = [rows[axis].doubles() - o[axis] for axis in range(3)]
-        legs = [rows[3 + k].doubles() for k in range(6)]
+        centre = [rows[axis] - broadcast(builder, args[2 + axis]) for axis in range(3)]
+        legs = [rows[3 + k] for k in range(6)]
+        room = size_of([*centre, *legs]) * ROUNDING
         inside = None
-        for side in range(5):
-            n = [_plane(builder, args[1], side, axis)[0] for axis in range(3)]
-            height = centre[0] * n[0] + centre[1] * n[1] + centre[2] * n[2]
+        for side in range(SIDES):
+            n = [_plane(builder, args[1], side, axis) for axis in range(3)]
+            height = centre[0] * n[0] + centre[1] * n[1] + centre[2] * n[2] + room
             u = legs[0] * n[0] + legs[1] * n[1] + legs[2] * n[2]
             v = legs[3] * n[0] + legs[4] * n[1] + legs[5] * n[2]
             outside = (height < 0.0) & (height * height > u * u + v * v)
@@ -191,13 +206,11 @@ def ellipses_in_pyramid(typingctx, block, planes, ox, oy, oz):
     return signature, codegen
 
 
-def _plane(builder, planes, side, axis):
-    """Broadcast component of a normal, and the row of the box's corner along it."""
-    words = builder.inttoptr(planes, ir.DoubleType().as_pointer())
-    value = builder.load(builder.gep(words, [ir.Constant(I64, side * 6 + axis)]))
-    rows = builder.inttoptr(planes, I64.as_pointer())
-    row = builder.load(builder.gep(rows, [ir.Constant(I64, side * 6 + 3 + axis)]))
-    return broadcast(builder, value), row
+def _plane(builder, planes, side, column):
+    """One number of a normal's row in all lanes."""
+    words = builder.inttoptr(planes, ir.FloatType().as_pointer())
+    place = ir.Constant(I64, side * PLANE_WORDS + column)
+    return broadcast(builder, builder.load(builder.gep(words, [place])))
 
 
 @intrinsic
