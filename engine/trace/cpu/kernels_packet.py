@@ -14,7 +14,8 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
       |<----- safe ----->|
 
 1. One walk down the hierarchy finds the blocks of eight Gaussians whose box reaches into the pyramid (A, not
-   B), and of these Gaussians those whose ellipse does: the candidates, once for all 64 rays.
+   B), and of these Gaussians those whose ellipse does: the candidates, once for all 64 rays
+   (:mod:`engine.trace.cpu.kernels_packet_walk`).
 2. The outline of an ellipse, seen from o, lies between two slopes a and two slopes b. Tables over 64 bins of
    each give the rays in between as the bits of one word. A candidate without a bit lies between the rays.
 3. Candidates are sorted by their likely distance and cut into chunks of 128. Within a chunk those that the

@@ -91,7 +91,7 @@ def new_walk():
 
 @lean(forceinline=True)
 def write_plane(plane, x, y, z):
-    """A normal, its positive parts, which a box's high corner takes, and its negative ones, for the low one."""
+    """A normal, its positive parts, which take a high corner, and its negative ones, which take a low."""
     plane[0], plane[1], plane[2] = x, y, z
     plane[3], plane[4], plane[5] = max(x, 0.0), max(y, 0.0), max(z, 0.0)
     plane[6], plane[7], plane[8] = min(x, 0.0), min(y, 0.0), min(z, 0.0)
