@@ -11,14 +11,15 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from engine.trace.cpu import kernels_eight, kernels_eight_backward, kernels_lanes
+from engine.trace.cpu.kernels_footprint import footprints
 from engine.trace.cpu.kernels_lanes import DOUBLE8, INT8, MASK8, Gapless, load
 from engine.trace.cpu.kernels_simd import boxes_in_pyramid, ellipses_in_pyramid
 
 ADDRESS, DOUBLE, SINGLE, WORD = types.uintp, types.float64, types.float32, types.int64
-MEET = (ADDRESS, DOUBLE, DOUBLE, DOUBLE, SINGLE, SINGLE, WORD, WORD, *(ADDRESS,) * 6)
+MEET = (ADDRESS, *(SINGLE,) * 5, WORD, WORD, *(ADDRESS,) * 6)
 KERNELS = {
     "meet_block": (kernels_eight.meet_block, MEET),
-    "write_alphas": (kernels_eight.write_alphas, (ADDRESS, ADDRESS, WORD, DOUBLE)),
+    "write_alphas": (kernels_eight.write_alphas, (ADDRESS, ADDRESS, WORD, SINGLE)),
     "sort_few": (kernels_eight.sort_few, (ADDRESS, WORD, ADDRESS)),
     "weigh_next": (
         kernels_eight.weigh_next,
@@ -33,8 +34,9 @@ KERNELS = {
         (*(ADDRESS,) * 7, WORD, DOUBLE, SINGLE, *(ADDRESS,) * 4),
     ),
     "add_row": (kernels_eight_backward.add_row, (ADDRESS, ADDRESS)),
-    "boxes_in_pyramid": (boxes_in_pyramid, (ADDRESS, ADDRESS, *(DOUBLE,) * 3)),
-    "ellipses_in_pyramid": (ellipses_in_pyramid, (ADDRESS, ADDRESS, *(DOUBLE,) * 3)),
+    "boxes_in_pyramid": (boxes_in_pyramid, (ADDRESS, ADDRESS, *(SINGLE,) * 3)),
+    "ellipses_in_pyramid": (ellipses_in_pyramid, (ADDRESS, ADDRESS, *(SINGLE,) * 3)),
+    "footprints": (footprints, (ADDRESS, ADDRESS, *(SINGLE,) * 3, ADDRESS, ADDRESS)),
 }
 CPUS = {
     # Whole registers, and products fused with sums, as the assembly of each writes them.

@@ -1,7 +1,9 @@
 """Eight hits of a ray at a time, as explicit vectors: where they are, how opaque, and what light is left.
 
-Addresses point to doubles, eight to a vector, unless said otherwise; stores may write up to eight values
-where fewer count, so that arrays have room for eight more. No flag allows the compiler to change a result.
+Where a hit is and how opaque is found in float32, one register of AVX2 for eight; what light is left is
+multiplied up in doubles. Addresses point to doubles, eight to a vector, unless said otherwise; stores may
+write up to eight values where fewer count, so that arrays have room for eight more. No flag allows the
+compiler to change a result.
 """
 
 import llvmlite.ir as ir
@@ -11,7 +13,6 @@ from numba.extending import intrinsic
 
 from engine.trace.cpu.kernels_lanes import (
     DOUBLE,
-    FLOAT,
     I32,
     INT8,
     LONG8,
@@ -33,57 +34,55 @@ from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Ve
 
 N_X, A_X, B_X, N_0, INNER, ALPHA_0 = 0, 3, 6, 9, 10, 11
 ROWS = 12
-"""Rows of a block of eight candidates: u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0."""
+"""Rows of a block of eight candidates, float32: u (N.d) = A.d and v (N.d) = B.d, t (N.d) = n0.
+
+N, A and B are along their packet's axis, e and f, where a ray is d = c (1, a, b) with small slopes a and b.
+"""
 
 
 @intrinsic
 def meet_block(
-    typingctx, block, dx, dy, dz, t_min, t_max, first, tail, keys, powers, opacities, us, vs, numbers
+    typingctx, block, a, b, per_axis, t_min, t_max, first, tail, keys, powers, opacities, us, vs, numbers
 ):
     """Test the eight candidates of a block, from ``first`` on; how many octagons the ray meets.
 
-    Of each that it meets between the two distances writes from place ``tail`` on, without gaps: a key, the
-    float32 distance in the upper half and the place in the lower (uint64); the exponent -(u^2 + v^2)/2;
-    and as 32-bit words the opacity, u, v and the number of the candidate. A ray that makes a cosine below
-    1e-6 with the normal runs inside the plane and meets nothing.
+    The ray has the slopes ``a`` and ``b`` in its packet's frame and is ``per_axis`` times as long as its way
+    along the axis. Of each octagon that it meets between the two distances writes from place ``tail`` on,
+    without gaps: a key, the float32 distance in the upper half and the place in the lower (uint64); and as
+    32-bit words the exponent -(u^2 + v^2)/2, the opacity, u, v and the number of the candidate. A ray that
+    makes a cosine below 1e-6 with the normal runs inside the plane and meets nothing.
     """
-    double, single, address = types.float64, types.float32, types.uintp
-    signature = types.int64(
-        address, double, double, double, single, single, types.int64, types.int64, *(address,) * 6
-    )
+    single, address = types.float32, types.uintp
+    signature = types.int64(address, *(single,) * 5, types.int64, types.int64, *(address,) * 6)
 
     def codegen(context, builder, sig, args):
-        block, dx, dy, dz, t_min, t_max, first, tail, keys, powers, opacities, us, vs, numbers = args
-        rows = Lanes(builder, block, DOUBLE8)
-        d = [broadcast(builder, component) for component in (dx, dy, dz)]
+        block, a, b, per_axis, t_min, t_max, first, tail, keys, powers, opacities, us, vs, numbers = args
+        rows = Lanes(builder, block, FLOAT8)
+        a, b, per_axis, t_min, t_max = (broadcast(builder, value) for value in (a, b, per_axis, t_min, t_max))
 
         def along(row):
-            return rows[row] * d[0] + rows[row + 1] * d[1] + rows[row + 2] * d[2]
+            return rows[row + 2] * b + (rows[row + 1] * a + rows[row])
 
-        cosine = along(N_X)
-        inverse = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES)) / cosine
+        slant = along(N_X)  # the cosine times per_axis, as (1, a, b) is longer than the ray
+        inverse = 1.0 / slant
         u, v = along(A_X) * inverse, along(B_X) * inverse
         cos_22, sin_22 = 0.9238795325112867, 0.3826834323650898
         farthest = (abs(u) * cos_22 + abs(v) * sin_22).larger(abs(u) * sin_22 + abs(v) * cos_22)
-        met = ((farthest <= rows[INNER]) & (abs(cosine) >= 1e-6)).value
-        t = builder.fptrunc((rows[N_0] * inverse).value, FLOAT8)
-        behind = builder.fcmp_ordered(">", t, splat(builder, t_min, FLOAT))
-        before = builder.fcmp_ordered("<", t, splat(builder, t_max, FLOAT))
-        met = builder.and_(met, builder.and_(behind, before))
+        t = rows[N_0] * inverse * per_axis
+        met = (farthest <= rows[INNER]) & (abs(slant) >= per_axis * 1e-6) & (t > t_min) & (t < t_max)
 
-        gapless = Gapless(context, builder, met)
+        gapless = Gapless(context, builder, met.value)
         places = builder.add(splat(builder, tail, I64), ir.Constant(LONG8, list(range(LANES))))
-        distance = builder.zext(gapless.packed(builder.bitcast(t, INT8)), LONG8)
+        distance = builder.zext(gapless.packed(builder.bitcast(t.value, INT8)), LONG8)
         key = builder.or_(builder.shl(distance, ir.Constant(LONG8, [32] * LANES)), places)
         store(builder, key, offset(builder, keys, tail, 8))
-        gapless.put(((u * u + v * v) * -0.5).value, offset(builder, powers, tail, 8))
         number = builder.add(
             splat(builder, builder.trunc(first, I32), I32), ir.Constant(INT8, list(range(LANES)))
         )
-        opacity = builder.fptrunc(rows[ALPHA_0].value, FLOAT8)
-        u, v = builder.fptrunc(u.value, FLOAT8), builder.fptrunc(v.value, FLOAT8)
-        for value, array in ((opacity, opacities), (u, us), (v, vs), (number, numbers)):
-            gapless.put(value, offset(builder, array, tail, 4))
+        power = (u * u + v * v) * -0.5
+        for vector, array in ((power, powers), (rows[ALPHA_0], opacities), (u, us), (v, vs)):
+            gapless.put(vector.value, offset(builder, array, tail, 4))
+        gapless.put(number, offset(builder, numbers, tail, 4))
         return gapless.count()
 
     return signature, codegen
@@ -91,20 +90,18 @@ def meet_block(
 
 @intrinsic
 def write_alphas(typingctx, powers, opacities, place, alpha_max):
-    """Eight exponents from ``place`` on become alphas: opacity exp(power), at most the max, as float32.
+    """Eight exponents from ``place`` on become alphas: opacity exp(power), at most the max; all float32.
 
-    The exponential is right to a relative 1e-8 for |power| < 700.
+    The exponential is right to a relative 1e-7 for |power| < 87.
     """
-    signature = types.void(types.uintp, types.uintp, types.int64, types.float64)
+    signature = types.void(types.uintp, types.uintp, types.int64, types.float32)
 
     def codegen(context, builder, sig, args):
         powers, opacities, place, alpha_max = args
-        at = offset(builder, powers, place, 8)
+        at = offset(builder, powers, place, 4)
         opacity = Lanes(builder, offset(builder, opacities, place, 4), FLOAT8)[0]
-        found = opacity * _exponential(builder, Lanes(builder, at, DOUBLE8)[0])
-        found = found.smaller(broadcast(builder, alpha_max))
-        rounded = builder.fpext(builder.fptrunc(found.value, FLOAT8), DOUBLE8)
-        store(builder, rounded, at)
+        found = opacity * _exponential(builder, Lanes(builder, at, FLOAT8)[0])
+        store(builder, found.smaller(broadcast(builder, alpha_max)).value, at)
         return context.get_dummy_value()
 
     return signature, codegen
@@ -171,10 +168,10 @@ def weigh_next(typingctx, keys, most, safe, known_alphas, t, stop_below, alphas,
     """Weights of the next of a ray's sorted hits, eight at the most, before which the transmittance is ``t``.
 
     Counts those of the first ``most`` of the ``keys`` that are below ``safe``. Writes their alphas, read from
-    ``known_alphas`` at the places in the keys, to ``alphas``, alpha T to ``weights``, and the transmittance
-    behind each to ``after``; what lies beyond them changes nothing. The result has the bits of those behind
-    which it is below ``stop_below``; eight bits higher of those behind which it is one half or less; and
-    their number from bit 16 on.
+    ``known_alphas`` at the places in the keys, to ``alphas`` (both float32), alpha T to ``weights``, and the
+    transmittance behind each to ``after``; what lies beyond them changes nothing. The result has the bits of
+    those behind which it is below ``stop_below``; eight bits higher of those behind which it is one half or
+    less; and their number from bit 16 on.
     """
     address, double, word = types.uintp, types.float64, types.int64
     signature = word(address, word, types.uint64, address, double, double, address, address, address)
@@ -184,11 +181,11 @@ def weigh_next(typingctx, keys, most, safe, known_alphas, t, stop_below, alphas,
         key = load(builder, keys, LONG8)
         valid = builder.icmp_unsigned("<", key, splat(builder, safe, I64))
         valid = builder.and_(valid, lanes_below(builder, most))
-        alpha = gather(builder, known_alphas, places_of(builder, key, valid), DOUBLE8)
-        alpha = Vector(builder, builder.select(valid, alpha, ir.Constant(DOUBLE8, [0.0] * LANES)))
+        alpha = gather(builder, known_alphas, places_of(builder, key, valid), FLOAT8)
+        alpha = Vector(builder, builder.select(valid, alpha, ir.Constant(FLOAT8, [0.0] * LANES)))
         store(builder, alpha.value, alphas)
-        one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
-        product = scan(builder, one - alpha, lambda a, b: a * b, 1.0)
+        alpha = alpha.doubles()
+        product = scan(builder, 1.0 - alpha, lambda a, b: a * b, 1.0)
         through = shifted(builder, product, 1, 1.0)
         begin = broadcast(builder, t)
         left = product * begin
@@ -223,8 +220,7 @@ def know_slots(typingctx, keys, count, known_numbers, slot_of, weights, numbers,
         store(builder, number, numbers)
         store(builder, slot, slots)
         weight = Lanes(builder, weights, DOUBLE8)[0]
-        distance = Vector(builder, builder.fpext(distances_of(builder, key), DOUBLE8))
-        distance = first_lanes(builder, distance, count)
+        distance = first_lanes(builder, Vector(builder, distances_of(builder, key)).doubles(), count)
         store(builder, (Lanes(builder, depths, DOUBLE8)[0] + weight * distance).value, depths)
         new = builder.icmp_signed("<", slot, ir.Constant(LONG8, [0] * LANES))
         return Vector(builder, builder.and_(new, valid)).mask()
@@ -249,7 +245,7 @@ def keep_hits(
         key = load(builder, keys, LONG8)
         where = places_of(builder, key, lanes_below(builder, count))
         values = (
-            builder.fptrunc(load(builder, alphas, DOUBLE8), FLOAT8),
+            load(builder, alphas, FLOAT8),
             distances_of(builder, key),
             gather(builder, known_us, where, FLOAT8),
             gather(builder, known_vs, where, FLOAT8),
@@ -288,14 +284,18 @@ def add_shown(typingctx, sums, shown, slots, weights, count):
 
 
 def _exponential(builder, x):
-    """Exponentials of eight doubles: 2^n times a polynomial of what is left, at most half of ln 2."""
-    shift = 6755399441055744.0  # 1.5 * 2^52: adding it rounds to a whole number, which the low bits then are
+    """Exponentials of eight float32: 2^n times a polynomial of what is left, at most half of ln 2.
+
+    The polynomial and ln 2 in two parts, the first of which times n is exact, are those of Cephes' expf
+    (https://www.netlib.org/cephes/).
+    """
+    shift = 12582912.0  # 1.5 * 2^23: adding it rounds to a whole number, which the low bits then are
     moved = x * 1.4426950408889634 + shift
     n = moved - shift
-    r = x - n * 0.6931471805599453
-    p = r * (1.0 / 40320.0) + 1.0 / 5040.0
-    for term in (1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0):
+    r = x - n * 0.693359375 + n * 2.12194440e-4
+    p = r * 1.9875691500e-4 + 1.3981999507e-3
+    for term in (8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1, 1.0, 1.0):
         p = p * r + term
-    bits = builder.shl(builder.bitcast(moved.value, LONG8), ir.Constant(LONG8, [52] * LANES))
-    bits = builder.add(bits, ir.Constant(LONG8, [1023 << 52] * LANES))
-    return p * Vector(builder, builder.bitcast(bits, DOUBLE8))
+    bits = builder.shl(builder.bitcast(moved.value, INT8), ir.Constant(INT8, [23] * LANES))
+    bits = builder.add(bits, ir.Constant(INT8, [127 << 23] * LANES))
+    return p * Vector(builder, builder.bitcast(bits, FLOAT8))

@@ -35,9 +35,8 @@ def walk_through(typingctx, alphas, count, t, through):
 
     def codegen(context, builder, sig, args):
         alphas, count, t, through = args
-        alpha = first_lanes(builder, Lanes(builder, alphas, FLOAT8)[0], count)
-        one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
-        product = scan(builder, one - alpha, lambda a, b: a * b, 1.0)
+        alpha = first_lanes(builder, Lanes(builder, alphas, FLOAT8)[0].doubles(), count)
+        product = scan(builder, 1.0 - alpha, lambda a, b: a * b, 1.0)
         store(builder, (shifted(builder, product, 1, 1.0) * broadcast(builder, t)).value, through)
         return builder.fmul(builder.extract_element(product.value, ir.Constant(I32, LANES - 1)), t)
 
@@ -79,16 +78,15 @@ def replay_hits(
             at = builder.add(by_ray, ir.Constant(I64, (3 + channel) * 4))
             slope = builder.fpext(builder.load(builder.inttoptr(at, FLOAT.as_pointer())), DOUBLE)
             value = value + Vector(builder, colour) * broadcast(builder, slope)
-        alpha = Lanes(builder, alphas, FLOAT8)[0]
+        alpha = Lanes(builder, alphas, FLOAT8)[0].doubles()
         clamped = alpha >= broadcast(builder, builder.fpext(alpha_max, DOUBLE))
         alpha = first_lanes(builder, alpha, count)
         through = Lanes(builder, through, DOUBLE8)[0]
-        one = Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
         weight = first_lanes(builder, alpha * through, count)
         seen = first_lanes(builder, weight * value, count)
         sums = scan(builder, seen, lambda a, b: a + b, 0.0, backwards=True)
         later = shifted(builder, sums, -1, 0.0) + broadcast(builder, behind)
-        h = (through * value - later / (one - alpha)) * alpha
+        h = (through * value - later / (1.0 - alpha)) * alpha
         h = first_lanes(builder, clamped.where(0.0, h), count)
         weight, h = builder.fptrunc(weight.value, FLOAT8), builder.fptrunc(h.value, FLOAT8)
         store(builder, weight, weights)
@@ -109,7 +107,7 @@ def add_row(typingctx, sums, row):
     def codegen(context, builder, sig, args):
         total, added = Lanes(builder, args[0], DOUBLE8), Lanes(builder, args[1], FLOAT8)
         for half in range(2):
-            total[half] = total[half] + added[half]
+            total[half] = total[half] + added[half].doubles()
         return context.get_dummy_value()
 
     return signature, codegen

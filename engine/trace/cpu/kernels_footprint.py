@@ -10,7 +10,8 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
-from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
+from engine.trace.cpu.kernels_rays import ray_slopes
+from engine.trace.cpu.kernels_simd import FLOAT8, I64, LANES, ROUNDING, Lanes, broadcast, size_of
 
 BINS = 64
 GRID = 8
@@ -18,23 +19,18 @@ CELLS = GRID * GRID
 """Cells of the pyramid's cross section along a Z-order curve."""
 FRAME_WORDS = 15
 """A packet's axis, e and f; its slopes a low, a high, b low, b high; bins per slope along a and b."""
-_GRAZING = 1e-6
-"""Room for the rounding of normals, as a fraction of the ellipse's size."""
 
 
 @njit(error_model="numpy")
-def write_bins(directions, first, last, frame, below):
+def write_bins(rays, first, last, frame, below):
     """Bins per slope into the frame, and the bits of the rays in bins before i into ``below[axis, i]``."""
     frame[13] = BINS / (frame[10] - frame[9])
     frame[14] = BINS / (frame[12] - frame[11])
     below[:] = 0
     for r in range(first, last):
-        d0, d1, d2 = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
-        inverse = 1.0 / (d0 * frame[0] + d1 * frame[1] + d2 * frame[2])
+        a, b, _per_axis = ray_slopes(rays, r, frame)
         bit = np.uint64(1) << np.uint64(r - first)
-        for axis in range(2):
-            k = 3 + 3 * axis
-            slope = (d0 * frame[k] + d1 * frame[k + 1] + d2 * frame[k + 2]) * inverse
+        for axis, slope in enumerate((a, b)):
             place = (slope - frame[9 + 2 * axis]) * frame[13 + axis]
             below[axis, np.int64(min(max(place, 0.0), BINS - 1.0)) + 1] |= bit
     for i in range(BINS):
@@ -44,20 +40,20 @@ def write_bins(directions, first, last, frame, below):
 
 @intrinsic
 def footprints(typingctx, block, frame, ox, oy, oz, bins, distances):
-    """Outlines and distances of the eight ellipses of a block of leaves, seen from o.
+    """Outlines and distances of the eight ellipses of a block of leaves, seen from o; all float32.
 
-    Writes the first and last bin along a, then along b, as rows of eight int32 to ``bins``, and two rows of
-    doubles to ``distances``: the least distance at which a ray of the packet can meet the ellipse, and that
-    at which most do. An ellipse that reaches behind the origin is everywhere. Bit k of the result: octagon k
-    has not vanished.
+    Writes the first and last bin along a, then along b, as rows of eight int32 to ``bins``, and two rows to
+    ``distances``: the least distance at which a ray of the packet can meet the ellipse, and that at which
+    most do. Outlines are wider and least distances less by what rounding can do. An ellipse that reaches
+    behind the origin is everywhere. Bit k of the result: octagon k has not vanished.
     """
-    double, address = types.float64, types.uintp
-    signature = types.int64(address, address, double, double, double, address, address)
+    single, address = types.float32, types.uintp
+    signature = types.int64(address, address, single, single, single, address, address)
 
     def codegen(context, builder, sig, args):
         block, frame, ox, oy, oz, bins, distances = args
         rows = Lanes(builder, block, FLOAT8)
-        words = builder.inttoptr(frame, ir.DoubleType().as_pointer())
+        words = builder.inttoptr(frame, ir.FloatType().as_pointer())
         f = [
             broadcast(builder, builder.load(builder.gep(words, [ir.Constant(I64, k)])))
             for k in range(FRAME_WORDS)
@@ -67,10 +63,13 @@ def footprints(typingctx, block, frame, ox, oy, oz, bins, distances):
         middle, u_axis, v_axis = dot(m, f[0:3]), dot(u, f[0:3]), dot(v, f[0:3])
         depth2, reach2 = middle * middle, u_axis * u_axis + v_axis * v_axis
         in_front = (depth2 > reach2 * 1.1) & (middle > 0.0)
-        per_middle = _one(builder) / middle
-        size = abs(u[0]) + abs(u[1]) + abs(u[2]) + abs(v[0]) + abs(v[1]) + abs(v[2])
-        room = size * per_middle * _GRAZING + 1e-9
-        inverse = _one(builder) / (depth2 - reach2)
+        per_middle = 1.0 / middle
+        inverse = 1.0 / (depth2 - reach2)
+        far, size = size_of(m), size_of([*u, *v])
+        # What is off by a fraction of m or of the legs moves a slope by that over the depth, times the slope;
+        # and the difference of squares passes on as often what is off in them.
+        wide = (far + size * 2.0) * per_middle * (depth2 * inverse)
+        room = wide * wide * ROUNDING + 1e-9
         out = Lanes(builder, bins, ir.VectorType(ir.IntType(32), LANES))
         for axis in range(2):
             e = f[3 + 3 * axis : 6 + 3 * axis]
@@ -93,16 +92,18 @@ def footprints(typingctx, block, frame, ox, oy, oz, bins, distances):
         on_e, on_f = dot(n, f[3:6]), dot(n, f[6:9])
         behind = height < 0.0
         height, on_axis, on_e, on_f = (
-            behind.where(_one(builder) * 0.0 - term, term) for term in (height, on_axis, on_e, on_f)
+            behind.where(0.0 - term, term) for term in (height, on_axis, on_e, on_f)
         )
+        unsure = size_of(n) * ROUNDING
         steepest = on_axis + (f[9] * on_e).larger(f[10] * on_e) + (f[11] * on_f).larger(f[12] * on_f)
+        steepest = steepest + unsure
         reach = reach2.root()
-        near = middle - reach
-        least = (steepest > 0.0).where(near.larger(height / steepest), near)
+        near = middle - reach - (far + size) * ROUNDING
+        least = (steepest > 0.0).where(near.larger((height - far * unsure) / steepest), near)
         likely = (on_axis > 0.0).where(height / on_axis, middle)
         likely = likely.larger(near).smaller(middle + reach)
-        out = Lanes(builder, distances, DOUBLE8)
-        out[0] = (least * (1.0 - 1e-6)).larger(0.0)
+        out = Lanes(builder, distances, FLOAT8)
+        out[0] = least.larger(0.0)
         out[1] = likely.larger(0.0)
         return (reach2 >= 0.0).mask()
 
@@ -112,10 +113,6 @@ def footprints(typingctx, block, frame, ox, oy, oz, bins, distances):
 def dot(a, b):
     """Sum of products."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _one(builder):
-    return Vector(builder, ir.Constant(DOUBLE8, [1.0] * LANES))
 
 
 @njit(error_model="numpy")

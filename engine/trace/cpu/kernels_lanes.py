@@ -20,7 +20,7 @@ def scan(builder, vector, combine, neutral, backwards=False):
 
 def shifted(builder, vector, by, filling):
     """Lane k moves to lane k + ``by``; ``filling`` comes in."""
-    fill = ir.Constant(DOUBLE8, [float(filling)] * LANES)
+    fill = ir.Constant(vector.value.type, [float(filling)] * LANES)
     places = [k - by if 0 <= k - by < LANES else LANES for k in range(LANES)]
     order = ir.Constant(ir.VectorType(I32, LANES), places)
     return Vector(builder, builder.shuffle_vector(vector.value, fill, order))
@@ -36,7 +36,7 @@ def splat(builder, scalar, kind):
 def first_lanes(builder, vector, count):
     """The first ``count`` lanes; zero in the others."""
     valid = lanes_below(builder, count)
-    return Vector(builder, builder.select(valid, vector.value, ir.Constant(DOUBLE8, [0.0] * LANES)))
+    return Vector(builder, builder.select(valid, vector.value, ir.Constant(vector.value.type, [0.0] * LANES)))
 
 
 def lanes_below(builder, count):

@@ -14,7 +14,8 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
       |<----- safe ----->|
 
 1. One walk down the hierarchy finds the blocks of eight Gaussians whose box reaches into the pyramid (A, not
-   B), and of these Gaussians those whose ellipse does: the candidates, once for all 64 rays.
+   B), and of these Gaussians those whose ellipse does: the candidates, once for all 64 rays
+   (:mod:`engine.trace.cpu.kernels_packet_walk`).
 2. The outline of an ellipse, seen from o, lies between two slopes a and two slopes b. Tables over 64 bins of
    each give the rays in between as the bits of one word. A candidate without a bit lies between the rays.
 3. Candidates are sorted by their likely distance and cut into chunks of 128. Within a chunk those that the
@@ -25,33 +26,27 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
 5. Backwards, the rays of a packet sum their shares of a Gaussian in one row of moments, which is enough as
    all share o (:mod:`engine.trace.cpu.kernels_packet_backward`). Rows are sorted and summed by Gaussian.
 
-Steps 1 to 3 leave out only what no ray meets; a hit itself is computed in float64 from the record. So a ray
-has the same hits in any packet and alone, up to the last digits of float64.
+Steps 1 to 3 leave out only what no ray meets. Rows are computed in float64 from the record, in the packet's
+frame, and rounded to float32, in which rays are tested: what is lost is 1e-7 of a slope against the axis, the
+last digit of a direction in float32. So a ray has the same hits in any packet and alone but at the edges of
+octagons, at distances that differ in the last digits of float32; and edge on, where a distance is as
+uncertain as the record's normal, by up to a slope times 4e-7 over the cosine.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64, UInt64
+from jaxtyping import Float32, Float64, Int32, UInt64
 from numba import njit
 
 from engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X, ROWS
-from engine.trace.cpu.kernels_footprint import BINS, FRAME_WORDS, footprints, rays_between, write_bins
 from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
+from engine.trace.cpu.kernels_packet_walk import gather_candidates, write_pyramid
 from engine.trace.cpu.kernels_rays import ray_origin, record_vector
-from engine.trace.cpu.kernels_simd import (
-    boxes_in_pyramid,
-    ellipses_in_pyramid,
-    float32_bits,
-    lowest_bit,
-)
-from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
-from engine.trace.kernels_native import LINE, ask_for, lean, prefetch
+from engine.trace.cpu.kernels_tree import WIDTH
+from engine.trace.kernels_native import LINE, lean, prefetch
 
-STACK = 1024
-"""Words for the nodes that wait, two each; a walk goes down at once, so that seven wait on each level."""
-ROW_BYTES, NODE_BYTES, BLOCK_BYTES = ROWS * WIDTH * 8, BOX_ROWS * WIDTH * 4, LEAF_ROWS * WIDTH * 4
+ROW_BYTES = ROWS * WIDTH * 4
 AHEAD = 8
 """Candidates between asking for a record and reading it: about as long as memory takes to answer."""
 RECORD_BYTES = RECORD_WORDS * 4
@@ -59,49 +54,14 @@ CHUNK = 128
 """Candidates that a ray tests before it composites what lies safely in front of the rest.
 
 Small enough that rays which end early leave most candidates untested, large enough that the sorting of a
-ray's hits, once a chunk, does not show; a chunk's rows (12 kB) stay in the first cache.
+ray's hits, once a chunk, does not show; a chunk's rows (6 kB) stay in the first cache.
 """
 WORD = 64
 """Blocks whose bits make one word of a ray's."""
 SHOWN = 8
 """What a Gaussian shows to a packet: its colour, 0, the normal turned towards the origin, 0."""
-SIDES = 5
-"""Planes of a pyramid: four through its sides, one through its apex across the axis."""
-SLOPE_ROOM = 1e-9
-"""The pyramid is wider than its rays by this, which covers the rounding of slopes in float64."""
 START_ROOM = 512
 """Candidates that a thread has room for at first; a packet that has more makes it grow."""
-
-
-class Tree(NamedTuple):
-    """The hierarchy; :mod:`engine.trace.cpu.kernels_tree` says how it is laid out."""
-
-    nodes: Float32[np.ndarray, "m 6 8"]
-    level_starts: Int64[np.ndarray, " l"]
-    blocks: Float32[np.ndarray, "b 9 8"]
-    order: Int32[np.ndarray, " k"]
-
-
-class Pyramid(NamedTuple):
-    """The pyramid around the rays of a packet.
-
-    ``planes`` are inward normals and, as int64, the rows of a box's farthest corner along them; ``frame`` the
-    axis, two directions across it, the range of slopes and bins per slope; ``below`` the bits of the rays in
-    the bins before each, along either slope.
-    """
-
-    planes: Float64[np.ndarray, "5 6"]
-    frame: Float64[np.ndarray, "15"]
-    below: UInt64[np.ndarray, "2 65"]
-
-
-class Walk(NamedTuple):
-    """Memory of a walk: waiting nodes, bins and distances of one block, and buckets for sorting."""
-
-    stack: Int64[np.ndarray, " s"]
-    bins: Int32[np.ndarray, "4 8"]
-    distances: Float64[np.ndarray, "2 8"]
-    histogram: Int32[np.ndarray, "256"]
 
 
 class Candidates(NamedTuple):
@@ -128,36 +88,15 @@ class Candidates(NamedTuple):
     near: Float32[np.ndarray, " c1"]
     block_rays: UInt64[np.ndarray, " b"]
     ray_blocks: UInt64[np.ndarray, "w 64"]
-    rows: Float64[np.ndarray, "b 12 8"]
+    rows: Float32[np.ndarray, "b 12 8"]
     slot_of: Int32[np.ndarray, " c"]
     shown: Float64[np.ndarray, "c 8"]
     pending: UInt64[np.ndarray, " c8"]
-    alphas: Float64[np.ndarray, " c8"]
+    alphas: Float32[np.ndarray, " c8"]
     opacities: Float32[np.ndarray, " c8"]
     us: Float32[np.ndarray, " c8"]
     vs: Float32[np.ndarray, " c8"]
     numbers: Int32[np.ndarray, " c8"]
-
-
-@njit(error_model="numpy")
-def new_pyramid():
-    """Room for a pyramid."""
-    return Pyramid(
-        np.empty((SIDES, 6), np.float64),
-        np.empty(FRAME_WORDS, np.float64),
-        np.empty((2, BINS + 1), np.uint64),
-    )
-
-
-@njit(error_model="numpy")
-def new_walk():
-    """Memory for walks, one after another."""
-    return Walk(
-        np.empty(STACK, np.int64),
-        np.empty((4, WIDTH), np.int32),
-        np.empty((2, WIDTH), np.float64),
-        np.empty(256, np.int32),
-    )
 
 
 @njit(error_model="numpy")
@@ -181,11 +120,11 @@ def new_candidates(room):
         np.empty(room + 1, np.float32),
         np.empty(room // WIDTH, np.uint64),
         np.empty((room // (WIDTH * WORD) + 1, WORD), np.uint64),
-        aligned_doubles(room * ROWS).reshape((room // WIDTH, ROWS, WIDTH)),
+        aligned_doubles(room * ROWS // 2).view(np.float32).reshape((room // WIDTH, ROWS, WIDTH)),
         np.empty(room, np.int32),
         aligned_doubles(room * SHOWN).reshape((room, SHOWN)),
         np.empty(room + WIDTH, np.uint64),
-        np.empty(room + WIDTH, np.float64),
+        np.empty(room + WIDTH, np.float32),
         np.empty(room + WIDTH, np.float32),
         np.empty(room + WIDTH, np.float32),
         np.empty(room + WIDTH, np.float32),
@@ -223,119 +162,10 @@ def packet_starts(origins, directions, most, least_cosine, starts):
     return packets
 
 
-@lean()
-def write_pyramid(directions, first, last, pyramid):
-    """The pyramid around rays ``first`` to ``last``."""
-    planes, frame = pyramid.planes, pyramid.frame
-    x = y = z = 0.0
-    for r in range(first, last):
-        x += directions[r, 0]
-        y += directions[r, 1]
-        z += directions[r, 2]
-    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
-    x, y, z = x * scale, y * scale, z * scale
-    # any frame around the axis
-    if abs(x) < 0.6:
-        e0, e1, e2 = 0.0, z, -y
-    else:
-        e0, e1, e2 = -z, 0.0, x
-    scale = 1.0 / math.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
-    e0, e1, e2 = e0 * scale, e1 * scale, e2 * scale
-    f0, f1, f2 = y * e2 - z * e1, z * e0 - x * e2, x * e1 - y * e0
-    a_low = b_low = np.inf
-    a_high = b_high = -np.inf
-    for r in range(first, last):
-        d0, d1, d2 = np.float64(directions[r, 0]), np.float64(directions[r, 1]), np.float64(directions[r, 2])
-        inverse = 1.0 / (d0 * x + d1 * y + d2 * z)
-        a = (d0 * e0 + d1 * e1 + d2 * e2) * inverse
-        b = (d0 * f0 + d1 * f1 + d2 * f2) * inverse
-        a_low, a_high, b_low, b_high = min(a_low, a), max(a_high, a), min(b_low, b), max(b_high, b)
-    a_low, a_high = a_low - SLOPE_ROOM, a_high + SLOPE_ROOM
-    b_low, b_high = b_low - SLOPE_ROOM, b_high + SLOPE_ROOM
-    planes[0, 0], planes[0, 1], planes[0, 2] = e0 - a_low * x, e1 - a_low * y, e2 - a_low * z
-    planes[1, 0], planes[1, 1], planes[1, 2] = a_high * x - e0, a_high * y - e1, a_high * z - e2
-    planes[2, 0], planes[2, 1], planes[2, 2] = f0 - b_low * x, f1 - b_low * y, f2 - b_low * z
-    planes[3, 0], planes[3, 1], planes[3, 2] = b_high * x - f0, b_high * y - f1, b_high * z - f2
-    planes[4, 0], planes[4, 1], planes[4, 2] = x, y, z
-    rows = planes.view(np.int64)
-    for side in range(SIDES):
-        for axis in range(3):
-            rows[side, 3 + axis] = 3 + axis if planes[side, axis] > 0.0 else axis
-    frame[0], frame[1], frame[2] = x, y, z
-    frame[3], frame[4], frame[5] = e0, e1, e2
-    frame[6], frame[7], frame[8] = f0, f1, f2
-    frame[9], frame[10], frame[11], frame[12] = a_low, a_high, b_low, b_high
-    write_bins(directions, first, last, frame, pyramid.below)
-
-
-@lean(fastmath={"contract"})
-def gather_candidates(tree, pyramid, origin, farthest, walk, candidates):
-    """The Gaussians whose ellipse a ray of the pyramid may meet before ``farthest``; returns how many.
-
-    Only as many as there is room for are written.
-    """
-    ox, oy, oz = origin
-    stack, bins, distances = walk.stack, walk.bins, walk.distances
-    level_starts = tree.level_starts
-    n_found = 0
-    top = len(level_starts) - 2
-    stack[0] = level_starts[top]
-    stack[1] = top
-    depth = 1
-    room = len(candidates.found)
-    nodes_at, blocks_at = tree.nodes.ctypes.data, tree.blocks.ctypes.data
-    planes_at, frame_at = pyramid.planes.ctypes.data, pyramid.frame.ctypes.data
-    bins_at, distances_at = bins.ctypes.data, distances.ctypes.data
-    while depth > 0:
-        depth -= 1
-        node = stack[2 * depth]
-        level = stack[2 * depth + 1]
-        mask = boxes_in_pyramid(nodes_at + node * NODE_BYTES, planes_at, ox, oy, oz)
-        first_child = (node - level_starts[level]) * WIDTH
-        waiting = mask
-        while waiting != 0:
-            child = first_child + lowest_bit(waiting)
-            waiting &= waiting - 1
-            if level > 0:
-                ask_for(nodes_at + (level_starts[level - 1] + child) * NODE_BYTES, NODE_BYTES)
-            else:
-                ask_for(blocks_at + child * BLOCK_BYTES, BLOCK_BYTES)
-        while mask != 0:
-            child = first_child + lowest_bit(mask)
-            mask &= mask - 1
-            if level > 0:
-                stack[2 * depth] = level_starts[level - 1] + child
-                stack[2 * depth + 1] = level - 1
-                depth += 1
-                continue
-            block_at = blocks_at + child * BLOCK_BYTES
-            reached = ellipses_in_pyramid(block_at, planes_at, ox, oy, oz)
-            if reached != 0:
-                reached &= footprints(block_at, frame_at, ox, oy, oz, bins_at, distances_at)
-            while reached != 0:
-                lane = lowest_bit(reached)
-                reached &= reached - 1
-                if distances[0, lane] >= farthest:
-                    continue
-                rays, cell = rays_between(bins, lane, pyramid.below)
-                if rays == 0:
-                    continue  # it lies between the rays
-                if n_found < room:
-                    candidates.found[n_found] = child * WIDTH + lane
-                    # non-negative floats sort like their bits
-                    likely = np.uint64(float32_bits(np.float32(distances[1, lane])))
-                    candidates.keys[n_found] = (likely << np.uint64(32)) | np.uint64(n_found)
-                    candidates.bounds[n_found] = distances[0, lane]
-                    candidates.cells[n_found] = cell
-                    candidates.masks[n_found] = rays
-                n_found += 1
-    return n_found
-
-
 @njit(error_model="numpy")
 def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
     """Candidates of the packet of rays ``first`` to ``last``, and how many; room grows as needed."""
-    write_pyramid(rays.directions, first, last, pyramid)
+    write_pyramid(rays, first, last, pyramid)
     one_end = len(rays.t_max) == 1
     farthest = rays.t_max[0 if one_end else first]
     if not one_end:
@@ -349,11 +179,20 @@ def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
     return candidates, count
 
 
+@lean(forceinline=True, fastmath={"contract"})
+def write_turned(block, row, lane, frame, x, y, z):
+    """A vector along the axis, e and f of a packet's ``frame``, as three rows of a lane."""
+    for axis in range(3):
+        k = 3 * axis
+        block[row + axis, lane] = np.float32(x * frame[k] + y * frame[k + 1] + z * frame[k + 2])
+
+
 @lean(fastmath={"contract"})
-def write_rows(candidates, count, scene, origin, coloured):
+def write_rows(candidates, count, scene, origin, frame, coloured):
     """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit.
 
-    Harmonics are asked for if hits will be ``coloured``.
+    Differences and turns into the packet's ``frame`` are taken in float64, and only what comes of them is
+    rounded. Harmonics are asked for if hits will be ``coloured``.
     """
     ox, oy, oz = origin
     rows, ids, records, sh = candidates.rows, candidates.ids, scene.records, scene.sh
@@ -367,9 +206,9 @@ def write_rows(candidates, count, scene, origin, coloured):
         block, lane = rows[k // WIDTH], k % WIDTH
         if k >= count:
             for row in range(ROWS):
-                block[row, lane] = 0.0
-            block[N_X, lane] = 1.0
-            block[INNER, lane] = -1.0
+                block[row, lane] = np.float32(0.0)
+            block[N_X, lane] = np.float32(1.0)
+            block[INNER, lane] = np.float32(-1.0)
             continue
         record = records[ids[k]]
         x, y, z = record[MEAN] - ox, record[MEAN + 1] - oy, record[MEAN + 2] - oz
@@ -379,13 +218,13 @@ def write_rows(candidates, count, scene, origin, coloured):
         height = x * n0 + y * n1 + z * n2
         xa = x * a0 + y * a1 + z * a2
         xb = x * b0 + y * b1 + z * b2
-        block[N_X, lane], block[N_X + 1, lane], block[N_X + 2, lane] = n0, n1, n2
-        block[A_X, lane] = height * a0 - xa * n0
-        block[A_X + 1, lane] = height * a1 - xa * n1
-        block[A_X + 2, lane] = height * a2 - xa * n2
-        block[B_X, lane] = height * b0 - xb * n0
-        block[B_X + 1, lane] = height * b1 - xb * n1
-        block[B_X + 2, lane] = height * b2 - xb * n2
-        block[N_0, lane] = height
+        write_turned(block, N_X, lane, frame, n0, n1, n2)
+        write_turned(
+            block, A_X, lane, frame, height * a0 - xa * n0, height * a1 - xa * n1, height * a2 - xa * n2
+        )
+        write_turned(
+            block, B_X, lane, frame, height * b0 - xb * n0, height * b1 - xb * n1, height * b2 - xb * n2
+        )
+        block[N_0, lane] = np.float32(height)
         block[INNER, lane] = record[INNER_RADIUS]
         block[ALPHA_0, lane] = record[OPACITY]

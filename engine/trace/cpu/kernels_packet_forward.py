@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt64
+from jaxtyping import Float32, Float64, Int64, UInt64
 from numba import njit, prange
 
 from engine.trace.cpu.bundles import Forward
@@ -19,29 +19,29 @@ from engine.trace.cpu.kernels_eight import (
 from engine.trace.cpu.kernels_hit import MEAN, NORMAL
 from engine.trace.cpu.kernels_packet import (
     CHUNK,
+    RECORD_BYTES,
     ROW_BYTES,
     SHOWN,
     START_ROOM,
     WORD,
     find_candidates,
     new_candidates,
-    new_pyramid,
-    new_walk,
     write_rows,
 )
 from engine.trace.cpu.kernels_packet_order import keep_candidates, sort_candidates
+from engine.trace.cpu.kernels_packet_walk import new_pyramid, new_walk
 from engine.trace.cpu.kernels_rays import (
     first_place,
-    ray_direction,
     ray_limits,
     ray_origin,
+    ray_slopes,
     record_vector,
     side_shown,
 )
 from engine.trace.cpu.kernels_sh import colour, write_view
 from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit
 from engine.trace.cpu.kernels_tree import WIDTH
-from engine.trace.kernels_native import ask_for, lean, next_from_counter
+from engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch
 
 RANKED = 96
 """Hits that are sorted by counting, for each, the smaller ones, eight at once: quadratic, but without a
@@ -59,7 +59,7 @@ class Scratch(NamedTuple):
     basis: Float64[np.ndarray, "16"]
     ranked: UInt64[np.ndarray, "104"]
     sums: Float64[np.ndarray, "8"]
-    alphas: Float64[np.ndarray, "8"]
+    alphas: Float32[np.ndarray, "8"]
     weights: Float64[np.ndarray, "8"]
     after: Float64[np.ndarray, "8"]
     depths: Float64[np.ndarray, "8"]
@@ -74,7 +74,7 @@ def new_scratch():
         np.empty(16, np.float64),
         np.empty(RANKED + WIDTH, np.uint64),
         np.empty(SHOWN, np.float64),
-        np.empty(WIDTH, np.float64),
+        np.empty(WIDTH, np.float32),
         np.empty(WIDTH, np.float64),
         np.empty(WIDTH, np.float64),
         np.empty(WIDTH, np.float64),
@@ -122,12 +122,12 @@ def sort_pending(candidates, ranked, head, tail):
 
 
 @lean(forceinline=True)
-def meet_blocks(candidates, bit, first, direction, limits, tail):
+def meet_blocks(candidates, bit, first, slopes, limits, tail):
     """Test the ``STRIDE`` blocks from ``first`` on that the packet's ray ``bit`` may meet.
 
     Returns how many hits there are then; ``tail`` are known already. The blocks' bits lie in one word.
     """
-    dx, dy, dz = direction
+    a, b, per_axis = np.float32(slopes[0]), np.float32(slopes[1]), np.float32(slopes[2])
     t_min, t_max = limits
     c = candidates
     rows_at = c.rows.ctypes.data
@@ -137,7 +137,7 @@ def meet_blocks(candidates, bit, first, direction, limits, tail):
         block = first + lowest_bit(bits)
         bits &= bits - 1
         tail += meet_block(
-            rows_at + block * ROW_BYTES, dx, dy, dz, t_min, t_max, block * WIDTH, tail,
+            rows_at + block * ROW_BYTES, a, b, per_axis, t_min, t_max, block * WIDTH, tail,
             c.pending.ctypes.data, c.alphas.ctypes.data, c.opacities.ctypes.data, c.us.ctypes.data,
             c.vs.ctypes.data, c.numbers.ctypes.data,
         )  # fmt: skip
@@ -148,15 +148,19 @@ def meet_blocks(candidates, bit, first, direction, limits, tail):
 def know_alphas(candidates, first, last, alpha_max):
     """Alphas of the hits ``first`` to ``last`` of a ray."""
     for place in range(first, last, WIDTH):
-        write_alphas(candidates.alphas.ctypes.data, candidates.opacities.ctypes.data, place, alpha_max)
+        write_alphas(
+            candidates.alphas.ctypes.data, candidates.opacities.ctypes.data, place, np.float32(alpha_max)
+        )
 
 
 @lean(forceinline=True)
-def ask_for_colours(new, numbers, ids, sh):
-    """Ask for the harmonics of the hits ``new`` at once, so that memory is not waited for one by one."""
-    sh_bytes = sh.shape[1] * 12
+def ask_for_colours(new, numbers, ids, scene):
+    """Ask for what the hits ``new`` show at once, so that memory is not waited for one by one."""
+    sh_at, sh_bytes = scene.sh.ctypes.data, scene.sh.shape[1] * 12
     while new != 0:
-        ask_for(sh.ctypes.data + ids[numbers[lowest_bit(new)]] * sh_bytes, sh_bytes)
+        i = ids[numbers[lowest_bit(new)]]
+        prefetch(scene.records.ctypes.data + i * RECORD_BYTES)
+        ask_for(sh_at + i * sh_bytes, sh_bytes)
         new &= new - 1
 
 
@@ -174,7 +178,7 @@ def show(shown, i, scene, limits, origin, basis):
 
 
 @lean(fastmath={"contract"})
-def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, count, kept, scratch):
+def trace_ray(r, bit, place, slots, slot_base, origin, frame, forward, candidates, count, kept, scratch):
     """Follow ray ``r``, which is ray ``bit`` of its packet; its hits are stored from ``place`` on.
 
     Returns the place behind its last hit, and the number of Gaussians that the packet has met, so far
@@ -184,7 +188,7 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
     pending, ids = candidates.pending, candidates.ids
     slot_of, shown = candidates.slot_of, candidates.shown
     feature_count, recording = features.shape[1], forward.recording
-    direction, span = ray_direction(forward.rays, r), ray_limits(forward.rays, r)
+    slopes, span = ray_slopes(forward.rays, r, frame), ray_limits(forward.rays, r)
     if recording:
         hits.starts[r] = place
     scratch.sums[:] = 0.0
@@ -200,7 +204,7 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
     while b0 < block_count and not stop:
         b1 = min(b0 + STRIDE, block_count)
         known = tail
-        tail = meet_blocks(candidates, bit, b0, direction, span, tail)
+        tail = meet_blocks(candidates, bit, b0, slopes, span, tail)
         if tail > known:
             know_alphas(candidates, known, tail, limits.alpha_max)
             sort_pending(candidates, scratch.ranked, head, tail)
@@ -235,7 +239,7 @@ def trace_ray(r, bit, place, slots, slot_base, origin, forward, candidates, coun
                 scratch.depths.ctypes.data,
             )  # fmt: skip
             if new & (new - 1) != 0:
-                ask_for_colours(new, scratch.numbers, ids, forward.scene.sh)
+                ask_for_colours(new, scratch.numbers, ids, forward.scene)
             while new != 0:
                 k = lowest_bit(new)
                 new &= new - 1
@@ -298,14 +302,15 @@ def trace_from_counter(forward, packets, tree, kept, counter):
         candidates, count = find_candidates(forward.rays, first, last, tree, pyramid, walk, candidates)
         sort_candidates(candidates, count, tree.order, walk.histogram)
         origin = ray_origin(forward.rays, first)
-        write_rows(candidates, count, forward.scene, origin, True)
+        write_rows(candidates, count, forward.scene, origin, pyramid.frame, True)
         candidates.slot_of[:count] = -1
         slots = 0
         place = slot_base = first_place(first, forward.limits)
         for r in range(first, last):
             place, slots = trace_ray(
-                r, r - first, place, slots, slot_base, origin, forward, candidates, count, kept, scratch
-            )
+                r, r - first, place, slots, slot_base, origin, pyramid.frame, forward, candidates, count,
+                kept, scratch,
+            )  # fmt: skip
         if forward.recording:
             kept.slot_counts[packet] = slots
 
@@ -322,13 +327,13 @@ def trace_packets(rays, scene, limits, out, hits, recording, packets, tree, kept
 
 
 @lean(fastmath={"contract"})
-def absorb_ray(r, bit, rays, candidates, count, limits):
+def absorb_ray(r, bit, rays, frame, candidates, count, limits):
     """What the candidates leave of ray ``r``, ray ``bit`` of its packet; 0 where that is below eps1."""
-    direction, span = ray_direction(rays, r), ray_limits(rays, r)
+    slopes, span = ray_slopes(rays, r, frame), ray_limits(rays, r)
     block_count = (count + WIDTH - 1) // WIDTH
     left = 1.0
     for b0 in range(0, block_count, STRIDE):
-        tail = meet_blocks(candidates, bit, b0, direction, span, 0)
+        tail = meet_blocks(candidates, bit, b0, slopes, span, 0)
         know_alphas(candidates, 0, tail, limits.alpha_max)
         for m in range(tail):
             left *= 1.0 - candidates.alphas[m]
@@ -349,9 +354,9 @@ def absorb_from_counter(rays, scene, limits, packets, tree, counter, transmittan
         first, last = packets[packet, 0], packets[packet, 1]
         candidates, count = find_candidates(rays, first, last, tree, pyramid, walk, candidates)
         keep_candidates(candidates, count, tree.order)
-        write_rows(candidates, count, scene, ray_origin(rays, first), False)
+        write_rows(candidates, count, scene, ray_origin(rays, first), pyramid.frame, False)
         for r in range(first, last):
-            transmittance[r] = absorb_ray(r, r - first, rays, candidates, count, limits)
+            transmittance[r] = absorb_ray(r, r - first, rays, pyramid.frame, candidates, count, limits)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

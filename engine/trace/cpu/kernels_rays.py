@@ -28,6 +28,21 @@ def ray_direction(rays, r):
 
 
 @lean(forceinline=True)
+def ray_slopes(rays, r, frame):
+    """Slopes a and b of ray ``r`` in a packet's ``frame``, and its length over its way along the axis.
+
+    The frame begins with the axis, e and f; the direction is axis + a e + b f over the third number.
+    """
+    d0, d1, d2 = ray_direction(rays, r)
+    per_axis = 1.0 / (d0 * frame[0] + d1 * frame[1] + d2 * frame[2])
+    return (
+        (d0 * frame[3] + d1 * frame[4] + d2 * frame[5]) * per_axis,
+        (d0 * frame[6] + d1 * frame[7] + d2 * frame[8]) * per_axis,
+        per_axis,
+    )
+
+
+@lean(forceinline=True)
 def record_vector(record, at):
     """Three numbers of a record in float64."""
     return np.float64(record[at]), np.float64(record[at + 1]), np.float64(record[at + 2])

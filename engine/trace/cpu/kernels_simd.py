@@ -1,7 +1,8 @@
 """Eight lanes at a time: the tests of a packet as explicit vectors.
 
-Loop vectorisers leave these short loops scalar. The intrinsics emit vectors of eight doubles, which the
-compiler maps to whatever the processor has; no flag allows it to change a result.
+Loop vectorisers leave these short loops scalar. The intrinsics emit vectors of eight float32, one register
+of AVX2, or of eight doubles, which the compiler maps to whatever the processor has; no flag allows it to
+change a result.
 """
 
 import llvmlite.ir as ir
@@ -13,10 +14,16 @@ LANES = 8
 I64 = ir.IntType(64)
 DOUBLE8 = ir.VectorType(ir.DoubleType(), LANES)
 FLOAT8 = ir.VectorType(ir.FloatType(), LANES)
+SIDES = 5
+"""Planes of a pyramid: four through its sides, one through its apex across the axis."""
+PLANE_WORDS = 9
+ROUNDING = 2e-6
+"""Room for rounding where candidates are sought in float32, as a fraction of the numbers that go in: some
+thirty roundings, while a sum of three products with differences and normals has eight."""
 
 
 class Vector:
-    """A vector value with the operators that the formulas need."""
+    """A vector value with the operators that the formulas need; numbers become lanes of its own type."""
 
     def __init__(self, builder, value):
         self.builder, self.value = builder, value
@@ -24,7 +31,7 @@ class Vector:
     def _other(self, other):
         if isinstance(other, Vector):
             return other.value
-        return ir.Constant(DOUBLE8, [float(other)] * LANES)
+        return ir.Constant(self.value.type, [float(other)] * LANES)
 
     def __add__(self, other):
         return Vector(self.builder, self.builder.fadd(self.value, self._other(other), flags=("contract",)))
@@ -37,6 +44,12 @@ class Vector:
 
     def __truediv__(self, other):
         return Vector(self.builder, self.builder.fdiv(self.value, self._other(other)))
+
+    def __rtruediv__(self, other):
+        return Vector(self.builder, self.builder.fdiv(self._other(other), self.value))
+
+    def __rsub__(self, other):
+        return Vector(self.builder, self.builder.fsub(self._other(other), self.value, flags=("contract",)))
 
     def _compare(self, operator, other):
         return Vector(self.builder, self.builder.fcmp_ordered(operator, self.value, self._other(other)))
@@ -60,10 +73,11 @@ class Vector:
         return Vector(self.builder, self.builder.not_(self.value))
 
     def __abs__(self):
-        integers = ir.VectorType(I64, LANES)
-        no_sign = ir.Constant(integers, [0x7FFFFFFFFFFFFFFF] * LANES)
+        width = 64 if self.value.type == DOUBLE8 else 32
+        integers = ir.VectorType(ir.IntType(width), LANES)
+        no_sign = ir.Constant(integers, [(1 << (width - 1)) - 1] * LANES)
         bits = self.builder.and_(self.builder.bitcast(self.value, integers), no_sign)
-        return Vector(self.builder, self.builder.bitcast(bits, DOUBLE8))
+        return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
 
     def larger(self, other):
         """The larger of two lanes; the second where they cannot be compared."""
@@ -75,13 +89,19 @@ class Vector:
 
     def where(self, yes, no):
         """Lanes of ``yes`` where this comparison holds, else those of ``no``."""
-        return Vector(self.builder, self.builder.select(self.value, self._other(yes), self._other(no)))
+        lanes = yes if isinstance(yes, Vector) else no  # at least one of the two is a vector
+        return Vector(self.builder, self.builder.select(self.value, lanes._other(yes), lanes._other(no)))
 
     def root(self):
         """Square roots."""
-        function_type = ir.FunctionType(DOUBLE8, [DOUBLE8])
-        function = cgutils.get_or_insert_function(self.builder.module, function_type, "llvm.sqrt.v8f64")
+        kind = self.value.type
+        name = "llvm.sqrt.v8f64" if kind == DOUBLE8 else "llvm.sqrt.v8f32"
+        function = cgutils.get_or_insert_function(self.builder.module, ir.FunctionType(kind, [kind]), name)
         return Vector(self.builder, self.builder.call(function, [self.value]))
+
+    def doubles(self):
+        """The same numbers of float32 lanes as doubles."""
+        return Vector(self.builder, self.builder.fpext(self.value, DOUBLE8))
 
     def integers(self):
         """Towards zero, as int32; the lanes must fit."""
@@ -96,7 +116,7 @@ class Lanes:
     """Loads and stores rows of eight lanes at an address."""
 
     def __init__(self, builder, address, element):
-        self.builder, self.size = builder, 8 if element is DOUBLE8 else 4
+        self.builder, self.size = builder, 8 if element == DOUBLE8 else 4
         self.element = element
         self.address = address
 
@@ -110,41 +130,48 @@ class Lanes:
         return self.builder.inttoptr(address, self.element.as_pointer())
 
     def __getitem__(self, row):
-        value = self.builder.load(self._pointer(row), align=4)
-        if self.element is FLOAT8:
-            value = self.builder.fpext(value, DOUBLE8)
-        return Vector(self.builder, value)
+        return Vector(self.builder, self.builder.load(self._pointer(row), align=4))
 
     def __setitem__(self, row, vector):
-        self.builder.store(vector.value, self._pointer(row), align=8)
+        self.builder.store(vector.value, self._pointer(row), align=4)
 
 
 def broadcast(builder, scalar):
-    """A vector of eight times the same double."""
-    one = builder.insert_element(ir.Constant(DOUBLE8, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
+    """A vector of eight times the same float32 or double."""
+    nothing = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
+    one = builder.insert_element(nothing, scalar, ir.Constant(ir.IntType(32), 0))
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return Vector(builder, builder.shuffle_vector(one, ir.Constant(DOUBLE8, ir.Undefined), zeros))
+    return Vector(builder, builder.shuffle_vector(one, nothing, zeros))
+
+
+def size_of(vectors):
+    """Sum of the magnitudes of several vectors."""
+    total = abs(vectors[0])
+    for vector in vectors[1:]:
+        total = total + abs(vector)
+    return total
 
 
 @intrinsic
 def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
     """Bit k: box k of a node reaches into the pyramid with apex o and the five inward ``planes``.
 
-    Row s of the planes is a normal of three doubles and three int64, the rows of the node that hold the box's
-    farthest corner along it.
+    Row s of the planes is a normal, its positive parts and its negative ones, float32. A box turned inside
+    out, whose corners are infinite, is in no pyramid.
     """
-    signature = types.int64(types.uintp, types.uintp, types.float64, types.float64, types.float64)
+    signature = types.int64(types.uintp, types.uintp, *(types.float32,) * 3)
 
     def codegen(context, builder, sig, args):
         rows = Lanes(builder, args[0], FLOAT8)
         o = [broadcast(builder, component) for component in args[2:]]
+        low, high = ([rows[first + axis] - o[axis] for axis in range(3)] for first in (0, 3))
+        room = size_of([abs(a).larger(abs(b)) for a, b in zip(low, high, strict=True)]) * ROUNDING
         inside = None
-        for side in range(5):
-            distance = None
-            for axis in range(3):
-                normal, row = _plane(builder, args[1], side, axis)
-                term = (rows[row] - o[axis]) * normal
-                distance = term if distance is None else distance + term
+        for side in range(SIDES):
+            distance = room
+            for axis in range(3):  # that of the corner farthest along the normal
+                distance = distance + high[axis] * _plane(builder, args[1], side, 3 + axis)
+                distance = distance + low[axis] * _plane(builder, args[1], side, 6 + axis)
             here = distance >= 0.0
             inside = here if inside is None else inside & here
         return inside.mask()
@@ -154,22 +181,22 @@ def boxes_in_pyramid(typingctx, node, planes, ox, oy, oz):
 
 @intrinsic
 def ellipses_in_pyramid(typingctx, block, planes, ox, oy, oz):
-    """Bit k: ellipse k of a block of leaves reaches into the pyramid.
+    """Bit k: ellipse k of a block of leaves reaches into the pyramid; see :func:`boxes_in_pyramid`.
 
     Its farthest point inwards along a normal lies sqrt(u^2 + v^2) beyond its centre, u and v being its legs
     along the normal.
     """
-    signature = types.int64(types.uintp, types.uintp, types.float64, types.float64, types.float64)
+    signature = types.int64(types.uintp, types.uintp, *(types.float32,) * 3)
 
     def codegen(context, builder, sig, args):
         rows = Lanes(builder, args[0], FLOAT8)
-        o = [broadcast(builder, component) for component in args[2:]]
-        centre = [rows[axis] - o[axis] for axis in range(3)]
+        centre = [rows[axis] - broadcast(builder, args[2 + axis]) for axis in range(3)]
         legs = [rows[3 + k] for k in range(6)]
+        room = size_of([*centre, *legs]) * ROUNDING
         inside = None
-        for side in range(5):
-            n = [_plane(builder, args[1], side, axis)[0] for axis in range(3)]
-            height = centre[0] * n[0] + centre[1] * n[1] + centre[2] * n[2]
+        for side in range(SIDES):
+            n = [_plane(builder, args[1], side, axis) for axis in range(3)]
+            height = centre[0] * n[0] + centre[1] * n[1] + centre[2] * n[2] + room
             u = legs[0] * n[0] + legs[1] * n[1] + legs[2] * n[2]
             v = legs[3] * n[0] + legs[4] * n[1] + legs[5] * n[2]
             outside = (height < 0.0) & (height * height > u * u + v * v)
@@ -179,13 +206,11 @@ def ellipses_in_pyramid(typingctx, block, planes, ox, oy, oz):
     return signature, codegen
 
 
-def _plane(builder, planes, side, axis):
-    """Broadcast component of a normal, and the row of the box's corner along it."""
-    words = builder.inttoptr(planes, ir.DoubleType().as_pointer())
-    value = builder.load(builder.gep(words, [ir.Constant(I64, side * 6 + axis)]))
-    rows = builder.inttoptr(planes, I64.as_pointer())
-    row = builder.load(builder.gep(rows, [ir.Constant(I64, side * 6 + 3 + axis)]))
-    return broadcast(builder, value), row
+def _plane(builder, planes, side, column):
+    """One number of a normal's row in all lanes."""
+    words = builder.inttoptr(planes, ir.FloatType().as_pointer())
+    place = ir.Constant(I64, side * PLANE_WORDS + column)
+    return broadcast(builder, builder.load(builder.gep(words, [place])))
 
 
 @intrinsic

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from engine.trace.cpu.kernels_packet import Tree
+from engine.trace.cpu.kernels_packet_walk import Tree
 from engine.trace.cpu.kernels_sort import stable_order
 from engine.trace.cpu.kernels_tree import (
     BOX_ROWS,

@@ -27,10 +27,11 @@ class CpuTracer:
     Rays that lie beside each other in the batch, share their origin, have their viewer there and look about
     one way form packets; the others are followed one by one (:func:`engine.trace.cpu.packets.find_packets`).
 
-    Hits are exact: a hierarchy only says which octagons to test, the octagon test and the distance come
-    from the parameters in float64, and hits are ordered by (float32 distance, id). So neither the shape of
+    Hits are exact: a hierarchy only says which octagons to test, and hits are ordered by (float32 distance,
+    id). The octagon test and the distance come from the parameters, for single rays in float64; packets round
+    them to float32 in a frame of their own (:mod:`engine.trace.cpu.kernels_packet`). So neither the shape of
     a hierarchy nor the number of threads changes a result; packets and single rays agree to the last digits
-    of float64. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy and a box of 24 B;
+    of float32. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy and a box of 24 B;
     Embree's hierarchy over the boxes is built when the first single rays want it.
 
     Not done: no gradient through octagon edges or visibility.
