@@ -104,7 +104,6 @@ class TraceGradients:
     """Gradients of a loss with respect to the outputs of a trace; None means zero.
 
     ``ray_errors`` is no gradient: any non-negative number a ray, shared out to its Gaussians by weight.
-    ``least_weight`` is none, either: Gaussians whose weights alpha T on all rays add up to less are left out.
     """
 
     rgb_srgb: Float32[np.ndarray, "r 3"]
@@ -114,7 +113,6 @@ class TraceGradients:
     normal_world: Float32[np.ndarray, "r 3"] | None = None
     features: Float32[np.ndarray, "r f"] | None = None
     ray_errors: Float32[np.ndarray, " r"] | None = None
-    least_weight: float = 0.0
 
     @property
     def with_geometry(self) -> bool:
@@ -203,8 +201,10 @@ class Tracer(Protocol):
         """
         ...
 
-    def backward(self, hits: Recording, gradients: TraceGradients) -> Gradients:
+    def backward(self, hits: Recording, gradients: TraceGradients, *, least_weight: float = 0.0) -> Gradients:
         """Gradients of the parameters for the rays of a recording of this tracer since its last build.
+
+        Gaussians whose weights alpha T on all these rays add up to less than ``least_weight`` are left out.
 
         Raises:
             ValueError: the recording is another tracer's, or older than the last build.

@@ -85,7 +85,9 @@ class ReferenceTracer:
         left[left < self.settings.transmittance_min] = 0.0
         return left
 
-    def backward(self, hits: Recording, gradients: TraceGradients) -> GaussianGradients:
+    def backward(
+        self, hits: Recording, gradients: TraceGradients, *, least_weight: float = 0.0
+    ) -> GaussianGradients:
         """Gradients of the raw parameters by autograd; see the protocol."""
         if not isinstance(hits, ReferenceRecording) or hits.build is not self._build:
             raise ValueError("the recording is not of this tracer, or older than its last build")
@@ -112,7 +114,7 @@ class ReferenceTracer:
             error_sums=errors[ids].astype(np.float32),
             hit_counts=counts.astype(np.int32),
         )
-        return heavier(everything, gradients.least_weight)
+        return heavier(everything, least_weight)
 
     def _parameters(self) -> ReferenceParameters:
         assert self._gaussians is not None, "build first"

@@ -83,12 +83,11 @@ def differentiate(
     recorded = [(seen.hits, by_seen), *back.further]
     if batch.sight_lines is not None:
         recorded.append(blocked_term(batch.sight_lines, tracer, weights.blocked))
-    if len(recorded) == 1:  # what several say of a Gaussian has to be added up first
-        recorded = [(seen.hits, replace(by_seen, least_weight=least_weight))]
-    gaussians = add_gradients([tracer.backward(hits, by).numpy() for hits, by in recorded])
+    least = least_weight if len(recorded) == 1 else 0.0  # what several say has to be added up first
+    parts = [tracer.backward(hits, by, least_weight=least).numpy() for hits, by in recorded]
     return Differentiated(
         loss=loss,
-        gaussians=heavier(gaussians, least_weight),
+        gaussians=heavier(add_gradients(parts), least_weight),
         shading=back.parameters,
         hits_per_ray=float(seen.hit_counts.mean()),
     )

@@ -185,14 +185,12 @@ def test_gaussians_that_hardly_weigh_are_left_out(tracer: Tracer, rng: np.random
     assert hits is not None
     all_of_them = tracer.backward(hits, given).numpy()
     least = float(np.median(all_of_them.weight_sums))
-    given.least_weight = least
-    some = tracer.backward(hits, given).numpy()
+    some = tracer.backward(hits, given, least_weight=least).numpy()
     enough = all_of_them.weight_sums >= least
     assert 0 < enough.sum() < len(enough)
     for name, rows in vars(all_of_them).items():
         assert getattr(some, name).tobytes() == rows[enough].tobytes(), name
-    given.least_weight = 1e9
-    assert len(tracer.backward(hits, given).numpy().ids) == 0
+    assert len(tracer.backward(hits, given, least_weight=1e9).numpy().ids) == 0
 
 
 def test_changed_parameters_are_read_when_told(tracer: Tracer, rng: np.random.Generator) -> None:

@@ -123,7 +123,9 @@ class CpuTracer:
             self._singles.absorb(Rays.of(rays), self._scene, alone, left)
         return left
 
-    def backward(self, hits: Recording, gradients: TraceGradients) -> GaussianGradients:
+    def backward(
+        self, hits: Recording, gradients: TraceGradients, *, least_weight: float = 0.0
+    ) -> GaussianGradients:
         """Gradients of the raw parameters; see the protocol."""
         if not isinstance(hits, CpuRecording) or hits.build is not self._build:
             raise ValueError("the recording is not of this tracer, or older than its last build")
@@ -132,11 +134,11 @@ class CpuTracer:
         given = output_gradients(gradients, len(hits.rays), self._features.shape[1])
         parameters = Parameters.of(self._gaussians)
         if len(hits.alone) == 0:
-            return self._packets.backward(hits, given, self._scene, parameters, gradients.least_weight)
+            return self._packets.backward(hits, given, self._scene, parameters, least_weight)
         parts = [self._singles.backward(hits, given, self._scene, parameters)]
         if len(hits.packets):
             parts.insert(0, self._packets.backward(hits, given, self._scene, parameters, 0.0))
-        return heavier(add_gradients(parts), gradients.least_weight)
+        return heavier(add_gradients(parts), least_weight)
 
     @property
     def _scene(self) -> Scene:
