@@ -160,6 +160,11 @@ class TrainConfig(_Frozen):
     lift_pixels: bool = Field(
         True, description="where the sparse model has fewer points, lift pixels of the photographs"
     )
+    lift_unseen: bool = Field(
+        False,
+        description="lift pixels that no neighbouring photographs show, too: where photographs are few, "
+        "detail instead of smears, not always at the right place",
+    )
     initial_opacity: float = Field(0.5, gt=0, lt=1)
     background: Literal["auto", "black", "white", "random", "learnt"] = Field(
         "auto",

@@ -111,6 +111,7 @@ def dense_points(
     threads: int = 1,
     behind: FirstBackground | None = None,
     gains: Float32[np.ndarray, " v"] | None = None,
+    unseen: bool = False,
 ) -> LiftedPoints:
     """About ``count`` points or fewer beside those of the sparse model.
 
@@ -121,6 +122,8 @@ def dense_points(
         threads: work on the views side by side, which changes no point.
         behind: what is behind everything; pixels that show it give no points.
         gains: factors on the display colours of each view, after which all are exposed alike; None for 1.
+        unseen: whether pixels whose place no two neighbouring views show, so that nothing can be matched, are
+            lifted, too: to a depth between those of the points around.
     """
     photographs = _Photographs(dataset, gains)
     known = dataset.points.xyz_world.astype(np.float64)
@@ -137,7 +140,7 @@ def dense_points(
             job: tuple[int, int, np.random.Generator], known: np.ndarray = known
         ) -> tuple[LiftedPoints, Evidence]:
             index, samples, generator = job
-            return _lift(photographs, index, samples, known, neighbours[index], generator, behind)
+            return _lift(photographs, index, samples, known, neighbours[index], generator, behind, unseen)
 
         with ThreadPoolExecutor(threads) as pool:
             parts = list(pool.map(lift, jobs))
@@ -185,6 +188,7 @@ def _lift(
     neighbours: list[int],
     rng: np.random.Generator,
     behind: FirstBackground | None,
+    unseen: bool,
 ) -> tuple[LiftedPoints, Evidence]:
     """Points for random pixels of one view."""
     dataset = photographs.dataset
@@ -197,7 +201,7 @@ def _lift(
     if len(patches.y) == 0:
         return nothing
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
-    _, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
+    away_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
     depth, cost, rivalry = _best_of(photographs, patches, depths[inside][nearest], neighbours)
     doubtful = np.flatnonzero(cost > DOUBTFUL)
     more = _sweep(depths[inside], len(doubtful), rng)
@@ -208,9 +212,12 @@ def _lift(
     good = cost < MAX_COST
     good[swept] = other[chosen] < BEHIND * depth[swept]
     depth[swept], cost[swept], rivalry[swept] = other[chosen], other_cost[chosen], other_rivalry[chosen]
+    alone = np.isinf(cost) & unseen
+    depth[alone] = _depths_between(depths[inside][nearest[alone]], away_px[alone])
+    good |= alone
     if behind is not None:
         at_infinity = _cost(photographs, patches, np.full(len(depth), INFINITY * depth.max()), neighbours)
-        as_well = at_infinity < cost + AS_WELL
+        as_well = alone | (at_infinity < cost + AS_WELL)
         good &= ~(as_well & behind.may_show(patches.directions_world[:, 0]))
     distance = depth * patches.depth_factors[:, 0]
     xyz = patches.origin_world + distance[:, None] * patches.directions_world[:, 0]
@@ -233,6 +240,14 @@ def _best_of(
     with np.errstate(invalid="ignore"):  # of what nobody shows nothing is asked
         rivalry = cost / np.maximum(rival, 1e-12)
     return np.take_along_axis(guesses, best, 1)[:, 0], cost, rivalry
+
+
+def _depths_between(
+    depths: Float64[np.ndarray, "n g"], away_px: Float64[np.ndarray, "n g"]
+) -> Float64[np.ndarray, " n"]:
+    """Mean depths, in logarithms, weighted by the inverse of the squared distance in the image."""
+    weights = 1.0 / (away_px + 1.0) ** 2
+    return np.asarray(np.exp((weights * np.log(depths)).sum(axis=1) / weights.sum(axis=1)))
 
 
 def _sweep(

@@ -47,7 +47,10 @@ def initial_gaussians(
         most = np.full(len(xyz), MAX_ANGLE)
         if config.lift_pixels and len(xyz) < limit:
             gains = evening_gains(dataset) if config.exposure is True else None
-            more = dense_points(dataset, limit - len(xyz), rng, threads=threads, behind=behind, gains=gains)
+            more = dense_points(
+                dataset, limit - len(xyz), rng,
+                threads=threads, behind=behind, gains=gains, unseen=config.lift_unseen,
+            )  # fmt: skip
             xyz, rgb = np.concatenate([xyz, more.xyz_world]), np.concatenate([rgb, more.rgb_srgb])
             most = np.concatenate([most, np.where(more.swept, SWEPT_ANGLE, MAX_ANGLE)])
         return from_points(

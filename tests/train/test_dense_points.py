@@ -98,6 +98,19 @@ def test_things_without_any_point_of_the_model_are_found(
     assert right[lifted.swept].mean() > 0.75 and right.mean() > 0.85
 
 
+def test_what_one_photograph_shows_is_lifted_where_that_is_asked(surface: cKDTree, tmp_path: Path) -> None:
+    config = GeneratedSceneConfig(views=6, width_px=160, height_px=120, points=1500, samples_per_side=1)
+    write_generated_scene(tmp_path / "scene", config)
+    few = Dataset.open(tmp_path / "scene", tmp_path / "cache")
+    matched, all_of_them = (
+        dense_points(few, 4000, np.random.default_rng(0), unseen=unseen) for unseen in (False, True)
+    )
+    assert len(all_of_them) > 1.4 * len(matched)
+    off, _ = surface.query(all_of_them.xyz_world.astype(np.float64))
+    # Between the points around them: right on walls and floor, not where things end.
+    assert (off < 0.1).mean() > 0.6 and (off < 0.3).mean() > 0.75
+
+
 def test_photographs_that_are_exposed_otherwise_match_when_evened(dataset: Dataset, tmp_path: Path) -> None:
     shutil.copytree(dataset.root, tmp_path / "scene")
     darker = np.where(np.arange(len(dataset.views)) % 3 == 1, 0.55, 1.0).astype(np.float32)
