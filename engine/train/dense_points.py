@@ -202,18 +202,22 @@ def _lift(
         return nothing
     pixels_px = np.stack([patches.x + 0.5, patches.y + 0.5], axis=1)
     away_px, nearest = cKDTree(projected_px[inside]).query(pixels_px, GUESSES)
-    depth, cost, rivalry = _best_of(photographs, patches, depths[inside][nearest], neighbours)
+    suggested = depths[inside][nearest]
+    depth, cost = _best(suggested, _costs(photographs, patches, suggested, neighbours))
     doubtful = np.flatnonzero(cost > DOUBTFUL)
     more = _sweep(depths[inside], len(doubtful), rng)
-    other, other_cost, other_rivalry = _best_of(photographs, patches[doubtful], more, neighbours)
+    more_costs = _costs(photographs, patches[doubtful], more, neighbours)
+    other, other_cost = _best(more, more_costs)
     swept = np.zeros(len(depth), np.bool_)
     swept[doubtful] = other_cost < CLEARLY * np.minimum(cost[doubtful], MAX_COST)
     chosen = swept[doubtful]
     good = cost < MAX_COST
     good[swept] = other[chosen] < BEHIND * depth[swept]
-    depth[swept], cost[swept], rivalry[swept] = other[chosen], other_cost[chosen], other_rivalry[chosen]
+    depth[swept], cost[swept] = other[chosen], other_cost[chosen]
+    rivalry = np.ones(len(depth))
+    rivalry[swept] = _rivalry(more_costs[chosen])
     alone = np.isinf(cost) & unseen
-    depth[alone] = _depths_between(depths[inside][nearest[alone]], away_px[alone])
+    depth[alone] = _depths_between(suggested[alone], away_px[alone])
     good |= alone
     if behind is not None:
         at_infinity = _cost(photographs, patches, np.full(len(depth), INFINITY * depth.max()), neighbours)
@@ -225,21 +229,29 @@ def _lift(
     return lifted[good], Evidence(np.full(len(depth), index), distance, rivalry)[good]
 
 
-def _best_of(
+def _costs(
     photographs: _Photographs,
     patches: _Patches,
     guesses: Float64[np.ndarray, "n g"],
     neighbours: list[int],
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """The best guess of each patch, how much it differs from what the neighbours show, and its rivalry."""
-    costs = np.stack([_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
+) -> Float64[np.ndarray, "n g"]:
+    """How much each patch at each of its guesses differs from what the neighbours show."""
+    return np.stack([_cost(photographs, patches, guess, neighbours) for guess in guesses.T], axis=1)
+
+
+def _best(
+    guesses: Float64[np.ndarray, "n g"], costs: Float64[np.ndarray, "n g"]
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """The guess of each patch that matches best, and its cost."""
     best = np.argmin(costs, axis=1)[:, None]
-    cost = np.take_along_axis(costs, best, 1)[:, 0]
-    beside = np.abs(np.arange(guesses.shape[1]) - best) <= 1
-    rival = np.where(beside, np.inf, costs).min(axis=1, initial=np.inf)
-    with np.errstate(invalid="ignore"):  # of what nobody shows nothing is asked
-        rivalry = cost / np.maximum(rival, 1e-12)
-    return np.take_along_axis(guesses, best, 1)[:, 0], cost, rivalry
+    return np.take_along_axis(guesses, best, 1)[:, 0], np.take_along_axis(costs, best, 1)[:, 0]
+
+
+def _rivalry(costs: Float64[np.ndarray, "n g"]) -> Float64[np.ndarray, " n"]:
+    """The least cost over the next that is more than one step away; depths are in order."""
+    best = np.argmin(costs, axis=1)[:, None]
+    beside = np.abs(np.arange(costs.shape[1]) - best) <= 1
+    return np.asarray(costs.min(axis=1) / np.maximum(np.where(beside, np.inf, costs).min(axis=1), 1e-12))
 
 
 def _depths_between(

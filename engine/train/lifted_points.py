@@ -54,8 +54,8 @@ class LiftedPoints:
 class Evidence:
     """What tells whether to believe points: whose pixels they were, and how clearly these matched.
 
-    ``view`` is one of the dataset's, ``distance`` that to its camera, and ``rivalry`` the cost of the depth
-    over that of the best other more than one step away: near 0 where only one depth matches.
+    ``view`` is one of the dataset's, and ``distance`` that to its camera. Of swept depths, ``rivalry`` is the
+    cost over that of the best other more than one step away: near 0 where only one depth matches.
     """
 
     view: Int64[np.ndarray, " n"]

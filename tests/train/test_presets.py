@@ -17,7 +17,8 @@ from engine.shading.plain import PLAIN
 from engine.trace.cpu.tracer import CpuTracer
 from engine.train.batches import BatchSource
 from engine.train.config import LossWeights, TrainConfig, preset
-from engine.train.iteration import differentiate
+from engine.train.densify import make_densifier
+from engine.train.iteration import Machinery, differentiate, iterate
 from engine.train.state import fresh_state
 from engine.train.trainer import Trainer
 
@@ -98,6 +99,29 @@ def test_without_a_patch_the_ssim_weight_adds_nothing() -> None:
     plain = differentiate(batch, tracer, PLAIN, LossWeights(), progress=0.0)
     bare = differentiate(replace(batch, patches=0), tracer, PLAIN, config.loss, progress=0.0)
     assert bare.loss.value == plain.loss.value < both.loss.value
+
+
+def test_gaussians_that_hardly_weigh_keep_still() -> None:
+    world = FlatWorld()
+    config = small_config()
+    batch = BatchSource(world, config).draw(np.random.default_rng(0))
+    tracer = CpuTracer(config.trace, threads=1)
+    tracer.build(world.start(opacity=0.6))
+    weights = differentiate(batch, tracer, PLAIN, config.loss, progress=0.0).gaussians
+    least = float(np.median(weights.weight_sums))
+    heavy = weights.ids[weights.weight_sums >= least]
+    state = fresh_state(world.start(opacity=0.6), 0)
+    before = state.gaussians.sh.copy()
+    tracer.build(state.gaussians)
+    densifier = make_densifier(config.densify, iterations=1, max_gaussians=len(before))
+    iterate(
+        state, batch, Machinery(tracer, PLAIN, densifier), config.model_copy(update={"least_weight": least}),
+        progress=0.0, extent=world.extent,
+    )  # fmt: skip
+    assert 0 < len(heavy) < len(weights.ids)
+    assert np.flatnonzero(state.adam.steps).tolist() == heavy.tolist()
+    changed = (state.gaussians.sh != before).any(axis=(1, 2))
+    assert changed[heavy].all() and changed.sum() == len(heavy)
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,10 @@ START_SLOTS = 256
 
 
 class Rows(NamedTuple):
-    """A row for each Gaussian of each packet; packet p has those from ``firsts[p]`` on."""
+    """A row for each Gaussian of each packet; packet p has those from ``firsts[p]`` on.
+
+    ``weights`` are column W of the sums once more, side by side.
+    """
 
     firsts: Int64[np.ndarray, " p1"]
     ids: Int32[np.ndarray, " e"]

@@ -27,12 +27,12 @@ class CpuTracer:
     Rays that lie beside each other in the batch, share their origin, have their viewer there and look about
     one way form packets; the others are followed one by one (:func:`engine.trace.cpu.packets.find_packets`).
 
-    Hits are exact: a hierarchy only says which octagons to test, and hits are ordered by (float32 distance,
-    id). The octagon test and the distance come from the parameters, for single rays in float64; packets round
-    them to float32 in a frame of their own (:mod:`engine.trace.cpu.kernels_packet`). So neither the shape of
-    a hierarchy nor the number of threads changes a result; packets and single rays agree to the last digits
-    of float32. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy and a box of 24 B;
-    Embree's hierarchy over the boxes is built when the first single rays want it.
+    A hierarchy only says which octagons to test, the test and the distance come from the parameters, and hits
+    are ordered by (float32 distance, id). So neither the shape of a hierarchy nor the number of threads
+    changes a result. Single rays test in float64; packets in float32 in a frame of their own
+    (:mod:`engine.trace.cpu.kernels_packet`), so that the two agree but for that rounding, which is largest
+    for needles and for octagons seen edge on. Memory per Gaussian: a record of 64 B, 48 B of the packets'
+    hierarchy and a box of 24 B; Embree's hierarchy over the boxes is built when single rays first want it.
 
     Not done: no gradient through octagon edges or visibility.
 
@@ -135,9 +135,10 @@ class CpuTracer:
         parameters = Parameters.of(self._gaussians)
         if len(hits.alone) == 0:
             return self._packets.backward(hits, given, self._scene, parameters, least_weight)
-        parts = [self._singles.backward(hits, given, self._scene, parameters)]
+        parts = []
         if len(hits.packets):
-            parts.insert(0, self._packets.backward(hits, given, self._scene, parameters, 0.0))
+            parts.append(self._packets.backward(hits, given, self._scene, parameters, 0.0))
+        parts.append(self._singles.backward(hits, given, self._scene, parameters))
         return heavier(add_gradients(parts), least_weight)
 
     @property
