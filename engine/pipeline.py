@@ -62,7 +62,7 @@ from engine.run_folder import (
 )
 from engine.run_poses import find_missing_poses, place_misfits
 from engine.scene import Dataset, write_held_out
-from engine.scene.near import NearZones, nearest_depths
+from engine.scene.near import NearZones, nearest_distances
 from engine.scene.seen import SeenSpace
 from engine.scene.views_file import ViewsRecord, read_views, write_views
 from engine.shading.protocol import ShadingModel
@@ -287,7 +287,7 @@ def _train(
         state.seconds = clock.seconds()
     else:
         clock.add(state.seconds)
-    nearest_world = nearest_depths(dataset.viewpoints, dataset.points)
+    nearest_world = nearest_distances(dataset.viewpoints, dataset.points)
     zones = NearZones.of(dataset.viewpoints, config.near_share * nearest_world, dataset.train_indices)
     seen = SeenSpace.of(dataset.viewpoints, dataset.train_indices)
     trainer = Trainer(
@@ -329,8 +329,8 @@ def _train(
         record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
     if config.near_share > 0:
         record["taken_near"] = trainer.state.taken_near
-    depths = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
-    record["nearest_world"] = {name: depth for name, depth in depths.items() if depth > 0}
+    distances = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
+    record["nearest_world"] = {name: distance for name, distance in distances.items() if distance > 0}
     write_json(output / TRAINING, record)
     return gaussians
 

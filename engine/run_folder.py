@@ -91,18 +91,18 @@ def run_near_zones(output: Path, share: float) -> NearZones | None:
 
     Args:
         output: folder of the run.
-        share: of the depth at which the sparse points of each view begin.
+        share: of the distance at which the sparse points around each camera begin.
 
     Returns:
-        None where the run does not know these depths, as runs of old, or keeps no cameras.
+        None where the run does not know these distances, as runs of old, or keeps no cameras.
     """
     try:
         known = json.loads((output / TRAINING).read_text(encoding="utf-8"))["nearest_world"]
         scene = read_views(output / VIEWS).viewpoints(None)
-        depths = np.array([share * float(known.get(view.name, 0.0)) for view in scene.views])
+        radii = np.array([share * float(known.get(view.name, 0.0)) for view in scene.views])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ConfigError):
         return None
-    return NearZones.of(scene, depths, scene.train_indices)
+    return NearZones.of(scene, radii, scene.train_indices)
 
 
 def run_exposures(output: Path) -> ExposuresByName | None:

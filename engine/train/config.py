@@ -219,11 +219,11 @@ class TrainConfig(_Frozen):
     materials: MaterialSettings = MaterialSettings()
     near: float = Field(0.01, ge=0, description="nearest distance at which a Gaussian is seen, of the extent")
     near_share: float = Field(
-        0.0,
+        0.3,
         ge=0,
         lt=1,
-        description="nothing stays in a view nearer than this share of the depth at which its sparse points "
-        "begin; 0 lets everything stay",
+        description="nothing stays nearer to the camera of a training view than this share of the distance "
+        "at which the sparse points around it begin; 0 lets everything stay",
     )
     min_scale_px: float = Field(
         0.0, ge=0, description="least standard deviation, in pixels of the nearest training camera"
@@ -338,6 +338,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "step_back_db": 0.3,
             "average_after": 0.8,
             "least_weight": 0.0,
+            "near_share": 0.0,
             "stop_early": 0.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
@@ -365,6 +366,7 @@ def preset(name: str) -> TrainConfig:
             sh_degree=0,
             rays=8192,
             least_weight=0.0,
+            near_share=0.0,
             stop_early=0.0,
             place_misfits=False,
             window_rays=1,

@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from engine.scene import Camera
 from engine.scene.model import SparsePoints
-from engine.scene.near import MOST_POINTS
 from engine.scene.seen import is_shown, points_in_cam
 from engine.shading.learnt_background import LearntBackground
 from engine.train.batches import TrainingData
@@ -26,6 +25,8 @@ EMPTY_SHARE = 0.05
 """A pixel farther than this share of the picture's longer side from all points is one of nothing near."""
 LEAST_VIEWS = 2
 """So many photographs must show nothing near in a direction."""
+MOST_POINTS = 50_000
+"""Of more points, evenly spaced ones are looked at."""
 MOST_VIEWS = 96
 """Of more photographs, evenly spaced ones are looked at."""
 SOFT_TEXELS = (2.0, 6.0)

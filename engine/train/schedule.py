@@ -71,8 +71,11 @@ class Schedule:
 
     def averages(self, done: int) -> bool:
         """Whether the state after ``done`` iterations counts in the mean that is exported."""
-        since = max(self.config.average_after * self.iterations, self.hastened_after or 0)
-        return since < done and (done % AVERAGE_EVERY == 0 or self.ends(done))
+        return self.is_late(done) and (done % AVERAGE_EVERY == 0 or self.ends(done))
+
+    def is_late(self, done: int) -> bool:
+        """Whether states are averaged by then."""
+        return max(self.config.average_after * self.iterations, self.hastened_after or 0) < done
 
     def settles_sides(self, done: int) -> bool:
         """Whether Gaussians whose outer side is in are turned over: until states are averaged."""

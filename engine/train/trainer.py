@@ -303,9 +303,12 @@ class Trainer:
         return self._densify() or cleared
 
     def _clear(self) -> bool:
-        """Make what is where nothing stays invisible, and so dead to the strategy; whether any was."""
-        state = self.state
-        if state.iteration % self._config.densify.interval:
+        """Make what is where nothing stays invisible, and so dead to the strategy; whether any was.
+
+        Not while states are averaged, which would have to begin anew: at the end it is all taken away.
+        """
+        state, schedule = self.state, self.schedule
+        if state.iteration % self._config.densify.interval or schedule.is_late(state.iteration):
             return False
         near, gone = self._where_nothing_stays(state.gaussians)
         gone &= state.gaussians.opacity_logits > GONE_LOGIT

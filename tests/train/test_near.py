@@ -9,7 +9,7 @@ from flat_world import FlatWorld, small_config
 from engine.gaussians.model import FlatGaussians, concatenate
 from engine.scene.cameras import Camera
 from engine.scene.model import PosedView, SparsePoints, Viewpoints
-from engine.scene.near import NearZones, nearest_depths
+from engine.scene.near import NearZones, nearest_distances
 from engine.scene.seen import SeenSpace
 from engine.train.state import fresh_state
 from engine.train.trainer import Trainer
@@ -39,25 +39,30 @@ def seen_from(*positions: tuple[float, float, float]) -> Viewpoints:
     return Viewpoints(views, (PINHOLE, WIDE))
 
 
-def test_depths_begin_where_the_sparse_points_do() -> None:
+def test_distances_begin_where_the_sparse_points_do() -> None:
     rng = np.random.default_rng(0)
     wall = np.concatenate([rng.uniform(-3, 3, (2000, 2)), np.full((2000, 1), 4.0)], axis=1)
     strays = np.array([[0.0, 0.0, 0.2]] * 5 + [[0.0, 0.0, -1.0]])
-    scene = seen_from((0, 0, 0), (0, 0, 1), (90, 0, 0), (0, 0, 2))
-    found = nearest_depths(scene, cloud(np.concatenate([wall, strays])))
-    assert found == pytest.approx([4.0, 3.0, 0.0, 2.0], abs=1e-6)
+    trunk = np.array([[0.0, 0.0, 9.0]]) + rng.uniform(-0.01, 0.01, (10, 3))
+    scene = seen_from((0, 0, 0), (0, 0, 1), (90, 0, 4), (0, 0, 10))
+    found = nearest_distances(scene, cloud(np.concatenate([wall, strays, trunk])))
+    assert found[:2] == pytest.approx([4.0, 3.0], rel=0.01)
+    assert found[2] == pytest.approx(87.0, rel=0.01)
+    assert found[3] == pytest.approx(1.0, rel=0.02)  # though it looks the other way
+    assert (nearest_distances(scene, cloud(wall[:40])) == 0).all()
 
 
-def test_a_zone_is_the_near_end_of_a_views_pyramid() -> None:
-    scene = seen_from((0, 0, 0), (10, 0, 0))
-    zones = NearZones.of(scene, np.array([1.0, 2.0]), np.arange(2))
+def test_a_zone_is_a_ball_around_a_camera() -> None:
+    scene = seen_from((0, 0, 0), (10, 0, 0), (20, 0, 0))
+    zones = NearZones.of(scene, np.array([1.0, 2.0, 0.0]), np.arange(3))
     points = [
-        (0.0, 0.0, 0.5), (0.2, -0.2, 0.45), (0.3, 0.0, 0.5), (0.0, 0.0, 1.01), (0.0, 0.0, -0.5),
-        (10.0, 0.0, 1.9), (10.0, 0.0, 2.1), (10 + 1.9, 0.0, 0.1),
+        (0.0, 0.0, 0.5), (0.6, -0.6, 0.45), (0.6, -0.6, 0.6), (0.0, 0.0, 1.01), (0.0, 0.0, -0.5),
+        (10.0, 0.0, 1.9), (10.0, 0.0, 2.1), (10 + 1.9, 0.0, -0.1), (20.0, 0.0, 0.0),
     ]  # fmt: skip
-    expected = [True, True, False, False, False, True, False, False]
+    expected = [True, True, False, False, True, True, False, True, False]
     assert zones.holds(np.array(points)).tolist() == expected
-    assert not NearZones.of(scene, np.zeros(2), np.arange(2)).holds(np.array(points)).any()
+    assert zones.holds(np.empty((0, 3))).tolist() == []
+    assert not NearZones.of(scene, np.zeros(3), np.arange(3)).holds(np.array(points)).any()
 
 
 def test_a_cloud_before_a_camera_does_not_outlive_the_training(tmp_path: Path) -> None:
@@ -66,7 +71,7 @@ def test_a_cloud_before_a_camera_does_not_outlive_the_training(tmp_path: Path) -
     veil.means_world = (
         world.origins[3] + [0, 0, 0.4] + np.random.default_rng(4).normal(0, 0.05, (60, 3))
     ).astype(np.float32)
-    zones = NearZones(world.views, (Camera("PINHOLE", (40.0, 40.0, 20.0, 20.0), 40, 40),), np.full(7, 1.0))
+    zones = NearZones(world.views, np.full(7, 1.0))
 
     def trained(near_zones: NearZones | None) -> tuple[FlatGaussians, Trainer]:
         trainer = Trainer(

@@ -41,8 +41,8 @@ from workers.cli.options import quiet_option
     default=0.25,
     show_default=True,
     metavar="SHARE",
-    help="Where IN is the folder of a run: remove those in a training view that are nearer than this share "
-    "of the depth at which its sparse points begin; 0 for none.",
+    help="Where IN is the folder of a run: remove those nearer to the camera of a training view than this "
+    "share of the distance at which the sparse points around it begin; 0 for none.",
 )
 @quiet_option
 def clean(
