@@ -155,7 +155,12 @@ class TrainConfig(_Frozen):
     )
     pixels_a_gaussian: int = Field(50, ge=10, description="where max_gaussians is 0")
     max_gaussians_auto: int = Field(400_000, ge=1, description="the most that 0 comes to in max_gaussians")
-    initial_points: int = Field(200_000, ge=1, description="most points to begin from")
+    initial_points: int = Field(
+        600_000,
+        ge=1,
+        description="most points to begin from; Gaussians that are added later overlap more with those that "
+        "are there",
+    )
     plane_points: int = Field(8, ge=3, description="points around one whose plane gives its first normal")
     lift_pixels: bool = Field(
         True, description="where the sparse model has fewer points, lift pixels of the photographs"

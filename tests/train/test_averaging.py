@@ -60,4 +60,5 @@ def test_which_states_count() -> None:
     schedule = Schedule(TrainConfig(average_after=0.5), 100)
     assert [k for k in range(1, 101) if schedule.averages(k)] == list(range(60, 101, AVERAGE_EVERY))
     assert not any(Schedule(TrainConfig(average_after=1), 100).averages(k) for k in range(1, 101))
+    assert [k for k in range(1, 101) if schedule.is_late(k)] == list(range(51, 101))
     assert Schedule(TrainConfig(), 17).averages(17)  # the last one always
