@@ -58,6 +58,8 @@ LEAST_COSINE = 0.5
 BASELINE = 0.05
 """Distance of a good neighbouring view, of that to the points: less tells depths badly apart, more shows
 other things."""
+FOR_ONE, MOST_FOR_ONE = 1.6, 5.0
+"""So many pixels are drawn for one point, and at most as many where more and more prove to give none."""
 JURY = 24
 """Views that vote on each point."""
 AGREES = 0.12
@@ -129,9 +131,12 @@ def dense_points(
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
     lifted = LiftedPoints.joined([])
+    drawn = 0
     for round_number in range(ROUNDS):
         # Pixels that no guess fits are lost: draw some more.
-        wanted = round(1.6 * (count - len(lifted)) / (ROUNDS - round_number))
+        for_one = min(max(FOR_ONE, drawn / max(1, len(lifted))), MOST_FOR_ONE)
+        wanted = round(for_one * (count - len(lifted)) / (ROUNDS - round_number))
+        drawn += max(0, wanted)
         per_view = rng.multinomial(max(0, wanted), _areas(dataset))
         generators = rng.spawn(len(per_view))  # one a view, so that their order does not matter
         jobs = list(zip(dataset.train_indices.tolist(), per_view.tolist(), generators, strict=True))
