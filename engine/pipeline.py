@@ -77,6 +77,7 @@ from engine.train.fingerprint import run_fingerprint
 from engine.train.first_state import first_state
 from engine.train.floors import ScaleFloor
 from engine.train.shading import background_of, deferred_of, exposures_of
+from engine.train.shown import shown_share
 from engine.train.trainer import Trainer
 from engine.train.within import make_plan, read_plan, write_plan
 from engine.versions import versions
@@ -169,7 +170,9 @@ def reconstruct(
                         output.rmdir()
             raise
         if not (output / SCENE).exists():
-            steps = 0 if config.minutes else iteration_count(config.train, dataset.train_pixel_count)
+            steps = 0
+            if not config.minutes:
+                steps = iteration_count(config.train, dataset.train_pixel_count, shown_share(dataset))
             with stage("train", tell, steps) as clock:
                 gaussians = _train(dataset, output, config, threads, tell, should_stop, clock, watch)
                 write_gaussian_ply(

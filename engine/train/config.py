@@ -273,24 +273,29 @@ class TrainConfig(_Frozen):
         return self
 
 
-def iteration_count(config: TrainConfig, training_pixels: int) -> int:
+def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
     """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
     Large scenes learn as long as there is something to see; small ones are done after 5,000 with 3 rays a
-    pixel.
+    pixel. Where only a share of the pixels shows anything (see :mod:`engine.train.shown`), the rays of the
+    others teach little and cost little, and it takes as many more; not with materials.
     """
     each = config.rays_a_pixel
-    wanted = round(each * training_pixels / config.rays / 1000)
-    return config.iterations or min(max(wanted, 5 * max(1, each // 3)), 10 * each // 3) * 1000
+    wanted = max(round(each * training_pixels / config.rays / 1000), 5 * max(1, each // 3))
+    if not config.materials.learn:
+        wanted = round(wanted / shown)
+    return config.iterations or min(wanted, 10 * each // 3) * 1000
 
 
-def most_gaussians(config: TrainConfig, training_pixels: int) -> int:
+def most_gaussians(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
     """``config.max_gaussians``, or where that is 0 what so many pixels of training views can hold down.
 
-    More than one for each 10 pixels learn the noise of the training views instead of the scene.
+    Of those only the share counts that shows anything. More than one for each 10 pixels learn the noise of
+    the training views instead of the scene.
     """
     if config.max_gaussians:
         return config.max_gaussians
+    training_pixels = round(training_pixels * shown)
     wanted = max(training_pixels // config.pixels_a_gaussian, min(training_pixels // 10, 10_000), 1)
     return min(wanted, config.max_gaussians_auto)
 

@@ -19,6 +19,7 @@ from engine.train.config import TrainConfig, most_gaussians
 from engine.train.dense_points import dense_points
 from engine.train.exposure_changes import evening_gains
 from engine.train.first_background import FirstBackground
+from engine.train.shown import shown_share
 
 MIN_POINTS = 50
 """Fewer sparse points than this are no use to begin from; random ones are taken."""
@@ -40,7 +41,8 @@ def initial_gaussians(
     """
     rng = np.random.Generator(np.random.PCG64([config.seed, 2]))
     points = dataset.points
-    limit = min(config.initial_points, most_gaussians(config, dataset.train_pixel_count))
+    most_of_all = most_gaussians(config, dataset.train_pixel_count, shown_share(dataset))
+    limit = min(config.initial_points, most_of_all)
     if len(points.xyz_world) >= MIN_POINTS:
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
         xyz, rgb = points.xyz_world, points.rgb_srgb

@@ -34,9 +34,9 @@ class Schedule:
     planned: int = 0
 
     @classmethod
-    def of(cls, config: TrainConfig, training_pixels: int) -> "Schedule":
-        """The schedule for so many pixels in the training views."""
-        return cls(config, iteration_count(config, training_pixels))
+    def of(cls, config: TrainConfig, training_pixels: int, shown: float = 1.0) -> "Schedule":
+        """The schedule for so many pixels in the training views, of which a share shows anything."""
+        return cls(config, iteration_count(config, training_pixels, shown))
 
     def hastened(self, done: int) -> "Schedule":
         """The schedule of a training for which it is decided after ``done`` iterations to end early.

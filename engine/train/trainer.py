@@ -29,6 +29,7 @@ from engine.train.pose_refinement import PoseRefiner, RefinedPoses
 from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
 from engine.train.shading import make_shading
+from engine.train.shown import shown_share
 from engine.train.sides import turn_outwards
 from engine.train.state import TrainState
 from engine.train.view_grids import guess_exposures
@@ -107,12 +108,12 @@ class Trainer:
                 state.pose_corrections = np.zeros((len(dataset.views), 6))
         self._dataset = dataset
         self._batches = BatchSource(dataset, config)
-        pixels = self._batches.sampler.pixel_count
-        self.schedule = Schedule.of(config, pixels)
+        pixels, shown = self._batches.sampler.pixel_count, shown_share(dataset)
+        self.schedule = Schedule.of(config, pixels, shown)
         densifier = make_densifier(
             config.densify,
             iterations=self.schedule.iterations,
-            max_gaussians=most_gaussians(config, pixels),
+            max_gaussians=most_gaussians(config, pixels, shown),
         )
         if config.materials.learn and config.materials.propagation:
             densifier = Propagating(densifier, config.materials, iterations=self.schedule.iterations)

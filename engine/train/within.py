@@ -17,6 +17,7 @@ from engine.gaussians.model import FlatGaussians
 from engine.scene import Dataset
 from engine.trace.protocol import Tracer
 from engine.train.config import MOST_PLANNED_ITERATIONS, TrainConfig, most_gaussians
+from engine.train.shown import shown_share
 from engine.train.state import fresh_state
 from engine.train.trainer import Trainer
 from engine.writing import write_text
@@ -103,7 +104,8 @@ def make_plan(
     began = time.perf_counter()
     pace_s = _seconds_an_iteration(dataset, config, first, threads, should_stop)
     left_s = USED_SHARE * (seconds - (time.perf_counter() - began))
-    return choose_plan(left_s, pace_s, len(first), most_gaussians(config, dataset.train_pixel_count))
+    most = most_gaussians(config, dataset.train_pixel_count, shown_share(dataset))
+    return choose_plan(left_s, pace_s, len(first), most)
 
 
 def write_plan(path: Path, plan: Plan) -> None:

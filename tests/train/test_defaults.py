@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
@@ -12,8 +13,10 @@ from engine.train.config import (
     preset,
     rebuild_interval,
     window_side_px,
+    with_materials,
 )
 from engine.train.preset_names import PRESETS
+from engine.train.shown import shown_share
 from engine.train.state import fresh_state
 from engine.train.trainer import Trainer
 
@@ -50,6 +53,32 @@ def test_large_scenes_train_longer(pixels: int, count: int) -> None:
     assert iteration_count(preset("fast"), pixels) == 1400
     assert iteration_count(preset("paper"), pixels) == 10_000
     assert 2.5 * count < iteration_count(preset("high"), pixels) < 3.5 * count
+
+
+@pytest.mark.parametrize(
+    ("shown", "gaussians", "count"), [(1.0, 392_000, 5000), (0.7, 274_400, 7000), (0.31, 121_520, 10_000)]
+)
+def test_pixels_that_show_nothing_hold_nothing_down(shown: float, gaussians: int, count: int) -> None:
+    assert most_gaussians(TrainConfig(), 19_600_000, shown) == gaussians
+    assert iteration_count(TrainConfig(), 19_600_000, shown) == count
+    assert iteration_count(preset("fast"), 19_600_000, shown) == 1400
+    materials = with_materials(TrainConfig())
+    assert iteration_count(materials, 19_600_000, shown) == iteration_count(materials, 19_600_000)
+
+
+@pytest.mark.parametrize("hidden", ["alpha", "weight"])
+def test_the_share_of_pixels_that_show_something(hidden: str) -> None:
+    class Half(FlatWorld):
+        def pixels(
+            self, view: np.ndarray, y: np.ndarray, x: np.ndarray
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            rgb, alpha, weight = super().pixels(view, y, x)
+            shown = {"alpha": alpha, "weight": weight}
+            shown[hidden] = np.where(x < 20, 0, shown[hidden])
+            return rgb, shown["alpha"], shown["weight"]
+
+    assert shown_share(FlatWorld()) == 1
+    assert shown_share(Half()) == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(("wanted", "count"), [(0, 5000), (80, 80)])
