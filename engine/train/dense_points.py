@@ -27,6 +27,7 @@ from engine.scene import Dataset
 from engine.train.first_background import FirstBackground
 from engine.train.kernels_patches import patch_differences
 from engine.train.lifted_points import Evidence, LiftedPoints, borne_out
+from engine.train.shown import shown_share
 
 GUESSES = 6
 """Depths tried for a pixel: those of the nearest points in the image."""
@@ -58,8 +59,8 @@ LEAST_COSINE = 0.5
 BASELINE = 0.05
 """Distance of a good neighbouring view, of that to the points: less tells depths badly apart, more shows
 other things."""
-FOR_ONE, MOST_FOR_ONE = 1.6, 5.0
-"""So many pixels are drawn for one point, and at most as many where more and more prove to give none."""
+FOR_ONE, MOST_FOR_ONE = 1.6, 10.0
+"""Pixels that show something are drawn for each point; and at the most, with those that show nothing."""
 JURY = 24
 """Views that vote on each point."""
 AGREES = 0.12
@@ -131,12 +132,10 @@ def dense_points(
     known = dataset.points.xyz_world.astype(np.float64)
     neighbours = _neighbouring_views(dataset, known)
     lifted = LiftedPoints.joined([])
-    drawn = 0
+    for_one = min(FOR_ONE / shown_share(dataset), MOST_FOR_ONE)
     for round_number in range(ROUNDS):
-        # Pixels that no guess fits are lost: draw some more.
-        for_one = min(max(FOR_ONE, drawn / max(1, len(lifted))), MOST_FOR_ONE)
+        # Pixels that no guess fits are lost, and those that show nothing: draw some more.
         wanted = round(for_one * (count - len(lifted)) / (ROUNDS - round_number))
-        drawn += max(0, wanted)
         per_view = rng.multinomial(max(0, wanted), _areas(dataset))
         generators = rng.spawn(len(per_view))  # one a view, so that their order does not matter
         jobs = list(zip(dataset.train_indices.tolist(), per_view.tolist(), generators, strict=True))

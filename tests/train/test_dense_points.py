@@ -164,3 +164,16 @@ def test_what_is_near_is_lifted_although_a_background_is_learnt(dataset: Dataset
     plain = dense_points(dataset, 1000, np.random.default_rng(0))
     before = dense_points(dataset, 1000, np.random.default_rng(0), behind=first_background(dataset))
     assert len(before) > 0.9 * len(plain)
+
+
+def test_pixels_that_show_nothing_are_made_up_for(dataset: Dataset, tmp_path: Path) -> None:
+    shutil.copytree(dataset.root, tmp_path / "scene")
+    masks = tmp_path / "scene" / "masks"
+    masks.mkdir()
+    seen = np.zeros((120, 160, 3), np.float32)
+    seen[30:90, 50:110] = 1  # 19 % of the picture
+    for view in dataset.views:
+        write_png(masks / f"{view.name}.png", seen)
+    masked = Dataset.open(tmp_path / "scene", tmp_path / "cache")
+    whole, part = (len(dense_points(data, 1000, np.random.default_rng(0))) for data in (dataset, masked))
+    assert part > 0.7 * whole
