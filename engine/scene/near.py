@@ -51,6 +51,10 @@ class NearZones:
         """The zones of the views ``which`` of a scene; ``radii`` are those of all its views."""
         return cls([scene.views[i] for i in which.tolist()], radii[which])
 
+    def grown(self, times: float) -> "NearZones":
+        """The same with balls so many times as large."""
+        return NearZones(self.views, self.radii * times)
+
     def holds(self, xyz_world: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether points lie in any of the zones."""
         inside = np.zeros(len(xyz_world), np.bool_)

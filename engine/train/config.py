@@ -228,7 +228,7 @@ class TrainConfig(_Frozen):
         ge=0,
         lt=1,
         description="nothing stays nearer to the camera of a training view than this share of the distance "
-        "at which the sparse points around it begin; 0 lets everything stay",
+        "at which the sparse points around it begin, in the end half as far again; 0 lets everything stay",
     )
     min_scale_px: float = Field(
         0.0, ge=0, description="least standard deviation, in pixels of the nearest training camera"

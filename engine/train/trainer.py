@@ -36,6 +36,8 @@ from engine.train.view_grids import guess_exposures
 
 GONE_LOGIT = np.float32(-12.0)
 """Opacity of what is taken away until its place is used for something else: no ray takes note of it."""
+AT_THE_END = 1.5
+"""So many times as large are the zones around cameras then, as what may not stand in them gathers around."""
 
 
 class Trainer:
@@ -185,7 +187,7 @@ class Trainer:
         """The Gaussians to export, seen once more from all views."""
         state, machinery = self.state, self._machinery
         chosen = self._judge.choose(state, machinery.tracer, machinery.shading)
-        near, gone = self._where_nothing_stays(chosen)
+        near, gone = self._where_nothing_stays(chosen, AT_THE_END)
         if gone.any():
             state.taken_near += int((near & (chosen.opacity_logits > GONE_LOGIT)).sum())
             chosen = chosen.select(np.flatnonzero(~gone))
@@ -320,12 +322,12 @@ class Trainer:
         return len(rows) > 0
 
     def _where_nothing_stays(
-        self, gaussians: FlatGaussians
+        self, gaussians: FlatGaussians, grown: float = 1.0
     ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Which Gaussians are too near to a camera, and which are that or in no view."""
+        """Which Gaussians are in the grown zone around a camera, and which are that or in no view."""
         near = np.zeros(len(gaussians), np.bool_)
         if self._near_zones is not None:
-            near = self._near_zones.holds(gaussians.means_world)
+            near = self._near_zones.grown(grown).holds(gaussians.means_world)
         if self._seen_space is None:
             return near, near.copy()
         return near, near | ~self._seen_space.holds(gaussians.means_world)
