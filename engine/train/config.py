@@ -133,7 +133,7 @@ class TrainConfig(_Frozen):
         description="end sooner where the training rays gain less than so many dB in a fifth of the "
         "iterations; 0 never does",
     )
-    rays_a_pixel: int = Field(4, ge=1, description="where iterations is 0; 5,000 to 13,000 iterations for 4")
+    rays_a_pixel: int = Field(3, ge=1, description="where iterations is 0; 5,000 to 10,000 iterations for 3")
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
     window_side: int = Field(
@@ -276,8 +276,8 @@ class TrainConfig(_Frozen):
 def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
     """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
-    Large scenes learn as long as there is something to see; small ones are done after 5,000 with 3 to 5
-    rays a pixel. Where only a share of the pixels shows anything (see :mod:`engine.train.shown`), the rays
+    Large scenes learn as long as there is something to see; small ones are done after 5,000 with 3 rays
+    a pixel. Where only a share of the pixels shows anything (see :mod:`engine.train.shown`), the rays
     of the others teach little and cost little, and it takes as many more; not with materials.
     """
     each = config.rays_a_pixel

@@ -45,18 +45,18 @@ def test_windows_follow_the_size_of_the_views(longest_px: int, side_px: int) -> 
 
 @pytest.mark.parametrize(
     ("pixels", "count"),
-    [(1_000, 5000), (20_000_000, 5000), (33_000_000, 8000), (46_900_000, 11_000), (10**9, 13_000)],
+    [(1_000, 5000), (20_000_000, 5000), (33_000_000, 6000), (46_900_000, 9000), (10**9, 10_000)],
 )
 def test_large_scenes_train_longer(pixels: int, count: int) -> None:
     assert iteration_count(TrainConfig(), pixels) == count
     assert iteration_count(TrainConfig(iterations=7), pixels) == 7
     assert iteration_count(preset("fast"), pixels) == 1400
     assert iteration_count(preset("paper"), pixels) == 10_000
-    assert 2.2 * count < iteration_count(preset("high"), pixels) < 3.5 * count
+    assert 2.5 * count < iteration_count(preset("high"), pixels) < 3.5 * count
 
 
 @pytest.mark.parametrize(
-    ("shown", "gaussians", "count"), [(1.0, 392_000, 5000), (0.7, 274_400, 7000), (0.31, 121_520, 13_000)]
+    ("shown", "gaussians", "count"), [(1.0, 392_000, 5000), (0.7, 274_400, 7000), (0.31, 121_520, 10_000)]
 )
 def test_pixels_that_show_nothing_hold_nothing_down(shown: float, gaussians: int, count: int) -> None:
     assert most_gaussians(TrainConfig(), 19_600_000, shown) == gaussians
@@ -92,7 +92,7 @@ def test_the_trainer_knows_its_iterations(tmp_path: Path, wanted: int, count: in
 
 
 def test_more_rays_an_iteration_want_fewer_iterations() -> None:
-    assert iteration_count(TrainConfig(rays=32_768), 70_000_000) == 9000
+    assert iteration_count(TrainConfig(rays=32_768), 70_000_000) == 6000
 
 
 @pytest.mark.parametrize(("gaussians", "iterations"), [(499_999, 25), (500_000, 50), (1_000_000, 75)])
