@@ -31,13 +31,15 @@ function steadily(page) {
     const visit = page.goto.bind(page);
     page.on("requestfailed", (request) => { dropped ||= /ERR_NETWORK_CHANGED/.test(request.failure()?.errorText ?? ""); });
     page.goto = async (address, options) => {
-        for (let left = 3; ; left -= 1) {
+        for (let left = 5; ; left -= 1) {
             dropped = false;
             const answer = await visit(address, options).catch((error) => {
-                if (!/ERR_NETWORK_CHANGED/.test(error.message) || left === 0) throw error;
+                // The page of the error that Chromium shows for the visit before may come only now and end this one.
+                if (!/ERR_NETWORK_CHANGED|navigation to "chrome-error:/.test(error.message) || left === 0) throw error;
                 dropped = true;
             });
             if (!dropped || left === 0) return answer;
+            await page.waitForTimeout(500);
         }
     };
     return page;
