@@ -30,7 +30,7 @@ from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import load_checkpoint, save_checkpoint
-from engine.train.config import TrainConfig
+from engine.train.config import TrainConfig, training_trace
 from engine.train.densify import make_densifier
 from engine.train.initialise import initial_gaussians
 from engine.train.iteration import Machinery, iterate
@@ -94,7 +94,9 @@ def spent(
     """Medians by stage of wall, CPU and own CPU time, seconds; hits a ray; Gaussians hit."""
     use_threads(threads)
     clock = Clock()
-    tracer = TimedTracer(make_tracer(config.trace, threads=threads, box_padding=config.box_padding), clock)
+    tracer = TimedTracer(
+        make_tracer(training_trace(config), threads=threads, box_padding=config.box_padding), clock
+    )
     densifier = make_densifier(config.densify, iterations=iterations, max_gaussians=len(state.gaussians))
     machinery = Machinery(tracer, make_shading(config, len(dataset.views), dataset.extent), densifier)
     batches = BatchSource(dataset, config)
@@ -131,8 +133,11 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=26, help="of a round")
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments")
     options = parser.parse_args()
-    config = resolve_config(options.preset, settings={"max_side": options.max_side}).train
+    config = resolve_config(
+        options.preset, settings={"max_side": options.max_side}, assignments=options.assignments
+    ).train
     with tempfile.TemporaryDirectory() as cache:
         dataset = Dataset.open(options.scene, Path(cache), max_side=options.max_side, near=config.near)
         if not options.state.exists():

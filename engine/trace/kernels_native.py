@@ -72,18 +72,24 @@ def call_with_four_pointers(typingctx, function, first, second, third, fourth):
 
 
 @intrinsic
-def next_from_counter(typingctx, address):
-    """Add one to the int64 at ``address`` as one indivisible step and return its value before.
+def taken_from_counter(typingctx, address, count):
+    """Add ``count`` to the int64 at ``address`` as one indivisible step and return its value before.
 
     Threads take their chunks of work from such a counter, so that none waits while there is work left.
     """
-    signature = types.int64(types.uintp)
+    signature = types.int64(types.uintp, types.int64)
 
     def codegen(context, builder, sig, args):
         pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
-        return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "monotonic")
+        return builder.atomic_rmw("add", pointer, args[1], "monotonic")
 
     return signature, codegen
+
+
+@lean(forceinline=True)
+def next_from_counter(address):
+    """:func:`taken_from_counter` of one."""
+    return taken_from_counter(address, 1)
 
 
 @intrinsic

@@ -39,6 +39,7 @@ class TraceSettings(BaseModel):
     max_hits: int = Field(512, ge=1, le=4096)
     alpha_max: float = Field(0.999, gt=0, le=0.9999)
     turned_beyond: float = Field(0.0, ge=0, le=1)
+    order: Literal["ray", "packet"] = "ray"
 
     @model_validator(mode="before")
     @classmethod

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Int64
 from torch import Tensor
 
 from engine.gaussians.model import FlatGaussians
@@ -101,9 +102,15 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
 
 
 def trace_reference(
-    parameters: ReferenceParameters, rays: RayBatch, settings: TraceSettings
+    parameters: ReferenceParameters,
+    rays: RayBatch,
+    settings: TraceSettings,
+    ranks: Int64[np.ndarray, "r n"] | None = None,
 ) -> ReferenceResult:
-    """Every ray against every Gaussian; see :class:`TraceSettings` for where rays end."""
+    """Every ray against every Gaussian; see :class:`TraceSettings` for where rays end.
+
+    Hits are composited by distance or, where ``ranks`` are given, in the order of those.
+    """
     p = parameters
     d = torch.tensor(rays.directions_world, dtype=torch.float64)
     o = torch.tensor(rays.origins_world, dtype=torch.float64).expand_as(d)
@@ -139,7 +146,8 @@ def trace_reference(
     for ray in range(len(d)):
         ids = torch.nonzero(hit[ray]).squeeze(-1)
         # Front to back; equal float32 distances are ordered by id (the sort is stable, ids ascend).
-        ids = ids[torch.sort(t32[ray, ids], stable=True).indices]
+        order = t32[ray, ids] if ranks is None else torch.tensor(ranks[ray])[ids]
+        ids = ids[torch.sort(order, stable=True).indices]
         ids = ids[: _stop(alpha[ray, ids].detach(), settings)]
         hit_ids.append(ids.numpy())
         al = alpha[ray, ids]

@@ -17,7 +17,7 @@ from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource, DrawnAhead, TrainingData
 from engine.train.checkpoint import save_checkpoint
-from engine.train.config import TrainConfig, most_gaussians
+from engine.train.config import TrainConfig, most_gaussians, training_trace
 from engine.train.corrected_views import PosedPhotographs
 from engine.train.densify import make_densifier
 from engine.train.densify.propagating import Propagating
@@ -127,7 +127,7 @@ class Trainer:
         if state.shading:
             self.shading.restore(state.shading)
         if tracer is None:  # boxes leave room for what moves between rebuilds
-            tracer = make_tracer(config.trace, threads=threads, box_padding=config.box_padding)
+            tracer = make_tracer(training_trace(config), threads=threads, box_padding=config.box_padding)
         self._machinery = Machinery(tracer, self.shading, densifier)
         self._judge = Judge(dataset, config, folder, listener)
         self._names = [view.name for view in dataset.views]

@@ -1,4 +1,4 @@
-"""Vectors of the processor's own width on each type of CPU: kernels for eight lanes, compiled but not run."""
+"""Vectors of the processor's own width on each type of CPU: kernels for lanes, compiled but not run."""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 from numba import njit, types
 from numba.extending import intrinsic
 
-from engine.trace.cpu import kernels_eight, kernels_eight_backward, kernels_lanes
+from engine.trace.cpu import kernels_eight, kernels_eight_backward, kernels_lanes, kernels_sixteen
 from engine.trace.cpu.kernels_footprint import footprints
 from engine.trace.cpu.kernels_lanes import DOUBLE8, INT8, MASK8, Gapless, load
 from engine.trace.cpu.kernels_simd import boxes_in_pyramid, ellipses_in_pyramid
@@ -34,6 +34,10 @@ KERNELS = {
         (*(ADDRESS,) * 7, WORD, DOUBLE, SINGLE, *(ADDRESS,) * 4),
     ),
     "add_row": (kernels_eight_backward.add_row, (ADDRESS, ADDRESS)),
+    "meet_group": (kernels_sixteen.meet_group, (*(ADDRESS,) * 4, WORD, *(SINGLE,) * 3)),
+    "show_group": (kernels_sixteen.show_group, (*(ADDRESS,) * 4, WORD, WORD, SINGLE)),
+    "replay_group": (kernels_sixteen.replay_group, (*(ADDRESS,) * 4, WORD, WORD, SINGLE)),
+    "add_up": (kernels_sixteen.add_up, (ADDRESS, ADDRESS)),
     "boxes_in_pyramid": (boxes_in_pyramid, (ADDRESS, ADDRESS, *(SINGLE,) * 3)),
     "ellipses_in_pyramid": (ellipses_in_pyramid, (ADDRESS, ADDRESS, *(SINGLE,) * 3)),
     "footprints": (footprints, (ADDRESS, ADDRESS, *(SINGLE,) * 3, ADDRESS, ADDRESS)),
@@ -44,7 +48,7 @@ CPUS = {
     "x86_64-unknown-linux-gnu haswell": (r"\sv\w+\s.*%ymm", r"vfn?m(add|sub)\d+p[sd]\s.*%ymm"),
     "aarch64-unknown-linux-gnu neoverse-n1": (r"\sv\d+\.(2d|4s)", r"fml[as]\s+v\d+\.(2d|4s)"),
 }
-WITHOUT_PRODUCTS = ("sort_few", "know_slots", "keep_hits", "walk_through", "add_row", "weigh_next")
+WITHOUT_PRODUCTS = ("sort_few", "know_slots", "keep_hits", "walk_through", "add_row", "add_up", "weigh_next")
 
 
 @pytest.mark.parametrize("name", KERNELS)

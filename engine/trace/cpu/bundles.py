@@ -11,7 +11,7 @@ writing for useless), and may not be given tuples of tuples.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
@@ -120,6 +120,23 @@ class PacketHits(NamedTuple):
     slot_ids: Int32[np.ndarray, " h"]
     slot_rgb: Float32[np.ndarray, "h 3"]
     slot_counts: Int32[np.ndarray, " p"]
+
+
+class OneOrderHits(NamedTuple):
+    """What packets keep whose rays see their Gaussians in one order.
+
+    Packet p has met ``counts[p]`` Gaussians, front to back from place ``starts[p]`` on: their ``ids``; the
+    ``bits`` of the rays that met them; and the ``lines`` of :mod:`engine.trace.cpu.kernels_sixteen`.
+    ``frames`` are the packets' axes, e and f; ``left`` is the transmittance in the end of each ray.
+    """
+
+    ids: Int32[np.ndarray, " h"]
+    bits: UInt64[np.ndarray, " h"]
+    lines: Float32[np.ndarray, "h 16"]
+    starts: Int64[np.ndarray, " p"]
+    counts: Int32[np.ndarray, " p"]
+    frames: Float64[np.ndarray, "p 9"]
+    left: Float32[np.ndarray, " r"]
 
 
 class Forward(NamedTuple):

@@ -30,7 +30,16 @@ from engine.trace.cpu.kernels_lanes import (
     splat,
     store,
 )
-from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
+from engine.trace.cpu.kernels_simd import (
+    DOUBLE8,
+    FLOAT8,
+    I64,
+    LANES,
+    Lanes,
+    Vector,
+    broadcast,
+    exponential,
+)
 
 N_X, A_X, B_X, N_0, INNER, ALPHA_0 = 0, 3, 6, 9, 10, 11
 ROWS = 12
@@ -100,7 +109,7 @@ def write_alphas(typingctx, powers, opacities, place, alpha_max):
         powers, opacities, place, alpha_max = args
         at = offset(builder, powers, place, 4)
         opacity = Lanes(builder, offset(builder, opacities, place, 4), FLOAT8)[0]
-        found = opacity * _exponential(builder, Lanes(builder, at, FLOAT8)[0])
+        found = opacity * exponential(builder, Lanes(builder, at, FLOAT8)[0])
         store(builder, found.smaller(broadcast(builder, alpha_max)).value, at)
         return context.get_dummy_value()
 
@@ -281,21 +290,3 @@ def add_shown(typingctx, sums, shown, slots, weights, count):
         return context.get_dummy_value()
 
     return signature, codegen
-
-
-def _exponential(builder, x):
-    """Exponentials of eight float32: 2^n times a polynomial of what is left, at most half of ln 2.
-
-    The polynomial and ln 2 in two parts, the first of which times n is exact, are those of Cephes' expf
-    (https://www.netlib.org/cephes/).
-    """
-    shift = 12582912.0  # 1.5 * 2^23: adding it rounds to a whole number, which the low bits then are
-    moved = x * 1.4426950408889634 + shift
-    n = moved - shift
-    r = x - n * 0.693359375 + n * 2.12194440e-4
-    p = r * 1.9875691500e-4 + 1.3981999507e-3
-    for term in (8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1, 1.0, 1.0):
-        p = p * r + term
-    bits = builder.shl(builder.bitcast(moved.value, INT8), ir.Constant(INT8, [23] * LANES))
-    bits = builder.add(bits, ir.Constant(INT8, [127 << 23] * LANES))
-    return p * Vector(builder, builder.bitcast(bits, FLOAT8))

@@ -187,14 +187,34 @@ def write_turned(block, row, lane, frame, x, y, z):
         block[row + axis, lane] = np.float32(x * frame[k] + y * frame[k + 1] + z * frame[k + 2])
 
 
+@lean(forceinline=True, fastmath={"contract"})
+def write_row(block, lane, record, origin, frame):
+    """One Gaussian's row, as a column of ``block``, for rays from one origin.
+
+    Differences and turns into the packet's ``frame`` are taken in float64, and only what comes of them is
+    rounded.
+    """
+    x, y, z = record[MEAN] - origin[0], record[MEAN + 1] - origin[1], record[MEAN + 2] - origin[2]
+    n0, n1, n2 = record_vector(record, NORMAL)
+    a0, a1, a2 = record_vector(record, AXIS_U)
+    b0, b1, b2 = record_vector(record, AXIS_V)
+    height = x * n0 + y * n1 + z * n2
+    xa = x * a0 + y * a1 + z * a2
+    xb = x * b0 + y * b1 + z * b2
+    write_turned(block, N_X, lane, frame, n0, n1, n2)
+    write_turned(block, A_X, lane, frame, height * a0 - xa * n0, height * a1 - xa * n1, height * a2 - xa * n2)
+    write_turned(block, B_X, lane, frame, height * b0 - xb * n0, height * b1 - xb * n1, height * b2 - xb * n2)
+    block[N_0, lane] = np.float32(height)
+    block[INNER, lane] = record[INNER_RADIUS]
+    block[ALPHA_0, lane] = record[OPACITY]
+
+
 @lean(fastmath={"contract"})
 def write_rows(candidates, count, scene, origin, frame, coloured):
     """Rows of the candidates for rays from one origin; the last block is filled with lanes that never hit.
 
-    Differences and turns into the packet's ``frame`` are taken in float64, and only what comes of them is
-    rounded. Harmonics are asked for if hits will be ``coloured``.
+    Harmonics are asked for if hits will be ``coloured``.
     """
-    ox, oy, oz = origin
     rows, ids, records, sh = candidates.rows, candidates.ids, scene.records, scene.sh
     records_at, sh_at = records.ctypes.data, sh.ctypes.data
     sh_bytes = sh.shape[1] * 12
@@ -210,21 +230,4 @@ def write_rows(candidates, count, scene, origin, frame, coloured):
             block[N_X, lane] = np.float32(1.0)
             block[INNER, lane] = np.float32(-1.0)
             continue
-        record = records[ids[k]]
-        x, y, z = record[MEAN] - ox, record[MEAN + 1] - oy, record[MEAN + 2] - oz
-        n0, n1, n2 = record_vector(record, NORMAL)
-        a0, a1, a2 = record_vector(record, AXIS_U)
-        b0, b1, b2 = record_vector(record, AXIS_V)
-        height = x * n0 + y * n1 + z * n2
-        xa = x * a0 + y * a1 + z * a2
-        xb = x * b0 + y * b1 + z * b2
-        write_turned(block, N_X, lane, frame, n0, n1, n2)
-        write_turned(
-            block, A_X, lane, frame, height * a0 - xa * n0, height * a1 - xa * n1, height * a2 - xa * n2
-        )
-        write_turned(
-            block, B_X, lane, frame, height * b0 - xb * n0, height * b1 - xb * n1, height * b2 - xb * n2
-        )
-        block[N_0, lane] = np.float32(height)
-        block[INNER, lane] = record[INNER_RADIUS]
-        block[ALPHA_0, lane] = record[OPACITY]
+        write_row(block, lane, records[ids[k]], origin, frame)

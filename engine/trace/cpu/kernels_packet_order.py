@@ -16,10 +16,7 @@ def sort_candidates(candidates, count, order, histogram):
     """Order the candidates in chunks by distance, within a chunk by the rays that may meet them."""
     keys, bounds, cells, near = candidates.keys, candidates.bounds, candidates.cells, candidates.near
     block_rays = candidates.block_rays
-    if count > FEW_KEYS:
-        sort_keys(keys, candidates.pending, count, histogram)
-    else:
-        insertion_sort(keys, count)
+    sort_by_distance(candidates, count, histogram)
     nearest = np.float32(np.inf)
     near[count] = nearest
     for k in range(count - 1, -1, -1):
@@ -42,6 +39,15 @@ def sort_candidates(candidates, count, order, histogram):
             candidates.ids[place] = order[candidates.found[which]]
             block_rays[place // WIDTH] |= candidates.masks[which]
     turn_bits(candidates, count)
+
+
+@lean(forceinline=True)
+def sort_by_distance(candidates, count, histogram):
+    """Sort the keys of the candidates."""
+    if count > FEW_KEYS:
+        sort_keys(candidates.keys, candidates.pending, count, histogram)
+    else:
+        insertion_sort(candidates.keys, count)
 
 
 @lean()

@@ -1,4 +1,4 @@
-"""Eight lanes at a time: the tests of a packet as explicit vectors.
+"""Vectors as explicit values, and the tests of a packet's walk, eight lanes at a time.
 
 Loop vectorisers leave these short loops scalar. The intrinsics emit vectors of eight float32, one register
 of AVX2, or of eight doubles, which the compiler maps to whatever the processor has; no flag allows it to
@@ -31,7 +31,7 @@ class Vector:
     def _other(self, other):
         if isinstance(other, Vector):
             return other.value
-        return ir.Constant(self.value.type, [float(other)] * LANES)
+        return ir.Constant(self.value.type, [float(other)] * self.value.type.count)
 
     def __add__(self, other):
         return Vector(self.builder, self.builder.fadd(self.value, self._other(other), flags=("contract",)))
@@ -73,9 +73,10 @@ class Vector:
         return Vector(self.builder, self.builder.not_(self.value))
 
     def __abs__(self):
-        width = 64 if self.value.type == DOUBLE8 else 32
-        integers = ir.VectorType(ir.IntType(width), LANES)
-        no_sign = ir.Constant(integers, [(1 << (width - 1)) - 1] * LANES)
+        kind = self.value.type
+        width = 64 if kind.element == DOUBLE8.element else 32
+        integers = ir.VectorType(ir.IntType(width), kind.count)
+        no_sign = ir.Constant(integers, [(1 << (width - 1)) - 1] * kind.count)
         bits = self.builder.and_(self.builder.bitcast(self.value, integers), no_sign)
         return Vector(self.builder, self.builder.bitcast(bits, self.value.type))
 
@@ -109,22 +110,23 @@ class Vector:
 
     def mask(self):
         """Truth of the lanes as the low bits of an int64."""
-        return self.builder.zext(self.builder.bitcast(self.value, ir.IntType(LANES)), I64)
+        return self.builder.zext(self.builder.bitcast(self.value, ir.IntType(self.value.type.count)), I64)
 
 
 class Lanes:
-    """Loads and stores rows of eight lanes at an address."""
+    """Loads and stores rows of lanes at an address, ``bytes_a_row`` apart: without gaps unless told."""
 
-    def __init__(self, builder, address, element):
-        self.builder, self.size = builder, 8 if element == DOUBLE8 else 4
+    def __init__(self, builder, address, element, bytes_a_row=0):
+        self.builder = builder
         self.element = element
         self.address = address
+        self.bytes_a_row = bytes_a_row or element.count * (8 if element == DOUBLE8 else 4)
 
     def _pointer(self, row):
         offset = (
-            ir.Constant(I64, row * LANES * self.size)
+            ir.Constant(I64, row * self.bytes_a_row)
             if isinstance(row, int)
-            else self.builder.mul(row, ir.Constant(I64, LANES * self.size))
+            else self.builder.mul(row, ir.Constant(I64, self.bytes_a_row))
         )
         address = self.builder.add(self.address, offset)
         return self.builder.inttoptr(address, self.element.as_pointer())
@@ -136,12 +138,32 @@ class Lanes:
         self.builder.store(vector.value, self._pointer(row), align=4)
 
 
-def broadcast(builder, scalar):
-    """A vector of eight times the same float32 or double."""
-    nothing = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
+def broadcast(builder, scalar, lanes=LANES):
+    """A vector of so many times the same float32 or double."""
+    nothing = ir.Constant(ir.VectorType(scalar.type, lanes), ir.Undefined)
     one = builder.insert_element(nothing, scalar, ir.Constant(ir.IntType(32), 0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
     return Vector(builder, builder.shuffle_vector(one, nothing, zeros))
+
+
+def exponential(builder, x):
+    """Exponentials of float32: 2^n times a polynomial of what is left, at most half of ln 2.
+
+    Right to a relative 1e-7 for |x| < 87. The polynomial and ln 2 in two parts, the first of which times n is
+    exact, are those of Cephes' expf (https://www.netlib.org/cephes/).
+    """
+    count = x.value.type.count
+    integers = ir.VectorType(ir.IntType(32), count)
+    shift = 12582912.0  # 1.5 * 2^23: adding it rounds to a whole number, which the low bits then are
+    moved = x * 1.4426950408889634 + shift
+    n = moved - shift
+    r = x - n * 0.693359375 + n * 2.12194440e-4
+    p = r * 1.9875691500e-4 + 1.3981999507e-3
+    for term in (8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1, 1.0, 1.0):
+        p = p * r + term
+    bits = builder.shl(builder.bitcast(moved.value, integers), ir.Constant(integers, [23] * count))
+    bits = builder.add(bits, ir.Constant(integers, [127 << 23] * count))
+    return p * Vector(builder, builder.bitcast(bits, x.value.type))
 
 
 def size_of(vectors):

@@ -10,12 +10,15 @@ from engine.trace.cpu.bundles import (
     ByGaussian,
     Forward,
     Limits,
+    OneOrderHits,
     OutputGradients,
     PacketHits,
     Parameters,
     Rays,
     Scene,
 )
+from engine.trace.cpu.kernels_one_order import see_packets
+from engine.trace.cpu.kernels_one_order_backward import replay_one_order
 from engine.trace.cpu.kernels_packet import packet_starts
 from engine.trace.cpu.kernels_packet_backward import (
     GEOMETRY_WORDS,
@@ -27,6 +30,7 @@ from engine.trace.cpu.kernels_packet_backward import (
 )
 from engine.trace.cpu.kernels_packet_forward import absorb_packets, trace_packets
 from engine.trace.cpu.kernels_rays import SPARE
+from engine.trace.cpu.kernels_sixteen import LINE
 from engine.trace.cpu.kernels_sort import sort_by_gaussian
 from engine.trace.cpu.memory import Pool, empty_gradients, raw_gradients
 from engine.trace.cpu.packet_tree import PacketTree
@@ -92,6 +96,7 @@ class PacketTracer:
         self._threads = threads
         self._pool = pool
         self._tree: PacketTree | None = None
+        self._most_met = 0
 
     def build(self, records: Float32[np.ndarray, "n 16"]) -> None:
         """Build the hierarchy."""
@@ -115,6 +120,31 @@ class PacketTracer:
         """Follow the rays of the packets."""
         assert self._tree is not None, "build first"
         trace_packets(*forward, packets, self._tree.arrays, kept, self._threads, np.zeros(1, np.int64))
+
+    def trace_in_one_order(
+        self, forward: Forward, packets: Int64[np.ndarray, "p 2"], rays: int
+    ) -> OneOrderHits:
+        """Follow the rays of the packets, those of a packet through its Gaussians in one order.
+
+        How many a packet will meet is not known before, so that what has no room is traced again.
+        """
+        assert self._tree is not None, "build first"
+        while True:
+            places = self._most_met if forward.recording else 0
+            ids, bits, lines, starts, counts, frames, left = self._pool.empty(
+                ((places,), np.int32), ((places,), np.uint64), ((places, LINE), np.float32),
+                ((len(packets),), np.int64), ((len(packets),), np.int32), ((len(packets), 9), np.float64),
+                ((rays,), np.float32),
+            )  # fmt: skip
+            kept = OneOrderHits(ids, bits, lines, starts, counts, frames, left)
+            met = np.zeros(1, np.int64)
+            see_packets(
+                *forward, packets, self._tree.arrays, kept, self._threads, np.zeros(1, np.int64), met
+            )  # fmt: skip
+            if met[0] <= places or not forward.recording:
+                left[:] = forward.out.transmittance
+                return kept
+            self._most_met = int(met[0]) * 5 // 4
 
     def absorb(
         self,
@@ -142,7 +172,9 @@ class PacketTracer:
 
         Gaussians whose weights add up to less than ``least_weight`` are left out before the sums.
         """
-        firsts = np.concatenate([[0], np.cumsum(recording.kept.slot_counts, dtype=np.int64)])
+        kept = recording.kept
+        counts = kept.counts if isinstance(kept, OneOrderHits) else kept.slot_counts
+        firsts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
         count, basis_count, feature_count = int(firsts[-1]), scene.sh.shape[1], scene.features.shape[1]
         geometry = GEOMETRY_WORDS if gradients.with_geometry else 0
         ids, weights, sums, by_geometry, features = self._pool.empty(
@@ -153,11 +185,14 @@ class PacketTracer:
             ((count, feature_count), np.float32),
         )
         rows = Rows(firsts, ids, weights, sums, by_geometry, features)
-        rays, packets = Rays.of(recording.rays), recording.packets
-        replay_packets(
-            rays, packets, recording.hits, recording.kept, recording.counts, parameters, scene.features,
-            self._limits, gradients, self._threads, np.zeros(1, np.int64), rows,
-        )  # fmt: skip
+        rays, packets, counter = Rays.of(recording.rays), recording.packets, np.zeros(1, np.int64)
+        if isinstance(kept, OneOrderHits):
+            replay_one_order(rays, packets, kept, self._limits, gradients, self._threads, counter, rows)
+        else:
+            replay_packets(
+                rays, packets, recording.hits, kept, recording.counts, parameters, scene.features,
+                self._limits, gradients, self._threads, counter, rows,
+            )  # fmt: skip
         by_gaussian = ByGaussian(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
         met = np.empty(len(by_gaussian.starts) - 1, np.float32)
         sum_weights(by_gaussian, rows.weights, met)

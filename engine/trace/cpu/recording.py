@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Int32, Int64
 
 from engine.rays import RayBatch
-from engine.trace.cpu.bundles import Hits, Limits, PacketHits
+from engine.trace.cpu.bundles import Hits, Limits, OneOrderHits, PacketHits
 from engine.trace.cpu.kernels_rays import first_place
 
 
@@ -30,7 +30,7 @@ class CpuRecording:
     packets: Int64[np.ndarray, "p 2"]
     alone: Int64[np.ndarray, " s"]
     hits: Hits
-    kept: PacketHits
+    kept: PacketHits | OneOrderHits
     limits: Limits
     build: object
 
@@ -41,9 +41,12 @@ class CpuRecording:
 
     def of_ray(self, ray: int) -> Int32[np.ndarray, " k"]:
         """Ids of the Gaussians of one ray, front to back."""
-        hits = self.place(ray)
         packet = int(np.searchsorted(self.packets[:, 0], ray, side="right")) - 1
         if packet < 0 or ray >= self.packets[packet, 1]:
-            return self.hits.ids[hits]
+            return self.hits.ids[self.place(ray)]
+        if isinstance(self.kept, OneOrderHits):
+            place = slice(*np.cumsum([self.kept.starts[packet], self.kept.counts[packet]]))
+            bit = np.uint64(ray - self.packets[packet, 0])
+            return self.kept.ids[place][(self.kept.bits[place] >> bit & np.uint64(1)).astype(bool)]
         first = first_place.py_func(int(self.packets[packet, 0]), self.limits)
-        return self.kept.slot_ids[first + self.kept.slots[hits]]
+        return self.kept.slot_ids[first + self.kept.slots[self.place(ray)]]

@@ -7,7 +7,16 @@ from jaxtyping import Float32, Int32, Int64
 from engine.gaussians.model import FlatGaussians
 from engine.rays import RayBatch
 from engine.threads import use_threads
-from engine.trace.cpu.bundles import Forward, Hits, Limits, Parameters, Rays, Scene
+from engine.trace.cpu.bundles import (
+    Forward,
+    Hits,
+    Limits,
+    OneOrderHits,
+    PacketHits,
+    Parameters,
+    Rays,
+    Scene,
+)
 from engine.trace.cpu.kernels_hit import RECORD_WORDS
 from engine.trace.cpu.kernels_rays import SPARE
 from engine.trace.cpu.kernels_records import outgrown_boxes, refresh_records, write_boxes, write_records
@@ -31,10 +40,12 @@ class CpuTracer:
     are ordered by (float32 distance, id). So neither the shape of a hierarchy nor the number of threads
     changes a result. Single rays test in float64; packets in float32 in a frame of their own
     (:mod:`engine.trace.cpu.kernels_packet`), so that the two agree but for that rounding, which is largest
-    for needles and for octagons seen edge on. Memory per Gaussian: a record of 64 B, 48 B of the packets'
-    hierarchy and a box of 24 B; Embree's hierarchy over the boxes is built when single rays first want it.
+    for needles and for octagons seen edge on. Where ``settings.order`` is ``packet``, the rays of a packet
+    composite in one order (:mod:`engine.trace.cpu.kernels_one_order`), unless Gaussians have features or
+    there is a second phase. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy and a box
+    of 24 B; Embree's hierarchy over the boxes is built when single rays first want it.
 
-    Not done: no gradient through octagon edges or visibility.
+    Not done: no gradient through octagon edges or visibility, and in one order none by depths and normals.
 
     Args:
         settings: where rays are cut off.
@@ -100,11 +111,16 @@ class CpuTracer:
         packets, alone = self._sorted_out(rays, coloured=True)
         count = len(rays)
         result = empty_result(count, self._features.shape[1])
-        hits = self._room(count if record else 0)
+        in_one_order = len(packets) > 0 and self._in_one_order
+        hits = self._room(count if record and not (in_one_order and len(alone) == 0) else 0)
         forward = Forward(Rays.of(rays), self._scene, self._limits, outputs(result), hits, record)
-        kept = self._packets.room(packets, count, recording=record)
-        if len(packets):
-            self._packets.trace(forward, packets, kept)
+        kept: PacketHits | OneOrderHits
+        if in_one_order:
+            kept = self._packets.trace_in_one_order(forward, packets, count)
+        else:
+            kept = self._packets.room(packets, count, recording=record)
+            if len(packets):
+                self._packets.trace(forward, packets, kept)
         if len(alone):
             self._singles.trace(forward, alone)
         if record:
@@ -131,6 +147,8 @@ class CpuTracer:
             raise ValueError("the recording is not of this tracer, or older than its last build")
         assert self._gaussians is not None
         use_threads(self.threads)
+        if isinstance(hits.kept, OneOrderHits) and gradients.with_geometry:
+            raise ValueError("depths and normals have no gradients in one order: trace with order='ray'")
         given = output_gradients(gradients, len(hits.rays), self._features.shape[1])
         parameters = Parameters.of(self._gaussians)
         if len(hits.alone) == 0:
@@ -140,6 +158,11 @@ class CpuTracer:
             parts.append(self._packets.backward(hits, given, self._scene, parameters, 0.0))
         parts.append(self._singles.backward(hits, given, self._scene, parameters))
         return heavier(add_gradients(parts), least_weight)
+
+    @property
+    def _in_one_order(self) -> bool:
+        one_phase = self.settings.second_phase_min is None
+        return self.settings.order == "packet" and one_phase and self._features.shape[1] == 0
 
     @property
     def _scene(self) -> Scene:
