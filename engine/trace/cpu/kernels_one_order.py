@@ -145,9 +145,11 @@ def see(first, last, origin, frame, forward, order, candidates, count, view):
     met = 0
     for k in range(count):
         if k + AHEAD < count:
-            ahead = order[found[np.int64(keys[k + AHEAD] & NUMBER)]]
-            prefetch(records_at + ahead * RECORD_BYTES)
-            ask_for(sh_at + ahead * sh_bytes, sh_bytes)
+            which = np.int64(keys[k + AHEAD] & NUMBER)
+            if masks[which] & alive != 0:
+                ahead = order[found[which]]
+                prefetch(records_at + ahead * RECORD_BYTES)
+                ask_for(sh_at + ahead * sh_bytes, sh_bytes)
         which = np.int64(keys[k] & NUMBER)
         may = masks[which] & alive
         if may == 0:

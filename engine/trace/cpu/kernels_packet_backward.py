@@ -21,7 +21,7 @@ from engine.trace.cpu.kernels_eight_backward import add_row, replay_hits, walk_t
 from engine.trace.cpu.kernels_packet import AHEAD, RECORD_BYTES
 from engine.trace.cpu.kernels_rays import first_place, ray_origin, side_shown
 from engine.trace.cpu.kernels_records import rotation_columns
-from engine.trace.cpu.kernels_sh import slope_by_mean, write_view
+from engine.trace.cpu.kernels_sh import add_by_colour, slope_by_mean, write_by_values, write_view
 from engine.trace.cpu.kernels_single_backward import Moments, write_gradients
 from engine.trace.cpu.kernels_tree import WIDTH
 from engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch
@@ -278,11 +278,10 @@ def sum_chunk(
             tau_v += (gtv - here[HVVV] - xa * huv - xb * hvv) * inverse
             by_colour = np.float64(here[RED]), np.float64(here[GREEN]), np.float64(here[BLUE])
             view = write_view(basis, basis_count, x, y, z)
-            for j in range(basis_count):
-                for channel in range(3):
-                    out.sh[place, j, channel] += basis[j] * by_colour[channel]
+            add_by_colour(out.sh, place, basis, basis_count, by_colour)
             if basis_count > 1:
-                by_x, by_y, by_z = slope_by_mean(scene.sh, i, basis_count, view, by_colour)
+                write_by_values(basis, scene.sh, i, basis_count, by_colour)
+                by_x, by_y, by_z = slope_by_mean(basis, basis_count, view)
                 m0, m1, m2 = m0 + by_x, m1 + by_y, m2 + by_z
             for f in range(feature_count):
                 out.features[place, f] += rows.features[row, f]

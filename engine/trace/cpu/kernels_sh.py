@@ -9,7 +9,16 @@ import numpy as np
 
 from engine.gaussians.harmonics import SH_C1, SH_C2, SH_C3
 from engine.gaussians.model import SH_C0
+from engine.trace.cpu.kernels_sh_lanes import (
+    CHANNELS,
+    HARMONICS,
+    add_harmonics,
+    sum_of_harmonics,
+    write_by_harmonic,
+)
 from engine.trace.kernels_native import lean
+
+SH_BYTES = HARMONICS * CHANNELS * 4
 
 
 @lean()
@@ -40,12 +49,26 @@ def write_basis(basis, count, x, y, z):
 @lean(forceinline=True)
 def colour(sh, i, basis):
     """Display colour max(0, 1/2 + sum_k sh[i, k] basis[k]) of Gaussian ``i``, three float64."""
+    if sh.shape[1] == HARMONICS:
+        red, green, blue = sum_of_harmonics(sh.ctypes.data + i * SH_BYTES, basis.ctypes.data)
+        return max(0.5 + red, 0.0), max(0.5 + green, 0.0), max(0.5 + blue, 0.0)
     red = green = blue = 0.5
     for k in range(sh.shape[1]):
         red += np.float64(sh[i, k, 0]) * basis[k]
         green += np.float64(sh[i, k, 1]) * basis[k]
         blue += np.float64(sh[i, k, 2]) * basis[k]
     return max(red, 0.0), max(green, 0.0), max(blue, 0.0)
+
+
+@lean(forceinline=True, fastmath={"contract"})
+def add_by_colour(gradients, i, basis, count, by_colour):
+    """Add the gradient by the first ``count`` harmonics to row ``i``."""
+    if count == HARMONICS:
+        add_harmonics(gradients.ctypes.data + i * SH_BYTES, basis.ctypes.data, *by_colour)
+        return
+    for k in range(count):
+        for channel in range(3):
+            gradients[i, k, channel] += basis[k] * by_colour[channel]
 
 
 @lean(forceinline=True, fastmath={"contract"})
@@ -75,32 +98,36 @@ def write_ray_view(basis, count, to_mean, direction, t_viewer):
 
 
 @lean(forceinline=True, fastmath={"contract"})
-def _by(sh, i, k, by_colour):
-    """Gradient by the value of harmonic ``k``."""
-    return by_colour[0] * sh[i, k, 0] + by_colour[1] * sh[i, k, 1] + by_colour[2] * sh[i, k, 2]
+def write_by_values(values, sh, i, count, by_colour):
+    """Gradients by the values of the first ``count`` harmonics of Gaussian ``i``."""
+    if count == HARMONICS:
+        write_by_harmonic(values.ctypes.data, sh.ctypes.data + i * SH_BYTES, *by_colour)
+        return
+    for k in range(count):
+        values[k] = by_colour[0] * sh[i, k, 0] + by_colour[1] * sh[i, k, 1] + by_colour[2] * sh[i, k, 2]
 
 
 @lean(fastmath={"contract"})
-def slope_by_mean(sh, i, count, view, by_colour):
-    """Gradient by the mean of Gaussian ``i``, through the direction in which its colour is seen.
+def slope_by_mean(by, count, view):
+    """Gradient by a Gaussian's mean, through the direction in which its colour is seen.
 
-    ``view`` is that direction and one over the distance, as :func:`write_view` gives them; 0 for a viewer at
-    infinity, where the mean changes nothing.
+    ``by`` are the gradients by the values of its harmonics; ``view`` is that direction and one over the
+    distance, as :func:`write_view` gives them; 0 for a viewer at infinity, where the mean changes nothing.
     """
     x, y, z, scale = view
 
     gx, gy, gz = (
-        -SH_C1 * _by(sh, i, 3, by_colour),
-        -SH_C1 * _by(sh, i, 1, by_colour),
-        SH_C1 * _by(sh, i, 2, by_colour),
+        -SH_C1 * by[3],
+        -SH_C1 * by[1],
+        SH_C1 * by[2],
     )
     if count > 4:
         a, b, c, d, e = (
-            SH_C2[0] * _by(sh, i, 4, by_colour),
-            SH_C2[1] * _by(sh, i, 5, by_colour),
-            SH_C2[2] * _by(sh, i, 6, by_colour),
-            SH_C2[3] * _by(sh, i, 7, by_colour),
-            SH_C2[4] * _by(sh, i, 8, by_colour),
+            SH_C2[0] * by[4],
+            SH_C2[1] * by[5],
+            SH_C2[2] * by[6],
+            SH_C2[3] * by[7],
+            SH_C2[4] * by[8],
         )
         gx += a * y - 2.0 * c * x + d * z + 2.0 * e * x
         gy += a * x + b * z - 2.0 * c * y - 2.0 * e * y
@@ -108,15 +135,15 @@ def slope_by_mean(sh, i, count, view, by_colour):
         if count > 9:
             xx, yy, zz = x * x, y * y, z * z
             a, b, c, d = (
-                SH_C3[0] * _by(sh, i, 9, by_colour),
-                SH_C3[1] * _by(sh, i, 10, by_colour),
-                SH_C3[2] * _by(sh, i, 11, by_colour),
-                SH_C3[3] * _by(sh, i, 12, by_colour),
+                SH_C3[0] * by[9],
+                SH_C3[1] * by[10],
+                SH_C3[2] * by[11],
+                SH_C3[3] * by[12],
             )
             e, f, g = (
-                SH_C3[4] * _by(sh, i, 13, by_colour),
-                SH_C3[5] * _by(sh, i, 14, by_colour),
-                SH_C3[6] * _by(sh, i, 15, by_colour),
+                SH_C3[4] * by[13],
+                SH_C3[5] * by[14],
+                SH_C3[6] * by[15],
             )
             gx += a * 6.0 * x * y + b * y * z - c * 2.0 * x * y - d * 6.0 * x * z
             gx += e * (4.0 * zz - 3.0 * xx - yy) + f * 2.0 * x * z + g * 3.0 * (xx - yy)

@@ -22,7 +22,7 @@ from engine.trace.cpu.kernels_rays import (
     side_shown,
 )
 from engine.trace.cpu.kernels_records import rotation_columns
-from engine.trace.cpu.kernels_sh import slope_by_mean, write_ray_view
+from engine.trace.cpu.kernels_sh import slope_by_mean, write_by_values, write_ray_view
 from engine.trace.kernels_native import lean, next_from_counter
 
 RED_OFF, GREEN_OFF, BLUE_OFF = 1 << 28, 1 << 29, 1 << 30
@@ -245,12 +245,13 @@ def gather_chunk(first, last, memory, rays, parameters, scene, limits, by_gaussi
                 sh_sum[0, 2] += gb
             else:
                 view = write_ray_view(basis, basis_count, to_mean, (d0, d1, d2), ray_viewer(rays, r))
-                m_x, m_y, m_z = slope_by_mean(scene.sh, i, basis_count, view, (gr, gg, gb))
-                s_m0, s_m1, s_m2 = s_m0 + m_x, s_m1 + m_y, s_m2 + m_z
                 for j in range(basis_count):
                     sh_sum[j, 0] += basis[j] * gr
                     sh_sum[j, 1] += basis[j] * gg
                     sh_sum[j, 2] += basis[j] * gb
+                write_by_values(basis, scene.sh, i, basis_count, (gr, gg, gb))
+                m_x, m_y, m_z = slope_by_mean(basis, basis_count, view)
+                s_m0, s_m1, s_m2 = s_m0 + m_x, s_m1 + m_y, s_m2 + m_z
             if g.with_geometry:
                 facing = w * side_shown(to_mean, r1, limits)
                 s_n0 += facing * g.normal[r, 0]
