@@ -30,7 +30,7 @@ from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
 from engine.train.batches import BatchSource
 from engine.train.checkpoint import load_checkpoint, save_checkpoint
-from engine.train.config import TrainConfig, training_trace
+from engine.train.config import TrainConfig, in_one_order
 from engine.train.densify import make_densifier
 from engine.train.initialise import initial_gaussians
 from engine.train.iteration import Machinery, iterate
@@ -94,9 +94,8 @@ def spent(
     """Medians by stage of wall, CPU and own CPU time, seconds; hits a ray; Gaussians hit."""
     use_threads(threads)
     clock = Clock()
-    tracer = TimedTracer(
-        make_tracer(training_trace(config), threads=threads, box_padding=config.box_padding), clock
-    )
+    settings = config.trace.model_copy(update={"order": "packet" if in_one_order(config) else "ray"})
+    tracer = TimedTracer(make_tracer(settings, threads=threads, box_padding=config.box_padding), clock)
     densifier = make_densifier(config.densify, iterations=iterations, max_gaussians=len(state.gaussians))
     machinery = Machinery(tracer, make_shading(config, len(dataset.views), dataset.extent), densifier)
     batches = BatchSource(dataset, config)

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 from engine.colour import composited
 from engine.scene import Camera
 from engine.scene.seen import turned
-from engine.train.batches import Pixels, still_background
+from engine.train.batches import still_background
 from engine.train.config import TrainConfig
+from engine.train.pixel_sampler import Pixels
 
 STEPS = 2
 MOST_PX = 1.0

@@ -19,6 +19,8 @@ from engine.train.preset_names import PRESETS
 MOST_PLANNED_ITERATIONS = 30_000
 """Where a time decides their number, see :mod:`engine.train.within`."""
 
+OWN_ORDER = 3 / 7
+"""Share of the rays that a training has time for where each ray has an order of its own."""
 TURNED_BEYOND = 0.5
 """Cosine beyond which normals that point away are turned, where materials are learnt."""
 FOR_SURFACE = 0.05
@@ -133,13 +135,14 @@ class TrainConfig(_Frozen):
         description="end sooner where the training rays gain less than so many dB in a fifth of the "
         "iterations; 0 never does",
     )
-    rays_a_pixel: int = Field(3, ge=1, description="where iterations is 0; 5,000 to 10,000 iterations for 3")
+    rays_a_pixel: int = Field(7, ge=1, description="where iterations is 0; 10,000 to 23,000 iterations for 7")
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
     window_side: int = Field(
         0,
         ge=0,
-        description="pixels that a window spans; 0: a fifteenth of the views' longest side",
+        description="pixels that a window spans; 0: as many as six Gaussians stand for, at most a fifteenth "
+        "of the views' longest side, which it is where each ray has an order of its own",
     )
     patch_fraction: float = Field(
         0.25, ge=0, le=1, description="share of the rays that comes in patches for SSIM"
@@ -218,10 +221,12 @@ class TrainConfig(_Frozen):
         ge=0,
         description="Gaussians whose weights on the rays of an iteration add up to less keep still in it",
     )
-    one_order: bool = Field(
-        True,
-        description="while training, the rays of a window composite in one order, which is several times as "
-        "fast and a little wrong; not with materials or loss.depth_normal",
+    one_order: float = Field(
+        0.8,
+        ge=0,
+        le=1,
+        description="share of the training in which the rays of a window composite in one order, which is "
+        "several times as fast and a little wrong; not with materials or loss.depth_normal",
     )
     rates: LearningRates = LearningRates()
     loss: LossWeights = LossWeights()
@@ -281,11 +286,12 @@ class TrainConfig(_Frozen):
 def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
     """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
-    Large scenes learn as long as there is something to see; small ones are done after 5,000 with 3 rays
-    a pixel. Where only a share of the pixels shows anything (see :mod:`engine.train.shown`), the rays
-    of the others teach little and cost little, and it takes as many more; not with materials.
+    Large scenes learn as long as there is something to see; small ones are done after 10,000 with 7 rays a
+    pixel. Rays that have an order of their own take longer, so that there are fewer of them. Where only a
+    share of the pixels shows anything (see :mod:`engine.train.shown`), the rays of the others teach little
+    and cost little, and it takes as many more; not with materials.
     """
-    each = config.rays_a_pixel
+    each = config.rays_a_pixel if in_one_order(config) else max(1, round(OWN_ORDER * config.rays_a_pixel))
     wanted = max(round(each * training_pixels / config.rays / 1000), 5 * max(1, each // 3))
     if not config.materials.learn:
         wanted = round(wanted / shown)
@@ -305,23 +311,25 @@ def most_gaussians(config: TrainConfig, training_pixels: int, shown: float = 1.0
     return min(wanted, config.max_gaussians_auto)
 
 
-def window_side_px(config: TrainConfig, longest_side_px: int) -> int:
-    """``config.window_side``, or where that is 0 a fifteenth of the longest side of the training views.
+def in_one_order(config: TrainConfig) -> bool:
+    """Whether the rays of a window composite in one order for a part of the training.
 
-    A window is to cover a small angle, so that its rays meet the same Gaussians.
-    """
-    return config.window_side or max(1, round(longest_side_px / 15))
-
-
-def training_trace(config: TrainConfig) -> TraceSettings:
-    """How the batches of a training are traced; what is measured and exported is traced as ``trace`` says.
-
-    Gradients by depths and normals, and a second phase, want each ray's own order.
+    Gradients by depths and normals, and a second phase, want each ray's own.
     """
     by_geometry = config.materials.learn or config.loss.depth_normal > 0
-    if not config.one_order or by_geometry or config.trace.second_phase_min is not None:
-        return config.trace
-    return config.trace.model_copy(update={"order": "packet"})
+    return config.one_order > 0 and not by_geometry and config.trace.second_phase_min is None
+
+
+def window_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian: float) -> int:
+    """``config.window_side``, or where that is 0 what suits the Gaussians or the views.
+
+    A window is to cover a small angle, so that its rays meet the same Gaussians: what these cost once for all
+    rays is most of what rays in one order cost. But rays that are too close learn the same.
+    """
+    if config.window_side:
+        return config.window_side
+    widest = max(1, round(longest_side_px / 15))
+    return min(widest, round(math.sqrt(6 * pixels_a_gaussian))) if in_one_order(config) else widest
 
 
 def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
@@ -365,7 +373,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "average_after": 0.8,
             "least_weight": 0.0,
             "near_share": 0.0,
-            "one_order": False,
+            "one_order": 0.0,
             "stop_early": 0.0,
             "densify": McmcConfig(copies="area", stop_fraction=0.4),
             "initial_opacity": 0.8,
@@ -386,7 +394,7 @@ def preset(name: str) -> TrainConfig:
     if name == "standard":
         return TrainConfig()
     if name == "high":
-        return TrainConfig(rays_a_pixel=9, pixels_a_gaussian=30, max_gaussians_auto=600_000)
+        return TrainConfig(rays_a_pixel=21, pixels_a_gaussian=30, max_gaussians_auto=600_000)
     if name == "paper":
         return TrainConfig(
             iterations=10_000,
@@ -394,7 +402,7 @@ def preset(name: str) -> TrainConfig:
             rays=8192,
             least_weight=0.0,
             near_share=0.0,
-            one_order=False,
+            one_order=0.0,
             stop_early=0.0,
             place_misfits=False,
             window_rays=1,

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from engine.rays import RayBatch
 from engine.scene import Camera, View
 from engine.train.alignment import Motion
-from engine.train.batches import TrainingData
+from engine.train.pixel_sampler import TrainingData
 
 ROUNDS = 3
 """The common part is found for small angles, and again for what that leaves."""

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from engine.scene.model import Observations
-from engine.train.batches import TrainingData
 from engine.train.config import TrainConfig
+from engine.train.pixel_sampler import TrainingData
 
 DARKEST, BRIGHTEST = 0.1, 0.95
 """Display values beyond which a brightness says little."""

@@ -17,7 +17,7 @@ from engine.scene import Camera
 from engine.scene.model import SparsePoints
 from engine.scene.seen import is_shown, points_in_cam
 from engine.shading.learnt_background import LearntBackground
-from engine.train.batches import TrainingData
+from engine.train.pixel_sampler import TrainingData
 
 ROWS = 64
 """Of the first map; finer ones are interpolated."""

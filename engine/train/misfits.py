@@ -15,8 +15,9 @@ from engine.psnr import colour_corrected, psnr
 from engine.scene import View
 from engine.shading.protocol import ShadingModel
 from engine.trace.protocol import Tracer
-from engine.train.batches import TrainingData, still_background
+from engine.train.batches import still_background
 from engine.train.config import TrainConfig
+from engine.train.pixel_sampler import TrainingData
 from engine.train.view_grids import shown_on_grids
 
 TILES = 3

@@ -18,9 +18,10 @@ from engine.scene.seen import turned
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
 from engine.train.alignment import Motion, Rendered, aligned, photograph_of
-from engine.train.batches import grid_pixels, still_background, view_sizes_px
+from engine.train.batches import grid_pixels, still_background
 from engine.train.config import TrainConfig
 from engine.train.corrected_views import CorrectedViews, PosedPhotographs, without_common
+from engine.train.pixel_sampler import view_sizes_px
 
 TILES = 5
 """So many tiles each way of a view are aligned, see :func:`engine.train.batches.grid_pixels`."""

@@ -12,9 +12,10 @@ from engine.events import HeldOutMeasured, Listener, Warned
 from engine.gaussians.model import FlatGaussians
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
-from engine.train.batches import PixelSampler, TrainingData, still_background, view_sizes_px
+from engine.train.batches import still_background
 from engine.train.checkpoint import load_best, save_best
 from engine.train.config import TrainConfig
+from engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
 from engine.train.shading import exposures_of
 from engine.train.state import TrainState
 from engine.train.view_grids import guess_exposures

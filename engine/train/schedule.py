@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from engine.train.averaging import AVERAGE_EVERY
-from engine.train.config import TrainConfig, iteration_count, rebuild_interval
+from engine.train.config import TrainConfig, in_one_order, iteration_count, rebuild_interval
 from engine.train.early_end import last_iteration
 
 EVENT_EVERY = 10
@@ -76,6 +76,10 @@ class Schedule:
     def is_late(self, done: int) -> bool:
         """Whether states are averaged by then."""
         return max(self.config.average_after * self.iterations, self.hastened_after or 0) < done
+
+    def in_one_order(self, done: int) -> bool:
+        """Whether the rays of a window composite in one order in the next iteration."""
+        return in_one_order(self.config) and self.progress(done) < self.config.one_order
 
     def settles_sides(self, done: int) -> bool:
         """Whether Gaussians whose outer side is in are turned over: until states are averaged."""

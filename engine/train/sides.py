@@ -10,7 +10,8 @@ from jaxtyping import Float64, Int32, Int64
 
 from engine.gaussians.model import FlatGaussians
 from engine.trace.protocol import TraceGradients, Tracer
-from engine.train.batches import TrainingData, grid_pixels, view_sizes_px
+from engine.train.batches import grid_pixels
+from engine.train.pixel_sampler import TrainingData, view_sizes_px
 
 TILES = 6
 """So many tiles of a view each way tell who sees what, see :func:`engine.train.batches.grid_pixels`."""

@@ -1,6 +1,7 @@
 """The training loop: iterations, and between them rebuilds, probes, checkpoints and densification."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,9 @@ from engine.scene.seen import SeenSpace
 from engine.shading.protocol import ShadingModel
 from engine.trace.make import make_tracer
 from engine.trace.protocol import Tracer
-from engine.train.batches import BatchSource, DrawnAhead, TrainingData
+from engine.train.batches import BatchSource, DrawnAhead
 from engine.train.checkpoint import save_checkpoint
-from engine.train.config import TrainConfig, most_gaussians, training_trace
+from engine.train.config import TrainConfig, most_gaussians
 from engine.train.corrected_views import PosedPhotographs
 from engine.train.densify import make_densifier
 from engine.train.densify.propagating import Propagating
@@ -25,6 +26,7 @@ from engine.train.early_end import gains_no_more
 from engine.train.floors import ScaleFloor
 from engine.train.iteration import Differentiated, Machinery, iterate
 from engine.train.misfits import TrainingViews, ViewJudge
+from engine.train.pixel_sampler import TrainingData
 from engine.train.pose_refinement import PoseRefiner, RefinedPoses
 from engine.train.probes import Judge, decibels
 from engine.train.schedule import Schedule, Stopwatch
@@ -126,9 +128,8 @@ class Trainer:
             densifier.restore(state.densifier)
         if state.shading:
             self.shading.restore(state.shading)
-        if tracer is None:  # boxes leave room for what moves between rebuilds
-            tracer = make_tracer(training_trace(config), threads=threads, box_padding=config.box_padding)
-        self._machinery = Machinery(tracer, self.shading, densifier)
+        self._given_tracer = tracer
+        self._machinery = Machinery(tracer or self._make_tracer(), self.shading, densifier)
         self._judge = Judge(dataset, config, folder, listener)
         self._names = [view.name for view in dataset.views]
         self._view_judge = ViewJudge(dataset, config)
@@ -148,7 +149,7 @@ class Trainer:
             return self._run(batches)
 
     def _run(self, batches: DrawnAhead) -> FlatGaussians:
-        state, machinery = self.state, self._machinery
+        state = self.state
         watch, began_at = Stopwatch(state.seconds), state.iteration
         stale = True  # whether the hierarchy is of other Gaussians
         while True:
@@ -167,6 +168,7 @@ class Trainer:
                 self._build()
             if schedule.ends(state.iteration):
                 return self._conclude()
+            machinery = self._machinery
             batch = batches.draw(state.rng, state.iteration)
             if self._threads != 1 and not self._draws_or_stops(state.iteration + 1):
                 batches.begin(state.rng, state.iteration + 1)
@@ -210,7 +212,16 @@ class Trainer:
         densifies = schedule.may_densify(done) and self._machinery.densifier.due(done)
         return densifies or schedule.ends(done) or schedule.rebuilds(done, len(self.state.gaussians))
 
+    def _make_tracer(self) -> Tracer:
+        """A tracer for the next iteration; boxes leave room for what moves between rebuilds."""
+        order = "packet" if self.schedule.in_one_order(self.state.iteration) else "ray"
+        settings = self._config.trace.model_copy(update={"order": order})
+        return make_tracer(settings, threads=self._threads, box_padding=self._config.box_padding)
+
     def _build(self) -> None:
+        one_order = self._machinery.tracer.settings.order == "packet"
+        if self._given_tracer is None and one_order != self.schedule.in_one_order(self.state.iteration):
+            self._machinery = replace(self._machinery, tracer=self._make_tracer())
         gaussians, machinery = self.state.gaussians, self._machinery
         machinery.tracer.build(gaussians, machinery.shading.features(gaussians))
         self._settle_sides()

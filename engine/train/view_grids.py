@@ -8,8 +8,9 @@ from jaxtyping import Float32, Float64, Int64
 
 from engine.shading.protocol import ShadingModel, Sight
 from engine.trace.protocol import Tracer
-from engine.train.batches import TrainingData, grid_pixels, still_background, view_sizes_px
+from engine.train.batches import grid_pixels, still_background
 from engine.train.config import TrainConfig
+from engine.train.pixel_sampler import TrainingData, view_sizes_px
 from engine.train.shading import exposures_of
 
 VIEWS_AT_ONCE = 64

@@ -7,7 +7,9 @@ import pytest
 from flat_world import FlatWorld, small_config
 
 from engine.train.config import (
+    LossWeights,
     TrainConfig,
+    in_one_order,
     iteration_count,
     most_gaussians,
     preset,
@@ -16,6 +18,7 @@ from engine.train.config import (
     with_materials,
 )
 from engine.train.preset_names import PRESETS
+from engine.train.schedule import Schedule
 from engine.train.shown import shown_share
 from engine.train.state import fresh_state
 from engine.train.trainer import Trainer
@@ -37,26 +40,51 @@ def test_most_gaussians_follow_the_pixels(pixels: int, counts: tuple[int, ...]) 
         assert most_gaussians(preset(name).model_copy(update={"max_gaussians": 777}), pixels) == 777
 
 
-@pytest.mark.parametrize(("longest_px", "side_px"), [(4, 1), (480, 32), (800, 53), (960, 64), (4000, 267)])
-def test_windows_follow_the_size_of_the_views(longest_px: int, side_px: int) -> None:
-    assert window_side_px(TrainConfig(), longest_px) == side_px
-    assert window_side_px(TrainConfig(window_side=20), longest_px) == 20
+@pytest.mark.parametrize(
+    ("longest_px", "each_px", "side_px", "own_order_px"),
+    [(4, 50, 1, 1), (480, 50, 17, 32), (800, 117, 26, 53), (960, 1000, 64, 64), (4000, 160, 31, 267)],
+)
+def test_windows_follow_the_gaussians_or_the_views(
+    longest_px: int, each_px: float, side_px: int, own_order_px: int
+) -> None:
+    assert window_side_px(TrainConfig(), longest_px, each_px) == side_px
+    assert window_side_px(TrainConfig(one_order=0), longest_px, each_px) == own_order_px
+    assert window_side_px(with_materials(TrainConfig()), longest_px, each_px) == own_order_px
+    assert window_side_px(TrainConfig(window_side=20), longest_px, each_px) == 20
+
+
+def test_what_is_learnt_says_whether_windows_have_one_order() -> None:
+    assert TrainConfig().trace.order == "ray"
+    for config in (
+        TrainConfig(one_order=0),
+        with_materials(TrainConfig()),
+        TrainConfig(loss=LossWeights(depth_normal=0.05)),
+        preset("paper"),
+    ):
+        assert not in_one_order(config)
+        assert not Schedule.of(config, 10**6).in_one_order(0)
+    schedule = Schedule.of(TrainConfig(), 10**6)
+    assert [schedule.in_one_order(done) for done in (0, 7_999, 8_000, 10_000)] == [True, True, False, False]
 
 
 @pytest.mark.parametrize(
     ("pixels", "count"),
-    [(1_000, 5000), (20_000_000, 5000), (33_000_000, 6000), (46_900_000, 9000), (10**9, 10_000)],
+    [(1_000, 10), (20_000_000, 10), (33_000_000, 14), (46_900_000, 20), (10**9, 23)],
 )
 def test_large_scenes_train_longer(pixels: int, count: int) -> None:
+    count *= 1000
     assert iteration_count(TrainConfig(), pixels) == count
     assert iteration_count(TrainConfig(iterations=7), pixels) == 7
     assert iteration_count(preset("fast"), pixels) == 1400
     assert iteration_count(preset("paper"), pixels) == 10_000
-    assert 2.5 * count < iteration_count(preset("high"), pixels) < 3.5 * count
+    assert 2.5 * count < iteration_count(preset("high"), pixels) <= 3.5 * count
+    in_own_order = iteration_count(TrainConfig(one_order=0), pixels)
+    assert 0.4 * count <= in_own_order <= 0.5 * count
+    assert iteration_count(with_materials(TrainConfig()), pixels) == in_own_order
 
 
 @pytest.mark.parametrize(
-    ("shown", "gaussians", "count"), [(1.0, 392_000, 5000), (0.7, 274_400, 7000), (0.31, 121_520, 10_000)]
+    ("shown", "gaussians", "count"), [(1.0, 392_000, 10_000), (0.7, 274_400, 14_000), (0.31, 121_520, 23_000)]
 )
 def test_pixels_that_show_nothing_hold_nothing_down(shown: float, gaussians: int, count: int) -> None:
     assert most_gaussians(TrainConfig(), 19_600_000, shown) == gaussians
@@ -81,7 +109,7 @@ def test_the_share_of_pixels_that_show_something(hidden: str) -> None:
     assert shown_share(Half()) == pytest.approx(0.5, abs=0.01)
 
 
-@pytest.mark.parametrize(("wanted", "count"), [(0, 5000), (80, 80)])
+@pytest.mark.parametrize(("wanted", "count"), [(0, 10_000), (80, 80)])
 def test_the_trainer_knows_its_iterations(tmp_path: Path, wanted: int, count: int) -> None:
     world, config = FlatWorld(), small_config(iterations=wanted)
     state = fresh_state(world.start(), config.seed)
@@ -92,7 +120,7 @@ def test_the_trainer_knows_its_iterations(tmp_path: Path, wanted: int, count: in
 
 
 def test_more_rays_an_iteration_want_fewer_iterations() -> None:
-    assert iteration_count(TrainConfig(rays=32_768), 70_000_000) == 6000
+    assert iteration_count(TrainConfig(rays=32_768), 70_000_000) == 15_000
 
 
 @pytest.mark.parametrize(("gaussians", "iterations"), [(499_999, 25), (500_000, 50), (1_000_000, 75)])

@@ -17,9 +17,10 @@ from engine.rays import RayBatch
 from engine.scene import Camera, View
 from engine.scene.seen import points_in_cam
 from engine.train.alignment import Motion, Rendered, aligned, photograph_of
-from engine.train.batches import grid_pixels, view_sizes_px
+from engine.train.batches import grid_pixels
 from engine.train.checkpoint import latest_checkpoint, load_checkpoint
 from engine.train.corrected_views import corrected, without_common
+from engine.train.pixel_sampler import view_sizes_px
 from engine.train.pose_refinement import RefinedPose
 from engine.train.state import TrainState, fresh_state
 from engine.train.trainer import Trainer
