@@ -154,9 +154,9 @@ class TrainConfig(_Frozen):
     max_gaussians: int = Field(
         0,
         ge=0,
-        description="0: one for each 50 pixels of the training views or, of up to 10,000, for each 10",
+        description="0: one for each 30 pixels of the training views or, of up to 10,000, for each 10",
     )
-    pixels_a_gaussian: int = Field(50, ge=10, description="where max_gaussians is 0")
+    pixels_a_gaussian: int = Field(30, ge=10, description="where max_gaussians is 0")
     max_gaussians_auto: int = Field(400_000, ge=1, description="the most that 0 comes to in max_gaussians")
     initial_points: int = Field(
         600_000,
@@ -291,7 +291,9 @@ def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.
     share of the pixels shows anything (see :mod:`engine.train.shown`), the rays of the others teach little
     and cost little, and it takes as many more; not with materials.
     """
-    each = config.rays_a_pixel if in_one_order(config) else max(1, round(OWN_ORDER * config.rays_a_pixel))
+    each = config.rays_a_pixel
+    if not (in_one_order(config) or config.materials.learn):  # materials have a number of their own
+        each = max(1, round(OWN_ORDER * each))
     wanted = max(round(each * training_pixels / config.rays / 1000), 5 * max(1, each // 3))
     if not config.materials.learn:
         wanted = round(wanted / shown)
@@ -369,6 +371,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "sh_every": 400,
             "rays": 8192,
             "rays_a_pixel": 8,
+            "pixels_a_gaussian": 50,
             "step_back_db": 0.3,
             "average_after": 0.8,
             "least_weight": 0.0,
@@ -394,7 +397,7 @@ def preset(name: str) -> TrainConfig:
     if name == "standard":
         return TrainConfig()
     if name == "high":
-        return TrainConfig(rays_a_pixel=21, pixels_a_gaussian=30, max_gaussians_auto=600_000)
+        return TrainConfig(rays_a_pixel=21, max_gaussians_auto=600_000)
     if name == "paper":
         return TrainConfig(
             iterations=10_000,
@@ -406,6 +409,7 @@ def preset(name: str) -> TrainConfig:
             stop_early=0.0,
             place_misfits=False,
             window_rays=1,
+            pixels_a_gaussian=50,
             max_gaussians_auto=350_000,
             initial_points=30_000,
             lift_pixels=False,
