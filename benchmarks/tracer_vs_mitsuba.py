@@ -12,6 +12,7 @@ import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -142,7 +143,7 @@ def median_seconds(functions: list[Callable[[], object]], repeats: int) -> list[
     return [float(np.median(t)) for t in times]
 
 
-def compare(name: str, gaussians: FlatGaussians, repeats: int) -> None:
+def compare(name: str, gaussians: FlatGaussians, repeats: int, order: Literal["ray", "packet"]) -> None:
     """Print how long both sides take on one scene."""
     gaussians = gaussians.select(np.flatnonzero(octagon_radii(gaussians.opacities, SETTINGS.q) > 0))
     # Mitsuba steps 1e-4 beyond each hit: the scene is made large, so that it steps over nothing else.
@@ -150,7 +151,7 @@ def compare(name: str, gaussians: FlatGaussians, repeats: int) -> None:
     gaussians.log_scales += np.float32(np.log(ENLARGE))
     origins, directions = camera_rays(gaussians)
     theirs = Mitsuba(gaussians, origins, directions)
-    ours = CpuTracer(SETTINGS, threads=2)
+    ours = CpuTracer(SETTINGS.model_copy(update={"order": order}), threads=2)
     ours.build(gaussians)
     gradient = np.random.default_rng(1).normal(size=(len(origins), 3)).astype(np.float32)
 
@@ -182,11 +183,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("scenes", nargs="*", type=Path)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--order", choices=["ray", "packet"], default="ray", help="packet: as trainings do")
     options = parser.parse_args()
     for name, gaussians in [(path.stem, read_scene(path)[0]) for path in options.scenes] or [
         ("generated cloud", cloud(100_000))
     ]:
-        compare(name, gaussians, options.repeats)
+        compare(name, gaussians, options.repeats, options.order)
 
 
 if __name__ == "__main__":

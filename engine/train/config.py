@@ -16,7 +16,7 @@ from engine.shading.material_settings import MaterialSettings
 from engine.trace.protocol import TraceSettings
 from engine.train.preset_names import PRESETS
 
-MOST_PLANNED_ITERATIONS = 30_000
+MOST_PLANNED_ITERATIONS = 70_000
 """Where a time decides their number, see :mod:`engine.train.within`."""
 
 OWN_ORDER = 3 / 7

@@ -14,16 +14,16 @@ from engine.train.within import Plan, choose_plan
 
 
 def test_more_time_buys_gaussians_and_iterations_and_is_used_up() -> None:
-    plans = [choose_plan(seconds, 0.05, 40_000, 200_000) for seconds in (200 / 3, 300, 3000, 30_000)]
+    plans = [choose_plan(seconds, 0.05, 40_000, 200_000) for seconds in (100, 300, 3000, 30_000)]
     for plan in plans:
         assert plan.seconds_an_iteration == 0.05 and plan.gaussians == 40_000
     for plan in plans[:3]:
         used = plan.iterations * 0.05 * (plan.max_gaussians / 40_000) ** 0.8
         assert used == pytest.approx(plan.seconds, rel=0.01)
-    assert plans[0].iterations == pytest.approx(1333, abs=2)
+    assert plans[0].iterations == pytest.approx(2000, abs=2)
     assert plans[0].max_gaussians == pytest.approx(40_000, abs=5)
     assert [plan.max_gaussians for plan in plans] == sorted(plan.max_gaussians for plan in plans)
-    assert plans[3].max_gaussians == 200_000 and plans[3].iterations == 30_000  # nothing more to be had
+    assert plans[3].max_gaussians == 200_000 and plans[3].iterations == 70_000  # nothing more to be had
 
 
 def test_no_time_at_all_still_makes_a_training() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, computed_field
 
-from engine.train.config import TrainConfig, iteration_count, most_gaussians
+from engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
 from workers.records.sizes import Sizes
 from workers.telling.wording import duration
 from workers.work.kinds.options import (
@@ -41,6 +41,9 @@ _MATERIAL_RAY_CPU_SECONDS = 2.1e-5
 _MATERIAL_GAUSSIANS = 80_000
 _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 5.5e-5
 """With four to sixteen rays a pixel and what they reflect: 8 to 10 s for each picture of 400 x 400 pixels."""
+_SAVED_IN_ONE_ORDER = 0.6
+"""Share of a ray's time that is saved where the rays of a window composite in one order: the ratio of bonsai's
+two ways (``docs/experiments.md``, "One order")."""
 _SINGLE_RAY_CPU_SECONDS = 10.8e-6
 """For a ray that comes alone, as the preset paper has them."""
 _PAPER_GAUSSIANS = 60_000
@@ -214,8 +217,9 @@ def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
     if train.materials.learn:
         return float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
     near, far = min(gaussians, _FITTED_GAUSSIANS) / 1e5, max(gaussians / _FITTED_GAUSSIANS, 1.0)
-    seconds = _RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER
-    return float(max(seconds, _LEAST_RAY_CPU_SECONDS))
+    seconds = max(_RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER, _LEAST_RAY_CPU_SECONDS)
+    saved = _SAVED_IN_ONE_ORDER * train.one_order if in_one_order(train) else 0.0
+    return float(seconds * (1 - saved))
 
 
 def _gaussian_bytes(sh_degree: int) -> int:
