@@ -42,8 +42,8 @@ _MATERIAL_GAUSSIANS = 80_000
 _MATERIAL_EVALUATE_CPU_SECONDS_PER_PIXEL = 5.5e-5
 """With four to sixteen rays a pixel and what they reflect: 8 to 10 s for each picture of 400 x 400 pixels."""
 _SAVED_IN_ONE_ORDER = 0.6
-"""Share of a ray's time that is saved where the rays of a window composite in one order: the ratio of bonsai's
-two ways (``docs/experiments.md``, "One order")."""
+"""Share of a ray's time that is saved where the rays of a window composite in one order
+(``docs/experiments.md``, "One order")."""
 _SINGLE_RAY_CPU_SECONDS = 10.8e-6
 """For a ray that comes alone, as the preset paper has them."""
 _PAPER_GAUSSIANS = 60_000
