@@ -26,7 +26,7 @@ def start() -> FlatGaussians:
 def train(folder: Path, tracer: str, iterations: int) -> tuple[TrainState, list[Event]]:
     world, events = FlatWorld(), list[Event]()
     config = small_config(
-        iterations=iterations, rays=64, probe_rays=256, trace={"tracer": tracer}, sh_every=20,
+        iterations=iterations, rays=64, probe_rays=256, trace={"tracer": tracer}, one_order=0, sh_every=20,
         densify={"kind": "mcmc", "start": 20, "interval": 20, "growth": 0.1},
     )  # fmt: skip
     trainer = Trainer(
