@@ -19,6 +19,8 @@ from engine.train.preset_names import PRESETS
 MOST_PLANNED_ITERATIONS = 70_000
 """Where a time decides their number, see :mod:`engine.train.within`."""
 
+LEAST_THOUSANDS = 5
+"""Of iterations, where the photographs decide their number."""
 OWN_ORDER = 3 / 7
 """Share of the rays that a training has time for where each ray has an order of its own."""
 TURNED_BEYOND = 0.5
@@ -135,7 +137,7 @@ class TrainConfig(_Frozen):
         description="end sooner where the training rays gain less than so many dB in a fifth of the "
         "iterations; 0 never does",
     )
-    rays_a_pixel: int = Field(7, ge=1, description="where iterations is 0; 10,000 to 23,000 iterations for 7")
+    rays_a_pixel: int = Field(7, ge=1, description="where iterations is 0; 7,000 to 23,000 iterations for 7")
     rays: int = Field(16_384, ge=64, description="rays of one iteration")
     window_rays: int = Field(64, ge=1, description="rays of one window, a square number; 1 scatters them")
     window_side: int = Field(
@@ -286,7 +288,7 @@ class TrainConfig(_Frozen):
 def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
     """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
 
-    Large scenes learn as long as there is something to see; small ones are done after 10,000 with 7 rays a
+    Large scenes learn as long as there is something to see; small ones are done after 7,000 with 7 rays a
     pixel. Rays that have an order of their own take longer, so that there are fewer of them. Where only a
     share of the pixels shows anything (see :mod:`engine.train.shown`), the rays of the others teach little
     and cost little, and it takes as many more; not with materials.
@@ -294,7 +296,7 @@ def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.
     each = config.rays_a_pixel
     if not (in_one_order(config) or config.materials.learn):  # materials have a number of their own
         each = max(1, round(OWN_ORDER * each))
-    wanted = max(round(each * training_pixels / config.rays / 1000), 5 * max(1, each // 3))
+    wanted = max(round(each * training_pixels / config.rays / 1000), LEAST_THOUSANDS, each)
     if not config.materials.learn:
         wanted = round(wanted / shown)
     return config.iterations or min(wanted, 10 * each // 3) * 1000
