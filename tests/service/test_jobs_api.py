@@ -56,7 +56,7 @@ def test_job_is_accepted_with_every_setting(talk: Callable[..., None]) -> None:
         assert (job["state"], job["attempt"], job["queue_position"]) == ("queued", 0, 0)
         assert job["stages"] == ["load", "train", "evaluate", "export"]
         train = job["options"]["train"]
-        assert (train["iterations"], train["max_gaussians_auto"]) == (70, 40_000)
+        assert (train["iterations"], train["max_gaussians_auto"]) == (70, 50_000)
         assert job["options"]["test_every"] == 8
         assert uuid.UUID(job["id"]).version == 7
         found = await http.get(answer.headers["Location"])

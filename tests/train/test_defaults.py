@@ -30,8 +30,8 @@ from engine.train.trainer import Trainer
         (38_000, (3_800,) * 4),
         (500_000, (16_666, 16_666, 16_666, 10_000)),
         (1_000_000, (33_333, 33_333, 33_333, 20_000)),
-        (5_552_160, (40_000, 185_072, 185_072, 111_043)),  # fox, 480 px
-        (46_000_000, (40_000, 400_000, 600_000, 350_000)),
+        (5_552_160, (50_000, 185_072, 185_072, 111_043)),  # fox, 480 px
+        (46_000_000, (50_000, 400_000, 600_000, 350_000)),
     ],
 )
 def test_most_gaussians_follow_the_pixels(pixels: int, counts: tuple[int, ...]) -> None:
@@ -75,7 +75,7 @@ def test_large_scenes_train_longer(pixels: int, count: int) -> None:
     count *= 1000
     assert iteration_count(TrainConfig(), pixels) == count
     assert iteration_count(TrainConfig(iterations=7), pixels) == 7
-    assert iteration_count(preset("fast"), pixels) == 1400
+    assert iteration_count(preset("fast"), pixels) == 2500
     assert iteration_count(preset("paper"), pixels) == 10_000
     assert 2.5 * count < iteration_count(preset("high"), pixels) <= 3.5 * count
     assert iteration_count(TrainConfig(one_order=0), pixels) == max(5000, round(3 / 7 * count, -3))
@@ -87,7 +87,8 @@ def test_large_scenes_train_longer(pixels: int, count: int) -> None:
 def test_pixels_that_show_nothing_hold_nothing_down(shown: float, gaussians: int, count: int) -> None:
     assert most_gaussians(TrainConfig(), 19_600_000, shown) == gaussians
     assert iteration_count(TrainConfig(), 19_600_000, shown) == count
-    assert iteration_count(preset("fast"), 19_600_000, shown) == 1400
+    assert iteration_count(preset("fast"), 19_600_000, shown) == 2500
+    assert iteration_count(with_materials(preset("fast")), 19_600_000) == 1400
     materials = with_materials(TrainConfig())
     assert iteration_count(materials, 19_600_000) == 19_000
     assert iteration_count(materials, 19_600_000, shown) == iteration_count(materials, 19_600_000)
