@@ -137,7 +137,7 @@ def test_what_a_job_takes_is_estimated_before_and_when_it_is_made(talk: Callable
         assert fast["cpu_seconds"] / 2 < fast["seconds"] < fast["cpu_seconds"]
         assert "on 2 cores and" in fast["text"] and not fast["finds_poses"]
         for changes, more in (
-            ({"train": {"iterations": 2000}}, "cpu_seconds"),
+            ({"train": {"iterations": 4000}}, "cpu_seconds"),
             ({"train": {"rays": 32_768}}, "cpu_seconds"),
             ({"train": {"max_gaussians": 80_000}}, "cpu_seconds"),
             ({"train": {"max_gaussians": 1_000_000}}, "memory_bytes"),
