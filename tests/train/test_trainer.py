@@ -123,6 +123,17 @@ def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, strategy: McmcC
     assert content(found) == content(expected)
 
 
+def test_windows_have_one_order_for_the_first_part_alone(tmp_path: Path) -> None:
+    world, config, orders = FlatWorld(), small_config(one_order=0.5), dict[int, str]()
+    Trainer(
+        world, config, fresh_state(world.start(), config.seed), folder=tmp_path, fingerprint="test",
+        listener=lambda _event: None, threads=1,
+        onlooker=lambda iteration, tracer: orders.update({iteration: tracer.settings.order}),
+    ).run()  # fmt: skip
+    assert {order for iteration, order in orders.items() if iteration <= 60} == {"packet"}
+    assert {order for iteration, order in orders.items() if iteration > 60} == {"ray"}
+
+
 def test_resuming_a_finished_run_gives_its_result(tmp_path: Path) -> None:
     config = small_config(iterations=40)
     expected, _ = train(tmp_path, config)
