@@ -15,5 +15,6 @@ test_demo.py test_surface.py test_exposure.py test_presets.py test_isolation.py 
 test_lights.py test_viewer.py test_threads.py test_front_end_is_light.py test_against_mitsuba.py test_seam.py
 test_brute_force.py test_dense_points.py test_embedded_postgres.py test_marching.py test_conformance.py
 test_twin.py test_uploads.py test_reconstruct.py test_contract.py test_preview.py test_misfits.py
+test_one_order.py
 """
 LONGEST_FIRST = {name: rank for rank, name in enumerate(_NAMES.split())}
