@@ -333,7 +333,9 @@ def window_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian:
     if config.window_side:
         return config.window_side
     widest = max(1, round(longest_side_px / 15))
-    return min(widest, round(math.sqrt(6 * pixels_a_gaussian))) if in_one_order(config) else widest
+    if not in_one_order(config):
+        return widest
+    return min(widest, max(1, round(math.sqrt(6 * pixels_a_gaussian))))
 
 
 def rebuild_interval(config: TrainConfig, gaussians: int) -> int:

@@ -42,7 +42,14 @@ def test_most_gaussians_follow_the_pixels(pixels: int, counts: tuple[int, ...]) 
 
 @pytest.mark.parametrize(
     ("longest_px", "each_px", "side_px", "own_order_px"),
-    [(4, 50, 1, 1), (480, 50, 17, 32), (800, 117, 26, 53), (960, 1000, 64, 64), (4000, 160, 31, 267)],
+    [
+        (4, 50, 1, 1),
+        (480, 0.01, 1, 32),
+        (480, 50, 17, 32),
+        (800, 117, 26, 53),
+        (960, 1000, 64, 64),
+        (4000, 160, 31, 267),
+    ],
 )
 def test_windows_follow_the_gaussians_or_the_views(
     longest_px: int, each_px: float, side_px: int, own_order_px: int
