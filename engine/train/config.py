@@ -294,9 +294,13 @@ def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.
     and cost little, and it takes as many more; not with materials.
     """
     each = config.rays_a_pixel
-    if not (in_one_order(config) or config.materials.learn):  # materials have a number of their own
-        each = max(1, round(OWN_ORDER * each))
-    wanted = max(round(each * training_pixels / config.rays / 1000), LEAST_THOUSANDS, each)
+    if in_one_order(config):
+        least = max(LEAST_THOUSANDS, each)
+    else:
+        if not config.materials.learn:  # which have a number of their own
+            each = max(1, round(OWN_ORDER * each))
+        least = LEAST_THOUSANDS * max(1, each // 3)
+    wanted = max(round(each * training_pixels / config.rays / 1000), least)
     if not config.materials.learn:
         wanted = round(wanted / shown)
     return config.iterations or min(wanted, 10 * each // 3) * 1000

@@ -98,6 +98,7 @@ def test_pixels_that_show_nothing_hold_nothing_down(shown: float, gaussians: int
     assert iteration_count(with_materials(preset("fast")), 19_600_000) == 1400
     materials = with_materials(TrainConfig())
     assert iteration_count(materials, 19_600_000) == 19_000
+    assert iteration_count(materials, 1_000_000) == 10_000
     assert iteration_count(materials, 19_600_000, shown) == iteration_count(materials, 19_600_000)
 
 
