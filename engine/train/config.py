@@ -36,7 +36,8 @@ class _Frozen(BaseModel):
 class LearningRates(_Frozen):
     """Sizes of the Adam steps, falling exponentially over the run.
 
-    The mean's falls to ``mean_final``; all others fall to the fraction ``decay``.
+    The mean's falls to ``mean_final``; all others fall to the fraction ``decay``. In long trainings means and
+    turns begin with smaller steps.
     """
 
     mean: float = Field(0.14, gt=0)
@@ -58,6 +59,20 @@ class LearningRates(_Frozen):
     metallic: float = Field(0.03, ge=0)
     roughness: float = Field(0.03, ge=0)
     decay: float = Field(0.3, gt=0, le=1)
+    calm_after: int = Field(
+        7000,
+        ge=0,
+        description="in trainings of more iterations mean and quat are smaller, by the root of how many times "
+        "as many there are; 0: never",
+    )
+
+    def calmed(self, iterations: int) -> "LearningRates":
+        """The rates for a training of so many iterations: where there is time, small steps go farther."""
+        if self.calm_after == 0 or iterations <= self.calm_after:
+            return self
+        share = math.sqrt(self.calm_after / iterations)
+        mean = min(self.mean, max(share * self.mean, self.mean_final))
+        return self.model_copy(update={"mean": mean, "quat": share * self.quat})
 
     def of_channel(self, name: str) -> float:
         """The rate of a named channel; 0 where it is not trained."""
@@ -98,6 +113,14 @@ class McmcConfig(_Frozen):
     error_power: float = Field(
         0.0, ge=0, description="0 samples by opacity alone, 1 by the error seen through it"
     )
+    idle_weight: float = Field(
+        0.05,
+        ge=0,
+        description="where there are as many as there may be, those whose weight on the rays is below this "
+        "share of the mean are moved, too, all of them to where the error is seen; 0 moves the dead alone",
+    )
+    idle_share: float = Field(0.05, ge=0, le=1, description="most of all that are moved for that at a time")
+    idle_rounds: int = Field(16, ge=1, description="about how often in a training, in whole intervals")
 
 
 class PaperConfig(_Frozen):
@@ -363,6 +386,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
         "log_scale": 0.02,
         "opacity": 0.1,
         "sh_rest_ratio": 0.05,
+        "calm_after": 0,
     }
     return config.model_copy(
         update={
@@ -387,7 +411,7 @@ def with_materials(config: TrainConfig) -> TrainConfig:
             "near_share": 0.0,
             "one_order": 0.0,
             "stop_early": 0.0,
-            "densify": McmcConfig(copies="area", stop_fraction=0.4),
+            "densify": McmcConfig(copies="area", stop_fraction=0.4, idle_weight=0.0),
             "initial_opacity": 0.8,
             "trace": config.trace.model_copy(update={"turned_beyond": TURNED_BEYOND}),
             "max_gaussians_auto": min(config.max_gaussians_auto * 4 // 5, 80_000),
@@ -433,6 +457,7 @@ def preset(name: str) -> TrainConfig:
                 opacity=0.05,
                 colour=1.4e-3,
                 decay=0.1,
+                calm_after=0,
             ),
             loss=LossWeights(l1=0.0, l2=0.8, ssim=0.1),
             trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),

@@ -114,6 +114,8 @@ class Trainer:
         self._batches = BatchSource(dataset, config)
         pixels, shown = self._batches.sampler.pixel_count, shown_share(dataset)
         self.schedule = Schedule.of(config, pixels, shown)
+        rates = config.rates.calmed(self.schedule.iterations)
+        self._config = config = config.model_copy(update={"rates": rates})
         densifier = make_densifier(
             config.densify,
             iterations=self.schedule.iterations,

@@ -47,80 +47,111 @@ class Mcmc:
     """Moves dead Gaussians to, and adds new ones at, places chosen by opacity and by the error seen there.
 
     A chosen Gaussian and its copies share its opacity and shrink, or keep its opacity and share its area;
-    copies are scattered inside it. The count
-    grows by a fixed fraction each time and never passes the cap.
+    copies are scattered inside it. The count grows by a fixed fraction each time and never passes the cap.
+    Once it is there, those that hardly weigh on any ray are moved with the dead (``idle_weight``), in rounds,
+    to where the error is seen, and share the area there: smaller ones are what is missing.
 
     Not done: the paper's noise on the means; the copies are scattered instead.
     """
 
     def __init__(self, config: McmcConfig, *, iterations: int, max_gaussians: int) -> None:
         self._config = config
-        self.wants_errors = config.error_power > 0
+        self.wants_errors = config.error_power > 0 or config.idle_weight > 0
         self._stop = int(config.stop_fraction * iterations)
         self._cap = max_gaussians
-        self._errors: Float32[np.ndarray, " n"] = np.zeros(0, np.float32)
+        self._round = config.interval * max(1, round(iterations / config.idle_rounds / config.interval))
+        self._errors: Float32[np.ndarray, " n"]
+        self._weights: Float32[np.ndarray, " n"]
+        self._begin(0)
 
     def observe(
         self, count: int, gradients: GaussianGradients, mean_steps_world: Float32[np.ndarray, "u 3"]
     ) -> None:
-        """Add up the error that is seen through each Gaussian, where it matters."""
+        """Add up the error that is seen through each Gaussian and its weight, where that matters."""
         if not self.wants_errors:
             return
         if len(self._errors) != count:
-            self._errors = np.zeros(count, np.float32)
+            self._begin(count)
         self._errors[gradients.ids] += gradients.error_sums
+        self._weights[gradients.ids] += gradients.weight_sums
 
     def due(self, iteration: int) -> bool:
-        """Every ``interval`` iterations between the start and the stop."""
-        return self._config.start <= iteration <= self._stop and iteration % self._config.interval == 0
+        """Every ``interval`` iterations between the start and the stop; in rounds once the cap is reached."""
+        every = self._round if self._moves_idle(len(self._errors)) else self._config.interval
+        return self._config.start <= iteration <= self._stop and iteration % every == 0
 
     def apply(
         self, gaussians: FlatGaussians, adam: Adam, rng: np.random.Generator, *, extent: float
     ) -> tuple[FlatGaussians, Adam]:
-        """Relocate the dead, then grow."""
-        config = self._config
-        count = len(gaussians)
+        """Relocate the dead, then grow; or, where nothing may grow, relocate the dead and the idle."""
+        config, count = self._config, len(gaussians)
         opacities = gaussians.opacities.astype(np.float64)
         alive = opacities > config.dead_opacity
-        errors, self._errors = self._errors, np.zeros(0, np.float32)
+        errors, weights = self._errors, self._weights
+        self._begin(count)
         if not alive.any():
             return gaussians, adam
+        power, area = config.error_power, config.copies == "area"
+        if self._moves_idle(count) and len(weights) == count:
+            alive[self._idle(weights)] = False
+            power, area = 1.0, True
         score = np.where(alive, opacities, 0.0)
-        if config.error_power > 0 and len(errors) == count and errors.max(initial=0.0) > 0:
-            score = np.where(alive, errors.astype(np.float64) ** config.error_power, 0.0)
+        if power > 0 and len(errors) == count and errors.max(initial=0.0) > 0:
+            score = np.where(alive, errors.astype(np.float64) ** power, 0.0)
         dead = np.flatnonzero(~alive)
         born = max(0, min(self._cap - count, round(config.growth * count)))
         wanted = len(dead) + born
         if wanted == 0 or score.sum() <= 0:
             return gaussians, adam
         chosen = rng.choice(count, size=wanted, p=score / score.sum())
-        copies = np.minimum(np.bincount(chosen, minlength=count) + 1, MAX_COPIES)
-        sources = np.flatnonzero(copies > 1)
-        if config.copies == "area":
-            shrunk = -0.5 * np.log(copies)
-        else:
-            shrunk = np.zeros(count)
-            a = np.clip(opacities[sources], 1e-4, 1 - 1e-4)
-            new_a = np.maximum(shared_opacity(a, copies[sources]), config.dead_opacity * 1.5)
-            gaussians.opacity_logits[sources] = np.log(new_a / (1 - new_a))
-            shrunk[sources] = np.log(shared_scale(a, copies[sources]))
-        before = gaussians.scales[chosen] if config.copies == "area" else None
-        gaussians.log_scales[sources] += shrunk[sources, None].astype(np.float32)
+        sources, made = self._copies(gaussians, chosen, area, rng)
         adam.reset(sources)
-        made = gaussians.select(chosen)
-        spread = rng.standard_normal((wanted, 2)) * (made.scales if before is None else before)
-        made.means_world += np.einsum("nij,nj->ni", made.rotations[:, :, 1:], spread).astype(np.float32)
         gaussians.put(dead, made.view(slice(len(dead))))
         adam.reset(dead)
         if born == 0:
             return gaussians, adam
         new = made.select(np.arange(len(dead), wanted))
+        self._begin(count + born)
         return concatenate([gaussians, new]), adam.append(Adam.fresh(new))
 
+    def _copies(
+        self, gaussians: FlatGaussians, chosen: Int64[np.ndarray, " w"], area: bool, rng: np.random.Generator
+    ) -> tuple[Int64[np.ndarray, " s"], FlatGaussians]:
+        """A scattered copy for each ``chosen``, and which these are; they share their area, or their opacity."""
+        copies = np.minimum(np.bincount(chosen, minlength=len(gaussians)) + 1, MAX_COPIES)
+        sources = np.flatnonzero(copies > 1)
+        scales = gaussians.scales[chosen]
+        if area:
+            shrunk = -0.5 * np.log(copies[sources])
+        else:
+            a = np.clip(gaussians.opacities[sources].astype(np.float64), 1e-4, 1 - 1e-4)
+            new_a = np.maximum(shared_opacity(a, copies[sources]), self._config.dead_opacity * 1.5)
+            gaussians.opacity_logits[sources] = np.log(new_a / (1 - new_a))
+            shrunk = np.log(shared_scale(a, copies[sources]))
+        gaussians.log_scales[sources] += shrunk[:, None].astype(np.float32)
+        made = gaussians.select(chosen)
+        spread = rng.standard_normal((len(chosen), 2)) * (scales if area else made.scales)
+        made.means_world += np.einsum("nij,nj->ni", made.rotations[:, :, 1:], spread).astype(np.float32)
+        return sources, made
+
     def state(self) -> dict[str, np.ndarray]:
-        """The error sums."""
-        return {"errors": self._errors}
+        """The sums of errors and weights."""
+        return {"errors": self._errors, "weights": self._weights}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Take the error sums back."""
-        self._errors = state["errors"]
+        """Take the sums back."""
+        self._errors, self._weights = state["errors"], state["weights"]
+
+    def _begin(self, count: int) -> None:
+        """Sums of nothing yet."""
+        self._errors, self._weights = np.zeros(count, np.float32), np.zeros(count, np.float32)
+
+    def _moves_idle(self, count: int) -> bool:
+        """Whether that many are all that there may be, and the idle are moved then."""
+        return self._config.idle_weight > 0 and count >= self._cap
+
+    def _idle(self, weights: Float32[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
+        """Those of least weight."""
+        most = int(self._config.idle_share * len(weights))
+        least = np.argsort(weights, kind="stable")[:most]
+        return least[weights[least] < self._config.idle_weight * weights.mean()]
