@@ -62,8 +62,8 @@ class LearningRates(_Frozen):
     calm_after: int = Field(
         7000,
         ge=0,
-        description="in trainings of more iterations mean and quat are smaller, by the root of how many times "
-        "as many there are; 0: never",
+        description="in trainings of more iterations mean and quat are smaller, by the root of how many "
+        "times as many there are; 0: never",
     )
 
     def calmed(self, iterations: int) -> "LearningRates":

@@ -1,5 +1,7 @@
 """Densification: counts, opacities and places after one application, and what a checkpoint keeps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -129,6 +131,63 @@ def test_moments_of_the_untouched_stay() -> None:
     assert len(after) == 13
     assert adam.steps.tolist() == [5, 5, 0, 5, 5, 5, 5, 5, 5, 5, 0, 0, 0]
     assert (adam.first[[0, 1, 3]] == 1).all() and not adam.first[10:].any()
+
+
+def weighing(weights: np.ndarray, errors: np.ndarray) -> tuple[GaussianGradients, np.ndarray]:
+    gradients, steps = seen(len(weights), errors)
+    return replace(gradients, weight_sums=weights.astype(np.float32)), steps
+
+
+def test_those_that_hardly_weigh_go_where_the_error_is() -> None:
+    """Of forty that may be forty: two of no weight, one of little; all errors are seen through number 7."""
+    before = make([0.5] * 40)
+    weights, errors = np.full(40, 10.0), np.zeros(40)
+    weights[[3, 20]], weights[11], errors[7] = 0.0, 0.4, 3.0
+    densifier = mcmc(40, idle_weight=0.05, idle_share=1.0)
+    densifier.observe(40, *weighing(weights, errors))
+    after, adam = apply(densifier, before.copy())
+    assert len(after) == 40
+    moved = [3, 7, 11, 20]
+    np.testing.assert_array_equal(after.sh[moved], np.repeat(before.sh[[7]], 4, axis=0))
+    np.testing.assert_allclose(after.opacities, 0.5, rtol=1e-6)  # the area is shared
+    np.testing.assert_allclose(after.scales[moved], np.repeat(before.scales[[7]], 4, axis=0) / 2, rtol=1e-6)
+    np.testing.assert_array_equal(after.means_world[7], before.means_world[7])
+    others = np.setdiff1d(np.arange(40), moved)
+    np.testing.assert_array_equal(after.means_world[others], before.means_world[others])
+    assert not densifier.state()["weights"].any() and not adam.steps.any()
+
+
+@pytest.mark.parametrize(("share", "moved"), [(0.0, []), (0.026, [20]), (0.051, [3, 20])])
+def test_only_a_share_of_them_goes_at_a_time(share: float, moved: list[int]) -> None:
+    before = make([0.5] * 40)
+    weights, errors = np.full(40, 10.0), np.zeros(40)
+    weights[3], weights[11], errors[7] = 0.1, 0.2, 3.0
+    weights[20] = 0.0
+    densifier = mcmc(40, idle_weight=0.05, idle_share=share)
+    densifier.observe(40, *weighing(weights, errors))
+    after, _ = apply(densifier, before.copy())
+    changed = np.flatnonzero((after.means_world != before.means_world).any(axis=1))
+    assert changed.tolist() == moved
+
+
+def test_nobody_is_idle_while_there_may_be_more() -> None:
+    before = make([0.5] * 40)
+    weights = np.full(40, 10.0)
+    weights[3] = 0.0
+    densifier = mcmc(100, idle_weight=0.05, idle_share=1.0, growth=0.1)
+    densifier.observe(40, *weighing(weights, np.ones(40)))
+    after, _ = apply(densifier, before.copy())
+    assert len(after) == 44
+    np.testing.assert_array_equal(after.means_world[:40], before.means_world)
+
+
+def test_rounds_begin_where_there_may_be_no_more() -> None:
+    config = McmcConfig(start=20, interval=10, stop_fraction=0.85, idle_rounds=4)
+    densifier = make_densifier(config, iterations=200, max_gaussians=50)
+    densifier.observe(40, *seen(40, 0.0))
+    assert [k for k in range(1, 201) if densifier.due(k)] == list(range(20, 171, 10))
+    densifier.observe(50, *seen(50, 0.0))
+    assert [k for k in range(1, 201) if densifier.due(k)] == [50, 100, 150]
 
 
 def test_nothing_to_do() -> None:

@@ -261,3 +261,13 @@ def test_channels_are_stepped_by_their_logits_as_torch_does() -> None:
     np.testing.assert_allclose(scene.channels["albedo"], torch.sigmoid(leaf).detach(), rtol=1e-4)
     assert (scene.channels["ambient"] == 1).all() and (scene.channels["label"] == 7).all()
     assert (adam.append(Adam.fresh(scene)).channel_first[6:] == 0).all()
+
+
+def test_long_trainings_take_smaller_steps_of_means_and_turns() -> None:
+    rates = LearningRates(mean=0.1, mean_final=0.03, quat=0.02, calm_after=1000)
+    assert rates.calmed(1000) == rates
+    four_times = rates.calmed(4000)
+    assert (four_times.mean, four_times.quat) == pytest.approx((0.05, 0.01))
+    assert four_times.model_copy(update={"mean": 0.1, "quat": 0.02}) == rates
+    assert rates.calmed(100_000).mean == 0.03  # which they fall to in any case
+    assert rates.model_copy(update={"calm_after": 0}).calmed(100_000).quat == 0.02

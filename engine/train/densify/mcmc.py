@@ -117,7 +117,7 @@ class Mcmc:
     def _copies(
         self, gaussians: FlatGaussians, chosen: Int64[np.ndarray, " w"], area: bool, rng: np.random.Generator
     ) -> tuple[Int64[np.ndarray, " s"], FlatGaussians]:
-        """A scattered copy for each ``chosen``, and which these are; they share their area, or their opacity."""
+        """Which are chosen, and a scattered copy each time; they share their area or their opacity."""
         copies = np.minimum(np.bincount(chosen, minlength=len(gaussians)) + 1, MAX_COPIES)
         sources = np.flatnonzero(copies > 1)
         scales = gaussians.scales[chosen]
