@@ -139,29 +139,47 @@ def weighing(weights: np.ndarray, errors: np.ndarray) -> tuple[GaussianGradients
 
 
 def test_those_that_hardly_weigh_go_where_the_error_is() -> None:
-    """Of forty that may be forty: two of no weight, one of little; all errors are seen through number 7."""
+    """Of forty that may be forty two have no weight, one has little; errors are seen through three others."""
     before = make([0.5] * 40)
     weights, errors = np.full(40, 10.0), np.zeros(40)
-    weights[[3, 20]], weights[11], errors[7] = 0.0, 0.4, 3.0
+    weights[[3, 20]], weights[11], errors[[7, 15, 30]] = 0.0, 0.4, (1000.0, 3.0, 0.5)
     densifier = mcmc(40, idle_weight=0.05, idle_share=1.0)
     densifier.observe(40, *weighing(weights, errors))
     after, adam = apply(densifier, before.copy())
     assert len(after) == 40
-    moved = [3, 7, 11, 20]
-    np.testing.assert_array_equal(after.sh[moved], np.repeat(before.sh[[7]], 4, axis=0))
+    moved, sources = [3, 11, 20], [7, 15, 30]  # one beside each, however much error there is
+    np.testing.assert_array_equal(after.sh[moved], before.sh[sources])
     np.testing.assert_allclose(after.opacities, 0.5, rtol=1e-6)  # the area is shared
-    np.testing.assert_allclose(after.scales[moved], np.repeat(before.scales[[7]], 4, axis=0) / 2, rtol=1e-6)
-    np.testing.assert_array_equal(after.means_world[7], before.means_world[7])
+    halves = before.scales[sources] / np.sqrt(2)
+    np.testing.assert_allclose(after.scales[moved], halves, rtol=1e-6)
+    np.testing.assert_allclose(after.scales[sources], halves, rtol=1e-6)
+    assert (after.means_world[moved] != before.means_world[sources]).any(axis=1).all()
     others = np.setdiff1d(np.arange(40), moved)
     np.testing.assert_array_equal(after.means_world[others], before.means_world[others])
     assert not densifier.state()["weights"].any() and not adam.steps.any()
+
+
+def test_more_error_draws_more_of_them() -> None:
+    drawn = np.zeros(40)
+    for seed in range(200):
+        weights, errors = np.full(40, 10.0), np.ones(40)
+        weights[3], errors[7], errors[15] = 0.0, 30.0, 15.0
+        densifier = mcmc(40, idle_weight=0.05, idle_share=1.0)
+        densifier.observe(40, *weighing(weights, errors))
+        before = make([0.5] * 40)
+        after, _ = apply(densifier, before.copy(), seed)
+        drawn += (after.scales != before.scales).any(axis=1) & (np.arange(40) != 3)
+    assert drawn.sum() == 200
+    assert drawn[7] == pytest.approx(200 * 30 / 82, abs=20) and drawn[15] == pytest.approx(
+        200 * 15 / 82, abs=17
+    )
 
 
 @pytest.mark.parametrize(("share", "moved"), [(0.0, []), (0.026, [20]), (0.051, [3, 20])])
 def test_only_a_share_of_them_goes_at_a_time(share: float, moved: list[int]) -> None:
     before = make([0.5] * 40)
     weights, errors = np.full(40, 10.0), np.zeros(40)
-    weights[3], weights[11], errors[7] = 0.1, 0.2, 3.0
+    weights[3], weights[11], errors[[7, 8]] = 0.1, 0.2, 3.0
     weights[20] = 0.0
     densifier = mcmc(40, idle_weight=0.05, idle_share=share)
     densifier.observe(40, *weighing(weights, errors))

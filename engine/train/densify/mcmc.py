@@ -6,7 +6,7 @@ After "3D Gaussian Splatting as Markov Chain Monte Carlo" (https://arxiv.org/abs
 from math import comb
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from engine.gaussians.model import FlatGaussians, concatenate
 from engine.trace.protocol import GaussianGradients
@@ -91,20 +91,18 @@ class Mcmc:
         self._begin(count)
         if not alive.any():
             return gaussians, adam
-        power, area = config.error_power, config.copies == "area"
-        if self._moves_idle(count) and len(weights) == count:
-            alive[self._idle(weights)] = False
-            power, area = 1.0, True
+        if self._moves_idle(count) and len(weights) == count and errors.any():
+            return self._move(gaussians, adam, alive, errors, weights, rng)
         score = np.where(alive, opacities, 0.0)
-        if power > 0 and len(errors) == count and errors.max(initial=0.0) > 0:
-            score = np.where(alive, errors.astype(np.float64) ** power, 0.0)
+        if config.error_power > 0 and len(errors) == count and errors.any():
+            score = np.where(alive, errors.astype(np.float64) ** config.error_power, 0.0)
         dead = np.flatnonzero(~alive)
         born = max(0, min(self._cap - count, round(config.growth * count)))
         wanted = len(dead) + born
         if wanted == 0 or score.sum() <= 0:
             return gaussians, adam
         chosen = rng.choice(count, size=wanted, p=score / score.sum())
-        sources, made = self._copies(gaussians, chosen, area, rng)
+        sources, made = self._copies(gaussians, chosen, config.copies == "area", rng)
         adam.reset(sources)
         gaussians.put(dead, made.view(slice(len(dead))))
         adam.reset(dead)
@@ -113,6 +111,26 @@ class Mcmc:
         new = made.select(np.arange(len(dead), wanted))
         self._begin(count + born)
         return concatenate([gaussians, new]), adam.append(Adam.fresh(new))
+
+    def _move(
+        self, gaussians: FlatGaussians, adam: Adam, alive: Bool[np.ndarray, " n"],
+        errors: Float32[np.ndarray, " n"], weights: Float32[np.ndarray, " n"], rng: np.random.Generator,
+    ) -> tuple[FlatGaussians, Adam]:  # fmt: skip
+        """Put the dead and the idle each beside another one, chosen by the error seen through it.
+
+        Drawn without putting back: through a veil before half of the pictures most of the error may be seen,
+        and a hundred copies of it would be a wall.
+        """
+        alive[self._idle(weights)] = False
+        seen = np.flatnonzero(alive & (errors > 0))
+        free = np.flatnonzero(~alive)[: len(seen)]
+        late = rng.exponential(size=len(seen)) / errors[seen]  # the first to come of so many, at such rates
+        chosen = seen[np.sort(np.argpartition(late, len(free) - 1)[: len(free)])] if len(free) else seen[:0]
+        sources, made = self._copies(gaussians, chosen, True, rng)
+        adam.reset(sources)
+        gaussians.put(free, made)
+        adam.reset(free)
+        return gaussians, adam
 
     def _copies(
         self, gaussians: FlatGaussians, chosen: Int64[np.ndarray, " w"], area: bool, rng: np.random.Generator
