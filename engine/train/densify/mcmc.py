@@ -124,8 +124,10 @@ class Mcmc:
         alive[self._idle(weights)] = False
         seen = np.flatnonzero(alive & (errors > 0))
         free = np.flatnonzero(~alive)[: len(seen)]
+        if len(free) == 0:
+            return gaussians, adam
         late = rng.exponential(size=len(seen)) / errors[seen]  # the first to come of so many, at such rates
-        chosen = seen[np.sort(np.argpartition(late, len(free) - 1)[: len(free)])] if len(free) else seen[:0]
+        chosen = seen[np.sort(np.argpartition(late, len(free) - 1)[: len(free)])]
         sources, made = self._copies(gaussians, chosen, True, rng)
         adam.reset(sources)
         gaussians.put(free, made)
