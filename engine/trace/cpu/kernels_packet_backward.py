@@ -220,11 +220,11 @@ def sum_weights(by_gaussian, weights, out):
 
 @lean(fastmath={"contract"})
 def sum_chunk(
-    first, last, rays, packets, parameters, scene, limits, by_gaussian, which, rows, out, sums, basis
+    first, last, rays, packets, parameters, scene, limits, by_gaussian, which, rows, out, sums, here, basis
 ):
     """Sum the rows of the Gaussians ``which[first:last]`` in packet order; the sums become gradients.
 
-    ``sums`` is room for one row, ``basis`` for harmonics. The frame is taken in float64 from the raw
+    ``sums`` and ``here`` are room for one row each, ``basis`` for harmonics. The frame is taken in float64 from the raw
     parameters: float32 axes would cost needles digits.
     """
     order, starts = by_gaussian.order, by_gaussian.starts
@@ -251,40 +251,44 @@ def sum_chunk(
         s2, s3 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1]))
         per_s2, per_s3 = 1.0 / s2, 1.0 / s3
         tau = tau_u = tau_v = n0 = n1 = n2 = m0 = m1 = m2 = 0.0
-        for k in range(starts[segment], starts[segment + 1]):
-            if k + AHEAD < len(order):
-                prefetch(rows.sums.ctypes.data + order[k + AHEAD] * (ROW_WORDS * 4))
-            row = order[k]
-            here = rows.sums[row]
-            add_row(sums.ctypes.data, here.ctypes.data)
-            ox, oy, oz = ray_origin(rays, packets[words[row, PACKET], 0])
+        k, end = starts[segment], starts[segment + 1]
+        while k < end:  # rows with one origin, such as those of one picture, become gradients together
+            ox, oy, oz = ray_origin(rays, packets[words[order[k], PACKET], 0])
+            here[:] = 0.0
+            gt = gtu = gtv = t0 = t1 = t2 = 0.0
+            while True:
+                if k + AHEAD < len(order):
+                    prefetch(rows.sums.ctypes.data + order[k + AHEAD] * (ROW_WORDS * 4))
+                row = order[k]
+                add_row(here.ctypes.data, rows.sums[row].ctypes.data)
+                if with_geometry:
+                    by_t = rows.geometry[row]
+                    gt, gtu, gtv = gt + by_t[GT], gtu + by_t[GTU], gtv + by_t[GTV]
+                    t0, t1, t2 = t0 + by_t[N_0], t1 + by_t[N_1], t2 + by_t[N_2]
+                for f in range(feature_count):
+                    out.features[place, f] += rows.features[row, f]
+                k += 1
+                if k == end or ray_origin(rays, packets[words[order[k], PACKET], 0]) != (ox, oy, oz):
+                    break
+            sums += here
             x, y, z = means[i, 0] - ox, means[i, 1] - oy, means[i, 2] - oz
             inverse = 1.0 / (x * r1[0] + y * r1[1] + z * r1[2])
             xa = (x * r2[0] + y * r2[1] + z * r2[2]) * per_s2
             xb = (x * r3[0] + y * r3[1] + z * r3[2]) * per_s3
-            gt = gtu = gtv = 0.0
-            if with_geometry:
-                by_t = rows.geometry[row]
-                gt, gtu, gtv = np.float64(by_t[GT]), np.float64(by_t[GTU]), np.float64(by_t[GTV])
-                # the gradient of the turned normal, turned back
+            if with_geometry:  # the gradient of the turned normal, turned back
                 side = side_shown((x, y, z), r1, limits)
-                n0 += side * by_t[N_0]
-                n1 += side * by_t[N_1]
-                n2 += side * by_t[N_2]
-            hu, hv = np.float64(here[HU]), np.float64(here[HV])
-            huu, huv, hvv = np.float64(here[HUU]), np.float64(here[HUV]), np.float64(here[HVV])
+                n0, n1, n2 = n0 + side * t0, n1 + side * t1, n2 + side * t2
+            hu, hv, huu, huv, hvv = here[HU], here[HV], here[HUU], here[HUV], here[HVV]
             tau += (gt - huu - xa * hu - hvv - xb * hv) * inverse
             tau_u += (gtu - here[HUUU] - xa * huu - xb * huv) * inverse
             tau_v += (gtv - here[HVVV] - xa * huv - xb * hvv) * inverse
-            by_colour = np.float64(here[RED]), np.float64(here[GREEN]), np.float64(here[BLUE])
+            by_colour = here[RED], here[GREEN], here[BLUE]
             view = write_view(basis, basis_count, x, y, z)
             add_by_colour(out.sh, place, basis, basis_count, by_colour)
             if basis_count > 1:
                 write_by_values(basis, scene.sh, i, basis_count, by_colour)
                 by_x, by_y, by_z = slope_by_mean(basis, basis_count, view)
                 m0, m1, m2 = m0 + by_x, m1 + by_y, m2 + by_z
-            for f in range(feature_count):
-                out.features[place, f] += rows.features[row, f]
         out.ids[place] = i
         moments = Moments(
             sums[H], sums[HU], sums[HV], sums[HUU], sums[HUV], sums[HVV],
@@ -303,7 +307,8 @@ def sum_packets(rays, packets, parameters, scene, limits, by_gaussian, which, ro
     per_chunk = (len(which) + chunks - 1) // chunks
     for chunk in prange(chunks):
         first, last = chunk * per_chunk, min(len(which), (chunk + 1) * per_chunk)
-        sums, basis = np.empty(ROW_WORDS, np.float64), np.empty(16, np.float64)
+        sums, here = np.empty(ROW_WORDS, np.float64), np.empty(ROW_WORDS, np.float64)
         sum_chunk(
-            first, last, rays, packets, parameters, scene, limits, by_gaussian, which, rows, out, sums, basis
-        )
+            first, last, rays, packets, parameters, scene, limits, by_gaussian, which, rows, out, sums, here,
+            np.empty(16, np.float64),
+        )  # fmt: skip
