@@ -60,7 +60,7 @@ from engine.run_folder import (
     open_photographs,
     run_scene,
 )
-from engine.run_poses import find_missing_poses, place_misfits
+from engine.run_poses import find_missing_poses, free_lenses, place_misfits
 from engine.scene import Dataset, write_held_out
 from engine.scene.near import NearZones, nearest_distances
 from engine.scene.seen import SeenSpace
@@ -154,6 +154,8 @@ def reconstruct(
             dataset = _load(scene, output, config, threads, tell, accepted)
             if recorded is None:
                 if place_misfits(dataset, output, config, threads, tell, should_stop):
+                    dataset = _load(scene, output, config, threads, tell, accepted)
+                if free_lenses(dataset, output, config, tell, should_stop):
                     dataset = _load(scene, output, config, threads, tell, accepted)
                 write_views(output / VIEWS, dataset.record)
             write_held_out(output / HELD_OUT, [dataset.views[i].name for i in dataset.test_indices])

@@ -6,7 +6,9 @@ from pathlib import Path
 from engine.config import ReconstructionConfig
 from engine.errors import DatasetError, PosesCrashed
 from engine.events import Listener, StageProgress, Warned
-from engine.poses import Given, find_poses, place_doubtful
+from engine.poses import Given, find_poses, lens_is_in_doubt, place_doubtful
+from engine.poses import free_lenses as with_lenses_freed
+from engine.poses.find import read_record
 from engine.run_folder import POSES, found_model
 from engine.scene import Dataset
 from engine.scene.colmap import find_model_folder, has_model
@@ -60,8 +62,7 @@ def place_misfits(
     Raises:
         Cancelled: stopped as asked.
     """
-    iterations = iteration_count(config.train, dataset.train_pixel_count)
-    is_long = iterations >= CHECKED_FROM if config.minutes is None else config.minutes >= CHECKED_FROM_MINUTES
+    is_long = _is_long(dataset, config)
     if not (config.train.place_misfits and is_long) or found_model(output) is not None:
         return False
     with stage("check", tell, CHECK_ITERATIONS):
@@ -98,3 +99,51 @@ def place_misfits(
             )
         )
     return bool(moved)
+
+
+def free_lenses(
+    dataset: Dataset,
+    output: Path,
+    config: ReconstructionConfig,
+    tell: Listener,
+    should_stop: Callable[[], bool],
+) -> bool:
+    """Give each photograph a principal point of its own if the lens moved; whether it did.
+
+    The model is then the one in the run's ``poses/``; see :mod:`engine.poses.lens_doubt` for what is asked
+    first, which takes no time worth a stage.
+
+    Raises:
+        Cancelled: stopped as asked.
+    """
+    if not (config.train.free_lenses and _is_long(dataset, config)):
+        return False
+    if "lenses" in read_record(output / POSES):
+        return False
+    if not lens_is_in_doubt(dataset.viewpoints, dataset.points, dataset.observations):
+        return False
+    model = found_model(output) or find_model_folder(dataset.root)
+    try:
+        facts = with_lenses_freed(
+            photograph_folder(dataset.root), model, output / POSES, listener=tell, should_stop=should_stop
+        )
+    except (DatasetError, PosesCrashed) as error:
+        tell(Warned(f"The lens seems to have moved between the photographs, but stays as it is: {error}"))
+        return False
+    if facts is None:
+        return False
+    tell(
+        Warned(
+            "The lens moved between the photographs, as stabilised ones do: each has a principal point of "
+            f"its own, {facts['shift_px_median']:.1f} px from the given one in the middle, and the sparse "
+            f"points fit to {facts['reprojection_px']:.2f} instead of {facts['reprojection_px_before']:.2f} px; "
+            "free_lenses=false leaves lenses alone."
+        )
+    )
+    return True
+
+
+def _is_long(dataset: Dataset, config: ReconstructionConfig) -> bool:
+    if config.minutes is not None:
+        return config.minutes >= CHECKED_FROM_MINUTES
+    return iteration_count(config.train, dataset.train_pixel_count) >= CHECKED_FROM

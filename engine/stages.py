@@ -21,6 +21,7 @@ DOING = {
     "matches": "Matching",
     "poses": "Finding poses",
     "placing": "Placing photographs anew",
+    "lenses": "Adjusting the lens of each photograph",
     "upload": "Uploading",
     "download": "Downloading",
     "read": "Reading",

@@ -294,7 +294,7 @@ def _evaluate_on(
 
 
 def _placed(output: Path) -> dict[str, object]:
-    """How many photographs have poses, or which were placed anew, where a run did that by itself."""
+    """How many photographs have poses, which were placed anew, and whether lenses were adjusted."""
     record = read_record(output / POSES)
-    known = {name: record[name] for name in ("placed", "photographs", "moved") if name in record}
+    known = {name: record[name] for name in ("placed", "photographs", "moved", "lenses") if name in record}
     return {"poses": known} if known else {}

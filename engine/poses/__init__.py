@@ -1,9 +1,10 @@
 """Poses for photographs that have none: features, matches, mapping by COLMAP, and checks of what came out.
 
-And for those of a given model that stand in the wrong place.
+And for those of a given model that stand in the wrong place, or whose lens moved.
 """
 
 from engine.poses.config import Given, PosesConfig
-from engine.poses.find import find_poses, place_doubtful
+from engine.poses.find import find_poses, free_lenses, place_doubtful
+from engine.poses.lens_doubt import lens_is_in_doubt
 
-__all__ = ["Given", "PosesConfig", "find_poses", "place_doubtful"]
+__all__ = ["Given", "PosesConfig", "find_poses", "free_lenses", "lens_is_in_doubt", "place_doubtful"]

@@ -35,12 +35,15 @@ def main() -> NoReturn:
         write(event.as_dict())
 
     try:
+        from engine.poses.lenses import free_lenses
         from engine.poses.misplaced import place_misplaced
         from engine.poses.search import Search
 
         for number in _CRASHES:
             signal.signal(number, signal.SIG_DFL)
-        if request.given is not None:
+        if request.lenses_of is not None:
+            free_lenses(request, request.lenses_of, tell)
+        elif request.given is not None:
             place_misplaced(request, request.given, tell)
         else:
             search = Search(

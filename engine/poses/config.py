@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 FEATURES, MATCHES, STAGE = "features", "matches", "poses"
 """The stages of the search."""
 PLACING = "placing"
+LENSES = "lenses"
 """The last stage where poses are given, and only those in doubt are asked."""
 RECORD = "poses.json"
 """What was found, and for which photographs; beside the model's files."""
@@ -79,7 +80,8 @@ class Given(BaseModel):
 class Request(BaseModel):
     """What the process in which COLMAP works is asked.
 
-    Without ``given`` see :class:`engine.poses.search.Search`.
+    With ``given`` see :mod:`engine.poses.misplaced`; with the folder of a model, ``lenses_of``, see
+    :mod:`engine.poses.lenses`; without either :class:`engine.poses.search.Search`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -90,3 +92,4 @@ class Request(BaseModel):
     config: PosesConfig
     threads: int
     given: Given | None = None
+    lenses_of: Path | None = None

@@ -127,6 +127,58 @@ def place_doubtful(
     return moved
 
 
+def free_lenses(
+    images: Path,
+    model: Path,
+    output: Path,
+    *,
+    config: PosesConfig = DEFAULT_CONFIG,
+    listener: Listener = ignore,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> dict[str, float] | None:
+    """Give each photograph of a model a principal point of its own, where that explains far more.
+
+    There is one stage, ``lenses``. See :mod:`engine.poses.lenses`.
+
+    Args:
+        images: folder of the photographs, for what is told of them.
+        model: folder of the COLMAP model.
+        output: becomes the folder of the changed model, with ``poses.json`` beside its files; it may be the
+            folder of the model that is changed. Nothing is written where the model stays as it is.
+        config: settings.
+        listener: hears the progress.
+        should_stop: asked now and then; True gives up.
+
+    Returns:
+        ``reprojection_px_before`` and ``reprojection_px``, means over the points, and how far the principal
+        points were moved, ``shift_px_median`` and ``shift_px_most``, at the size of the model; None where the
+        model stays.
+
+    Raises:
+        DatasetError: COLMAP refuses to work with the model.
+        PosesCrashed: COLMAP died.
+        Cancelled: stopped as asked.
+    """
+    before = read_record(output)
+    with _work_folder(output) as work:
+        request = Request(
+            images=images.resolve(),
+            names=(),
+            work=work.resolve(),
+            config=config,
+            threads=1,
+            lenses_of=model.resolve(),
+        )
+        _Waiting(request, listener, should_stop).wait()
+        facts: dict[str, float] | None = read_record(work / FOUND)["lenses"]
+        if facts is not None:
+            write_json(work / FOUND / RECORD, {**before, "lenses": facts})
+            if output.is_dir():
+                output.rename(work / "before")
+            (work / FOUND).rename(output)
+    return facts
+
+
 @contextmanager
 def _work_folder(output: Path) -> Iterator[Path]:
     """An empty hidden folder beside the one for the result, until the block ends."""

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from engine.colour import composited
 from engine.scene import Camera
+from engine.scene.flow import flow_by_pose
 from engine.scene.seen import turned
 from engine.train.batches import still_background
 from engine.train.config import TrainConfig
@@ -31,8 +32,6 @@ FAR_PX = 1e6
 """Image points farther off are none."""
 LEAST_NOISE = 0.005
 """Display values; no smaller difference counts as usual."""
-DEPTH_SHARE = 1e-4
-"""Slopes of the projection are differences over this share of the middle depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +198,7 @@ def _step(
 
     Shifts count in depths while it is solved, so that all six numbers are angles.
     """
-    flow = _flow(points_cam, camera, depth)
+    flow = flow_by_pose(points_cam, camera, depth)
     by_pose = np.einsum("nci,nik->nck", now.shown.slope, flow)
     slopes = np.zeros((len(points_cam), 3, 12))  # by the pose, and by each channel's gain and offset
     slopes[:, :, :6] = by_pose
@@ -216,21 +215,6 @@ def _step(
     moved_px = np.linalg.norm(np.einsum("nik,k->ni", flow[now.shown.valid], step), axis=1)
     step *= min(1.0, MOST_PX / max(float(np.median(moved_px)), 1e-12))
     return step * np.repeat([1.0, depth], 3)
-
-
-def _flow(
-    points_cam: Float64[np.ndarray, "n 3"], camera: Camera, depth: float
-) -> Float64[np.ndarray, "n 2 6"]:
-    """How points move in the picture (px) by a rotation of the camera's points and a shift in depths."""
-    here, length = camera.project(points_cam), DEPTH_SHARE * depth
-    by_point = np.stack(
-        [(camera.project(points_cam + length * axis) - here) / length for axis in np.eye(3)], axis=2
-    )
-    x, y, z = points_cam.T
-    zero = np.zeros_like(x)
-    by_turn = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
-    flow = np.concatenate([np.einsum("nij,njk->nik", by_point, by_turn), depth * by_point], axis=2)
-    return np.where(np.isfinite(flow), flow, 0.0)
 
 
 def _spline(

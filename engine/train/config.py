@@ -223,6 +223,12 @@ class TrainConfig(_Frozen):
         description="look for photographs of a given model that stand in the wrong place, and place them "
         "anew before the training; not before one of less than 1,000 iterations or 10 minutes",
     )
+    free_lenses: bool = Field(
+        True,
+        description="let each photograph of a model have a principal point of its own, where the sparse "
+        "points show that the lens moved, as stabilised ones do; not before a training of less than 1,000 "
+        "iterations or 10 minutes",
+    )
     misfits_after: float = Field(
         0.3, ge=0, le=1, description="share of the iterations after which checkpoints look for them"
     )
@@ -441,6 +447,7 @@ def preset(name: str) -> TrainConfig:
             one_order=0.0,
             stop_early=0.0,
             place_misfits=False,
+            free_lenses=False,
             window_rays=1,
             pixels_a_gaussian=50,
             max_gaussians_auto=350_000,

@@ -31,6 +31,7 @@ _DONE = {
     "matches": ("Matched", "pair"),
     "poses": ("Found the poses of", "photograph"),
     "placing": ("Asked where the matches put", "photograph"),
+    "lenses": ("Adjusted the lens of each photograph", ""),
     "upload": ("Uploaded", "kB"),
     "download": ("Downloaded", "kB"),
     "read": ("Read", "file"),

@@ -89,6 +89,7 @@ def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
     return [
         *([f"Poses found for {placed} of {poses['photographs']} photographs"] if placed else []),
         *([f"Placed {moved} photograph{'s' if moved > 1 else ''} anew"] if moved else []),
+        *(["Adjusted the lens of each photograph"] if poses.get("lenses") else []),
         mean_metrics(metrics),
         *_training_views(metrics.get("training_views") or {}),
         f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "

@@ -133,7 +133,7 @@ class Reporter:
             # The last step comes before the end in the journal too, and is not lost to the next first one.
             if self._progress is not None and "event" in self._progress:
                 self._events.append(("progress", self._progress.pop("event")))
-            if event["stage"] in ("poses", "placing", "train"):
+            if event["stage"] in ("poses", "placing", "lenses", "train"):
                 self._want_checkpoint(self._steps if event["stage"] == "train" else 0)
         elif kind == "preview_written":
             self._preview = event
