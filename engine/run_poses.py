@@ -132,12 +132,12 @@ def free_lenses(
         return False
     if facts is None:
         return False
+    before, after = facts["reprojection_px_before"], facts["reprojection_px"]
     tell(
         Warned(
             "The lens moved between the photographs, as stabilised ones do: each has a principal point of "
             f"its own, {facts['shift_px_median']:.1f} px from the given one in the middle, and the sparse "
-            f"points fit to {facts['reprojection_px']:.2f} instead of {facts['reprojection_px_before']:.2f} px; "
-            "free_lenses=false leaves lenses alone."
+            f"points fit to {after:.2f} px instead of {before:.2f}; free_lenses=false leaves lenses alone."
         )
     )
     return True

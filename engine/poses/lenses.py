@@ -9,6 +9,7 @@ the given model by the similarity that brings the cameras closest.
 Not done: rigs of several cameras; focal lengths that change, as by autofocus.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +44,10 @@ def free_lenses(request: Request, folder: Path, tell: Listener) -> None:
     given: Any = pycolmap.Reconstruction(folder)
     found = request.work / FOUND
     found.mkdir()
-    given.update_point_3d_errors()
-    before = given.compute_mean_reprojection_error()
-    with stage_of(LENSES, _ROUNDS, tell) as at:
-        model = _with_lenses(given, before, at)
+    with stage_of(LENSES, _ROUNDS + 1, tell) as at:
+        shared, before = _with_one_lens(given)
+        at(1)
+        model = None if shared is None else _with_lenses(shared, given, before, lambda done: at(1 + done))
     after = before if model is None else model.compute_mean_reprojection_error()
     if model is None or not after <= (1 - LEAST_GAIN) * before:
         write_json(found / RECORD, {"lenses": None})
@@ -62,17 +63,30 @@ def free_lenses(request: Request, folder: Path, tell: Listener) -> None:
     write_json(found / RECORD, {"lenses": facts})
 
 
-def _with_lenses(given: Any, error_px: float, at: Any) -> Any | None:
-    """The model adjusted; None where it cannot be, or some principal points come out nowhere."""
+def _with_one_lens(given: Any) -> tuple[Any | None, float]:
+    """The model adjusted with the lenses that are given, and its mean error (px); None if it cannot be.
+
+    What is gained so is not the lenses' doing.
+    """
     if any(len(frame.data_ids) > 1 for frame in given.frames.values()):
-        return None
-    fixed = {i for i, image in given.images.items() if image.num_points3D < FEWEST_OBSERVATIONS}
+        return None, 0.0
+    model = _split(given)
+    model.update_point_3d_errors()
+    if not _adjust(model, set(model.images), model.compute_mean_reprojection_error()):
+        return None, 0.0
+    model.update_point_3d_errors()
+    return model, model.compute_mean_reprojection_error()
+
+
+def _with_lenses(shared: Any, given: Any, error_px: float, counted: Callable[[int], None]) -> Any | None:
+    """A ``shared`` model adjusted further, lenses too, and laid over the given one; None where that fails."""
+    fixed = {i for i, image in shared.images.items() if image.num_points3D < FEWEST_OBSERVATIONS}
     for k in range(_ROUNDS):
-        model = _split(given)
+        model = _split(shared)
         if not _adjust(model, fixed, error_px):
             return None
         _lay_over(model, given)
-        at(k + 1)
+        counted(k + 1)
         astray = {i for i in model.images if _shift_px(model, given, i) > MOST_SHIFT * _side_px(model, i)}
         if not astray:
             model.update_point_3d_errors()

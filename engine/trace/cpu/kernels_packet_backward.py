@@ -224,8 +224,8 @@ def sum_chunk(
 ):
     """Sum the rows of the Gaussians ``which[first:last]`` in packet order; the sums become gradients.
 
-    ``sums`` and ``here`` are room for one row each, ``basis`` for harmonics. The frame is taken in float64 from
-    the raw parameters: float32 axes would cost needles digits.
+    ``sums`` and ``here`` are room for one row each, ``basis`` for harmonics. The frame is taken in float64
+    from the raw parameters: float32 axes would cost needles digits.
     """
     order, starts = by_gaussian.order, by_gaussian.starts
     means, quats, log_scales = parameters.means, parameters.quats, parameters.log_scales
