@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from engine.gaussians.model import FlatGaussians
-from engine.shading.exposure_guess import guessed
+from engine.shading.exposure_guess import guessed, times_of
 from engine.shading.plain import PLAIN
 from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
 from engine.trace.protocol import GaussianGradients, Tracer
@@ -94,17 +94,20 @@ class Exposures:
         shown = (rgb_srgb - self.offsets[view]) / np.exp(self.log_gains[view])
         return np.asarray(np.clip(shown, 0, 1), np.float32)
 
-    def guess_others(self, brightness: Float64[np.ndarray, " v"] | None = None) -> None:
+    def guess_others(self, names: Sequence[str], brightness: Float64[np.ndarray, " v"] | None = None) -> None:
         """Give views that were not trained on the exposures that the trained ones suggest.
 
         See :mod:`engine.shading.exposure_guess`.
 
         Args:
+            names: of all views.
             brightness: of all views, as the mean exposure shows the scene; None where that is not known.
         """
         trained, others = np.flatnonzero(self.steps > 0), np.flatnonzero(self.steps == 0)
+        times = times_of(names)
         for values in (self.log_gains, self.offsets):
-            values[others] = guessed(values[trained].astype(np.float64), trained, others, brightness)
+            known = values[trained].astype(np.float64)
+            values[others] = guessed(known, trained, others, times, brightness)
 
     def reverse(
         self,

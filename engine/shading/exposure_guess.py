@@ -1,10 +1,14 @@
 """The exposure of a photograph that was not trained on, from those that were.
 
-A camera exposes by how bright it finds what it looks at, and keeps its exposure for a while. So exposures
-are guessed in two steps, each taken as far as it tells the trained photographs' own when they are left out:
-a straight line over the brightness that the scene has in each view, as the mean exposure shows it; and what
-is left of the views before and after, by number.
+A camera exposes by how bright it finds what it looks at, and keeps its exposure for a while. So there are two
+sources: a straight line over the brightness that the scene has in each view, as the mean exposure shows it;
+and the views before and after, by the numbers in their names. Each is taken as far as it tells the trained
+photographs' own exposures when they are left out. Either may go first while the other one tells what is left:
+the guess is the mean of both ways, by the inverse of how much each leaves of the trained photographs.
 """
+
+import re
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -15,10 +19,24 @@ LEAST_FOR_LINE = 8
 """From fewer no line over the brightness is drawn."""
 
 
+def times_of(names: Sequence[str]) -> Float64[np.ndarray, " v"]:
+    """When photographs were taken, in any unit: the last numbers of their names, as of the frames of a film.
+
+    Their places in the list where these do not ascend.
+    """
+    found = [re.findall(r"\d+", name.rsplit(".", 1)[0]) for name in names]
+    if all(found):
+        numbers = np.array([float(digits[-1]) for digits in found])
+        if (np.diff(numbers) > 0).all():
+            return numbers
+    return np.arange(len(names), dtype=np.float64)
+
+
 def guessed(
     known: Float64[np.ndarray, "k c"],
     trained: Int64[np.ndarray, " k"],
     others: Int64[np.ndarray, " m"],
+    times: Float64[np.ndarray, " v"],
     brightness: Float64[np.ndarray, " v"] | None = None,
 ) -> Float64[np.ndarray, "m c"]:
     """Values of the views ``others``: 0, the mean of the trained ones, as far as nothing tells more.
@@ -27,45 +45,92 @@ def guessed(
         known: values of the trained views, whose mean is about 0.
         trained: their numbers, ascending.
         others: numbers of the views to guess.
+        times: of all views, ascending, see :func:`times_of`.
         brightness: of all views as the mean exposure shows the scene; None where that is not known.
     """
-    found = np.zeros((len(others), known.shape[1]))
     if len(trained) < LEAST_VIEWS:
-        return found
-    rest = known
-    if brightness is not None and len(trained) >= LEAST_FOR_LINE:
-        line, trust = _line(brightness[trained], known)
-        centred = brightness - brightness[trained].mean()
-        rest = known - trust * centred[trained, None] * line
-        found += trust * centred[others, None] * line
-    return found + _beside(rest, trained, others)
+        return np.zeros((len(others), known.shape[1]))
+    ours, theirs = times[trained], times[others]
+    if brightness is None or len(trained) < LEAST_FOR_LINE:
+        return _beside(known, ours, theirs)[0]
+    light = brightness[trained], brightness[others]
+    ways = [way(known, ours, theirs, *light) for way in (_line_then_beside, _beside_then_line)]
+    shares = np.array([1 / (np.square(left).mean() + 1e-12) for _, left in ways])
+    shares /= shares.sum()
+    return shares[0] * ways[0][0] + shares[1] * ways[1][0]
 
 
-def _line(
-    brightness: Float64[np.ndarray, " k"], known: Float64[np.ndarray, "k c"]
-) -> tuple[Float64[np.ndarray, " c"], float]:
-    """Slopes of the lines that fit best, and how far to trust them."""
-    centred = brightness - brightness.mean()
-    spread = float(centred @ centred)
+Way = tuple[Float64[np.ndarray, "m c"], Float64[np.ndarray, "i c"]]
+"""What is said of the other views, and what is left of each trained one when it is left out."""
+
+
+def _line_then_beside(
+    known: Float64[np.ndarray, "k c"],
+    ours: Float64[np.ndarray, " k"],
+    theirs: Float64[np.ndarray, " m"],
+    our_brightness: Float64[np.ndarray, " k"],
+    their_brightness: Float64[np.ndarray, " m"],
+) -> Way:
+    """What the line over the brightness says, and what is left of the views before and after."""
+    middle, height = our_brightness.mean(), known.mean(axis=0)
+    slopes, left_out, trust = _slopes(our_brightness - middle, known, height)
+    rest = known - trust * (our_brightness - middle)[:, None] * slopes
+    found, left = _beside(rest, ours, theirs)
+    missed = trust * ((our_brightness - middle)[:, None] * slopes - left_out)[1:-1]
+    return trust * (their_brightness - middle)[:, None] * slopes + found, left + missed
+
+
+def _beside_then_line(
+    known: Float64[np.ndarray, "k c"],
+    ours: Float64[np.ndarray, " k"],
+    theirs: Float64[np.ndarray, " m"],
+    our_brightness: Float64[np.ndarray, " k"],
+    their_brightness: Float64[np.ndarray, " m"],
+) -> Way:
+    """What the views before and after say, and a line over how much brighter than these a view is."""
+    found, left = _beside(known, ours, theirs)
+    brighter = our_brightness[1:-1] - _between(our_brightness[:, None], ours)[:, 0]
+    slopes, left_out, trust = _slopes(brighter, left)
+    their_brighter = their_brightness - np.interp(theirs, ours, our_brightness)
+    return found + trust * their_brighter[:, None] * slopes, left - trust * left_out
+
+
+def _slopes(
+    brightness: Float64[np.ndarray, " k"],
+    known: Float64[np.ndarray, "k c"],
+    height: Float64[np.ndarray, " c"] | None = None,
+) -> tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, "k c"], float]:
+    """Slopes of the lines over a brightness around 0; what the lines of all others say of each; the trust.
+
+    Lines go through 0, or through the ``height`` of the mean.
+    """
+    spread = float(brightness @ brightness)
     if spread <= 1e-12:
-        return np.zeros(known.shape[1]), 0.0
-    slopes = centred @ known / spread
-    # What the line through all others says of each, without drawing it anew for each.
-    reach = (1 / len(centred) + centred**2 / spread)[:, None]
-    fitted = known.mean(axis=0) + centred[:, None] * slopes
-    left_out = known - (known - fitted) / np.maximum(1 - reach, 1e-6)
-    return slopes, _trust(left_out, known)
+        return np.zeros(known.shape[1]), np.zeros_like(known), 0.0
+    slopes, reach = brightness @ known / spread, brightness**2 / spread
+    fitted = brightness[:, None] * slopes
+    if height is not None:
+        fitted, reach = fitted + height, reach + 1 / len(brightness)
+    left_out = known - (known - fitted) / np.maximum(1 - reach[:, None], 1e-6)
+    return slopes, left_out, _trust(left_out, known)
 
 
 def _beside(
-    known: Float64[np.ndarray, "k c"], trained: Int64[np.ndarray, " k"], others: Int64[np.ndarray, " m"]
-) -> Float64[np.ndarray, "m c"]:
+    known: Float64[np.ndarray, "k c"], ours: Float64[np.ndarray, " k"], theirs: Float64[np.ndarray, " m"]
+) -> Way:
     """The mean of the trained views before and after, by how near they are, as far as it is to be trusted."""
-    places, inner = trained.astype(np.float64), np.arange(1, len(trained) - 1)
-    share = (places[inner] - places[inner - 1]) / (places[inner + 1] - places[inner - 1])
-    between = known[inner - 1] + share[:, None] * (known[inner + 1] - known[inner - 1])
-    near = np.stack([np.interp(others, trained, channel) for channel in known.T], axis=1)
-    return _trust(between, known[inner]) * near
+    near = np.stack([np.interp(theirs, ours, channel) for channel in known.T], axis=1)
+    between = _between(known, ours)
+    trust = _trust(between, known[1:-1])
+    return trust * near, known[1:-1] - trust * between
+
+
+def _between(
+    known: Float64[np.ndarray, "k c"], ours: Float64[np.ndarray, " k"]
+) -> Float64[np.ndarray, "i c"]:
+    """What the views before and after each say of it, of all but the first and the last."""
+    share = (ours[1:-1] - ours[:-2]) / (ours[2:] - ours[:-2])
+    return known[:-2] + share[:, None] * (known[2:] - known[:-2])
 
 
 def _trust(said: Float64[np.ndarray, "k c"], known: Float64[np.ndarray, "k c"]) -> float:

@@ -67,7 +67,8 @@ def guess_exposures(
     """Give held-out views the exposures that a camera would choose there, where exposures are learnt."""
     exposures = exposures_of(shading)
     if exposures is not None and exposures.steps.any():
-        exposures.guess_others(_brightness(dataset, config, tracer, shading))
+        names = [view.name for view in dataset.views]
+        exposures.guess_others(names, _brightness(dataset, config, tracer, shading))
 
 
 def _brightness(

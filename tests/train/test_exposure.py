@@ -12,6 +12,7 @@ from engine.events import Event, HeldOutMeasured
 from engine.rays import RayBatch
 from engine.scene.model import Observations
 from engine.shading.exposure import Exposures
+from engine.shading.exposure_guess import times_of
 from engine.shading.protocol import Sight
 from engine.trace.cpu.tracer import CpuTracer
 from engine.trace.protocol import GaussianGradients, TraceResult
@@ -180,6 +181,26 @@ def test_a_resumed_run_has_the_same_exposures(tmp_path: Path) -> None:
     assert whole.state.gaussians.sh.tobytes() == parts.state.gaussians.sh.tobytes()
 
 
+NAMES = [f"view_{k:03}.png" for k in range(65)]
+
+
+def test_names_tell_when_photographs_were_taken() -> None:
+    """A film of which few frames are kept: the held-out one is like the frame just before it."""
+    names = ["take2_0001.jpg", "take2_0002.jpg", "take2_0090.jpg", "take2_0091.jpg", "take2_0180.jpg"]
+    np.testing.assert_array_equal(times_of(names), [1, 2, 90, 91, 180])
+    for other in (names[::-1], ["a.jpg", "b2.jpg", "c3.jpg"], ["a1.jpg", "b1.jpg", "c2.jpg"]):
+        np.testing.assert_array_equal(times_of(other), np.arange(len(other)))
+    times = np.sort(np.random.default_rng(2).choice(400, 40, replace=False))
+    exposures = Exposures(40, rate=0.02)
+    known, trained = np.sin(times / 40)[:, None] * np.ones(3), np.arange(40) % 8 != 0
+    exposures.log_gains[trained], exposures.steps[trained] = known[trained], 1
+    off = []
+    for names in ([f"{time:04}.jpg" for time in times], NAMES[:40]):
+        exposures.guess_others(names)
+        off.append(np.abs(exposures.log_gains - known)[~trained][1:-1].max())
+    assert off[0] < 0.03 < off[1]
+
+
 def test_a_held_out_view_is_guessed_from_those_beside_it_where_they_tell() -> None:
     places = np.arange(33)
     smooth, anew = np.sin(places / 5)[:, None] * np.ones(3), np.random.default_rng(0).normal(size=(33, 3))
@@ -187,7 +208,7 @@ def test_a_held_out_view_is_guessed_from_those_beside_it_where_they_tell() -> No
         exposures = Exposures(33, rate=0.02)
         trained = places % 8 != 0
         exposures.log_gains[trained], exposures.steps[trained] = known[trained], 1
-        exposures.guess_others()
+        exposures.guess_others(NAMES[:33])
         np.testing.assert_array_equal(exposures.log_gains[trained], known[trained].astype(np.float32))
         off = np.abs(exposures.log_gains[~trained] - known[~trained])
         if told:
@@ -208,7 +229,7 @@ def test_a_held_out_view_is_exposed_by_its_brightness_where_cameras_did_so() -> 
     for shown in (None, brightness):
         exposures = Exposures(65, rate=0.02)
         exposures.log_gains[trained], exposures.steps[trained] = known[trained], 1
-        exposures.guess_others(shown)
+        exposures.guess_others(NAMES[:65], shown)
         off.append(np.sqrt(np.mean((exposures.log_gains - known)[~trained] ** 2)))
     assert off[1] < 0.01 < 0.04 < off[0]
 
@@ -222,7 +243,7 @@ def test_a_brightness_that_tells_nothing_is_not_listened_to() -> None:
     for _ in range(20):
         exposures = Exposures(65, rate=0.02)
         exposures.log_gains[trained], exposures.steps[trained] = rng.normal(0, 0.1, (56, 3)), 1
-        exposures.guess_others(rng.uniform(0.2, 0.7, 65))
+        exposures.guess_others(NAMES[:65], rng.uniform(0.2, 0.7, 65))
         sizes.append(float(np.abs(exposures.log_gains[~trained]).max()))
     assert np.median(sizes) < 0.04
 
