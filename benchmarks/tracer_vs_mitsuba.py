@@ -5,7 +5,8 @@
     python benchmarks/tracer_vs_mitsuba.py [scene.ply ...]
 
 Without a scene, a cloud of 100,000 flat Gaussians is made. Both sides trace 65,536 camera rays in turn, so
-that a slow moment of the machine hits both; the medians and their ratio are printed.
+that a slow moment of the machine hits both; the medians and their ratio are printed. Run it on an idle
+machine: beside other programs, threads that wait for each other cost more than the work.
 """
 
 import argparse
@@ -27,6 +28,8 @@ from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
 SIDE = 256
 THIN = 1e-5
 ENLARGE = 3.0
+PAUSE_SECONDS = 0.1
+"""Before each measurement, so that the other side's threads no longer wait at full speed."""
 SETTINGS = TraceSettings(q=CHI2_3_99, transmittance_min=0.01, alpha_max=0.9999)
 
 
@@ -136,6 +139,7 @@ def median_seconds(functions: list[Callable[[], object]], repeats: int) -> list[
     times: list[list[float]] = [[] for _ in functions]
     for repeat in range(repeats + 2):
         for k, function in enumerate(functions):
+            time.sleep(PAUSE_SECONDS)
             start = time.perf_counter()
             function()
             if repeat >= 2:
