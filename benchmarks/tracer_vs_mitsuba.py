@@ -10,12 +10,15 @@ machine: beside other programs, threads that wait for each other cost more than 
 """
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before OpenMP is loaded, as the command line does
 
 from engine.files import read_scene
 from engine.gaussians.model import FlatGaussians
