@@ -292,7 +292,8 @@ def _process(request: Request, noise: IO[bytes]) -> Iterator["subprocess.Popen[b
 
 def _how_it_died(code: int, stage: str, log: Path) -> str:
     placing = "placing photographs" if stage else "starting"
-    doing = {"features": "looking for features", "matches": "matching"}.get(stage, placing)
+    known = {"features": "looking for features", "matches": "matching", "lenses": "adjusting lenses"}
+    doing = known.get(stage, placing)
     how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     said = next((line.strip()[:300] for line in reversed(text.splitlines()) if line.strip()), "")
