@@ -20,8 +20,9 @@ FEWEST_OBSERVATIONS = 100
 """Photographs that show fewer points are not asked, nor given a lens of their own."""
 FEWEST_ASKED = 8
 """From fewer photographs nothing is said."""
-LEAST_ERROR_PX = 0.1
-"""Better models need nothing: mean distance between where points are seen and where they should be."""
+LEAST_ERROR_SHARE = 1e-4
+"""Better models need nothing: mean distance between where points are seen and where they should be, as a
+share of the picture's longer side."""
 LEAST_GAIN = 0.05
 """From this share of the errors on, the lens is in doubt."""
 _ROUNDS = 5
@@ -36,12 +37,13 @@ def lens_is_in_doubt(viewpoints: Viewpoints, points: SparsePoints, observations:
         points_cam = turned(points_world, view.rotation_cam_from_world) + view.translation_cam_from_world
         errors = _errors(points_cam, xy_px, camera)
         if errors is not None:
-            before.append(errors[0])
-            after.append(errors[1])
+            side_px = max(view.width_px, view.height_px)
+            before.append(errors[0] / side_px)
+            after.append(errors[1] / side_px)
     if len(before) < FEWEST_ASKED:
         return False
     mean, left = float(np.mean(before)), float(np.mean(after))
-    return mean >= LEAST_ERROR_PX and left <= (1 - LEAST_GAIN) * mean
+    return mean >= LEAST_ERROR_SHARE and left <= (1 - LEAST_GAIN) * mean
 
 
 def _seen_of_each(
@@ -75,7 +77,7 @@ def _errors(
     slopes = np.concatenate([flow, np.broadcast_to(np.eye(2), (len(away), 2, 2))], axis=2)
     slopes = slopes / np.sqrt(np.square(slopes).mean(axis=(0, 1)) + 1e-30)
     distances = first = np.linalg.norm(away, axis=1)
-    least = float(np.median(first))
+    least = max(float(np.median(first)), 1e-9)
     for _ in range(_ROUNDS):  # what lies far off counts little
         weights = 1 / np.maximum(distances, least)
         curvature = np.einsum("nck,ncl,n->kl", slopes, slopes, weights)
