@@ -5,8 +5,8 @@
     python benchmarks/tracer_vs_mitsuba.py [scene.ply ...]
 
 Without a scene, a cloud of 100,000 flat Gaussians is made. Both sides trace 65,536 camera rays in turn, so
-that a slow moment of the machine hits both; the medians and their ratio are printed. Run it on an idle
-machine: beside other programs, threads that wait for each other cost more than the work.
+that a slow moment of the machine hits both; the medians and their ratio are printed. Threads
+that wait are asleep, ours as in the command line, Mitsuba's after a pause.
 """
 
 import argparse

@@ -6,8 +6,7 @@ from pathlib import Path
 from engine.config import ReconstructionConfig
 from engine.errors import DatasetError, PosesCrashed
 from engine.events import Listener, StageProgress, Warned
-from engine.poses import Given, find_poses, lens_is_in_doubt, place_doubtful
-from engine.poses import free_lenses as with_lenses_freed
+from engine.poses import Given, adjust_lenses, find_poses, lens_is_in_doubt, place_doubtful
 from engine.poses.find import read_record
 from engine.run_folder import POSES, found_model
 from engine.scene import Dataset
@@ -124,9 +123,7 @@ def free_lenses(
         return False
     model = found_model(output) or find_model_folder(dataset.root)
     try:
-        facts = with_lenses_freed(
-            photograph_folder(dataset.root), model, output / POSES, listener=tell, should_stop=should_stop
-        )
+        facts = adjust_lenses(model, output / POSES, listener=tell, should_stop=should_stop)
     except (DatasetError, PosesCrashed) as error:
         tell(Warned(f"The lens seems to have moved between the photographs, but stays as it is: {error}"))
         return False

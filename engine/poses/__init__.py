@@ -4,7 +4,7 @@ And for those of a given model that stand in the wrong place, or whose lens move
 """
 
 from engine.poses.config import Given, PosesConfig
-from engine.poses.find import find_poses, free_lenses, place_doubtful
+from engine.poses.find import adjust_lenses, find_poses, place_doubtful
 from engine.poses.lens_doubt import lens_is_in_doubt
 
-__all__ = ["Given", "PosesConfig", "find_poses", "free_lenses", "lens_is_in_doubt", "place_doubtful"]
+__all__ = ["Given", "PosesConfig", "adjust_lenses", "find_poses", "lens_is_in_doubt", "place_doubtful"]

@@ -35,14 +35,14 @@ def main() -> NoReturn:
         write(event.as_dict())
 
     try:
-        from engine.poses.lenses import free_lenses
+        from engine.poses.lenses import write_with_lenses
         from engine.poses.misplaced import place_misplaced
         from engine.poses.search import Search
 
         for number in _CRASHES:
             signal.signal(number, signal.SIG_DFL)
         if request.lenses_of is not None:
-            free_lenses(request, request.lenses_of, tell)
+            write_with_lenses(request, request.lenses_of, tell)
         elif request.given is not None:
             place_misplaced(request, request.given, tell)
         else:
@@ -56,6 +56,8 @@ def main() -> NoReturn:
     except (RuntimeError, ValueError, OSError, MemoryError) as error:  # COLMAP's, by way of its binding
         text = " ".join(str(error).split())[:300].rstrip(".") or type(error).__name__
         message = f"COLMAP cannot find poses for {request.images} ({text}); look at the photographs."
+        if request.lenses_of is not None:
+            message = f"COLMAP cannot adjust the model in {request.lenses_of} ({text}); run COLMAP again."
         write({"kind": "error", "message": message})
     # Not by way of the interpreter's clean-up, in which a library may hang or crash after all is done.
     os._exit(0)

@@ -127,8 +127,7 @@ def place_doubtful(
     return moved
 
 
-def free_lenses(
-    images: Path,
+def adjust_lenses(
     model: Path,
     output: Path,
     *,
@@ -141,7 +140,6 @@ def free_lenses(
     There is one stage, ``lenses``. See :mod:`engine.poses.lenses`.
 
     Args:
-        images: folder of the photographs, for what is told of them.
         model: folder of the COLMAP model.
         output: becomes the folder of the changed model, with ``poses.json`` beside its files; it may be the
             folder of the model that is changed. Nothing is written where the model stays as it is.
@@ -162,7 +160,7 @@ def free_lenses(
     before = read_record(output)
     with _work_folder(output) as work:
         request = Request(
-            images=images.resolve(),
+            images=model.resolve(),  # no photograph is looked at
             names=(),
             work=work.resolve(),
             config=config,

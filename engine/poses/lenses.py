@@ -32,7 +32,7 @@ _ROUNDS = 3
 _MOST_STEPS = 50
 
 
-def free_lenses(request: Request, folder: Path, tell: Listener) -> None:
+def write_with_lenses(request: Request, folder: Path, tell: Listener) -> None:
     """Write the model with a lens for each photograph, where that explains far more, and what it is worth.
 
     Args:

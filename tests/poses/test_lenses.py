@@ -8,10 +8,10 @@ import pycolmap
 import pytest
 
 from engine.config import resolve_config
-from engine.errors import Cancelled
+from engine.errors import Cancelled, DatasetError
 from engine.events import Event, StageFinished, StageStarted, Warned
 from engine.pipeline import reconstruct
-from engine.poses import free_lenses, lens_is_in_doubt
+from engine.poses import adjust_lenses, lens_is_in_doubt
 from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from engine.scene.load import load_scene
 
@@ -69,7 +69,7 @@ def test_a_moved_lens_is_in_doubt_and_a_still_one_is_not(moved: Path, still: Pat
 
 def test_the_principal_points_come_out_where_the_pictures_were_moved(moved: Path, tmp_path: Path) -> None:
     model, found = moved / "sparse" / "0", tmp_path / "found"
-    facts = free_lenses(moved / "images", model, found)
+    facts = adjust_lenses(model, found)
     assert facts is not None
     assert facts["reprojection_px"] < 1.1 * NOISE_PX < 0.75 * facts["reprojection_px_before"]
     given = principal_points(model)
@@ -79,17 +79,23 @@ def test_the_principal_points_come_out_where_the_pictures_were_moved(moved: Path
     np.testing.assert_allclose(centres(found), centres(model), atol=0.01 * size)
     assert json.loads((found / "poses.json").read_text())["lenses"] == facts
     again = tmp_path / "again"
-    free_lenses(moved / "images", model, again)
+    adjust_lenses(model, again)
     for path in found.iterdir():
         assert (again / path.name).read_bytes() == path.read_bytes()
     # The folder of the model itself may be the one to change; what its record says stays.
     (again / "poses.json").write_text('{"moved": ["a.png"]}')
-    assert free_lenses(moved / "images", again, again) is None
+    assert adjust_lenses(again, again) is None
     assert json.loads((again / "poses.json").read_text()) == {"moved": ["a.png"]}
 
 
 def test_a_still_lens_stays(still: Path, tmp_path: Path) -> None:
-    assert free_lenses(still / "images", still / "sparse" / "0", tmp_path / "none") is None
+    assert adjust_lenses(still / "sparse" / "0", tmp_path / "none") is None
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_model_that_colmap_cannot_read_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"COLMAP cannot adjust the model in .*gone"):
+        adjust_lenses(tmp_path / "gone", tmp_path / "none")
     assert not any(tmp_path.iterdir())
 
 
@@ -103,7 +109,7 @@ def test_photographs_that_show_few_points_keep_their_lens(moved: Path, tmp_path:
     given = tmp_path / "given"
     given.mkdir()
     model.write_binary(str(given))
-    assert free_lenses(moved / "images", given, tmp_path / "found") is not None
+    assert adjust_lenses(given, tmp_path / "found") is not None
     shifts = principal_points(tmp_path / "found") - principal_points(given)
     assert not shifts[4:6].any()
     assert np.abs(np.delete(shifts - SHIFTS_PX, [4, 5], axis=0)).max() < 2.5
