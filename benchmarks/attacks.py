@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from workers.client.api import Api, find_address, find_token
+from octasplat.workers.client.api import Api, find_address, find_token
 
 TESTS = Path(__file__).parents[1] / "tests"
 sys.path[:0] = [str(TESTS), *(str(TESTS / folder) for folder in ("intake", "service", "work", "store"))]

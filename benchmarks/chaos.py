@@ -30,16 +30,16 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-
 from benchmarks.chaos_kind import ChainOptions, undisturbed
 from benchmarks.chaos_machine import BLOWS, Blow, Machine, small_disk
-from engine.pipeline import reconstruct
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.client.api import Api, ServiceError, Unreachable
-from workers.client.upload import scene_files, upload_scene
-from workers.store.opening import open_storage
-from workers.store.trees import read_manifest
-from workers.work.kinds.options import resolve_reconstruction
+
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.workers.client.api import Api, ServiceError, Unreachable
+from octasplat.workers.client.upload import scene_files, upload_scene
+from octasplat.workers.store.opening import open_storage
+from octasplat.workers.store.trees import read_manifest
+from octasplat.workers.work.kinds.options import resolve_reconstruction
 
 IN_FLIGHT = 20
 OVER = ("succeeded", "failed", "canceled")

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from engine.errors import Cancelled
-from engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
-from workers.work.kinds import JobKind, register
-from workers.work.kinds.table import validated
-from workers.work.task import Task
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
+from octasplat.workers.work.kinds import JobKind, register
+from octasplat.workers.work.kinds.table import validated
+from octasplat.workers.work.task import Task
 
 EVERY = 5
 RESULT_BLOCKS = 20_000

@@ -94,7 +94,7 @@ class Machine:
             "NUMBA_NUM_THREADS": "2",
         }
         environment.pop("DATABASE_URL", None)
-        command = [sys.executable, "-m", "workers", "serve", "--data", str(self.data)]
+        command = [sys.executable, "-m", "octasplat", "serve", "--data", str(self.data)]
         command += ["--port", str(self.port), "--queues", f"cpu={self.slots}"]
         (self.data / "serve.json").unlink(missing_ok=True)
         with self.log.open("ab") as output:
@@ -130,7 +130,7 @@ class Machine:
 
     def jobs(self) -> list[psutil.Process]:
         """The children of the worker."""
-        return self.below("workers.work.child")
+        return self.below("octasplat.workers.work.child")
 
     def worker(self) -> list[psutil.Process]:
         """The worker that takes jobs."""

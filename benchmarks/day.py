@@ -35,7 +35,8 @@ from typing import Any
 from benchmarks.chaos import Run, make_scene, prepare, timeline
 from benchmarks.chaos_machine import ROOT
 from benchmarks.fleet import Fleet, release
-from workers.client.api import Api
+
+from octasplat.workers.client.api import Api
 
 BEFORE = "8a6786e625c3"
 """The commit of the release before this one."""

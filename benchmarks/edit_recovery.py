@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.edit.local_maps import legs_world
-from engine.edit.recovery import EditOptions, recover_edit
-from engine.files import Mesh, export_scene, read_mesh, read_scene
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.edit.local_maps import legs_world
+from octasplat.engine.edit.recovery import EditOptions, recover_edit
+from octasplat.engine.files import Mesh, export_scene, read_mesh, read_scene
+from octasplat.engine.gaussians.model import FlatGaussians
 
 Map = Callable[[np.ndarray], np.ndarray]
 STEP = 1e-5

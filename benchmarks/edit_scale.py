@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.files import export_scene
-from engine.files.ply_container import read_ply
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.files import export_scene
+from octasplat.engine.files.ply_container import read_ply
+from octasplat.engine.gaussians.model import FlatGaussians
 
 
 def random_scene(count: int, degree: int) -> FlatGaussians:
@@ -99,7 +99,7 @@ def measure(name: str, *arguments: object) -> None:
     """One row of the table, if it was asked for."""
     if len(sys.argv) > 3 and sys.argv[3] not in name:
         return
-    command = [sys.executable, "-m", "workers", *(str(argument) for argument in arguments), "--quiet"]
+    command = [sys.executable, "-m", "octasplat", *(str(argument) for argument in arguments), "--quiet"]
     began = time.perf_counter()
     process = subprocess.Popen(command)
     _, status, usage = os.wait4(process.pid, 0)

@@ -22,20 +22,20 @@ import numpy as np
 from numba import carray, cfunc, njit, types
 from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
-from engine.files import read_scene
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import octagon_radii
-from engine.gaussians.order import morton_order
-from engine.rays import RayBatch
-from engine.trace.cpu.bundles import Forward, Hits, Limits, Parameters, Rays, Scene
-from engine.trace.cpu.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon
-from engine.trace.cpu.kernels_records import write_boxes, write_records
-from engine.trace.cpu.memory import Pool, aligned_empty, empty_result, outputs
-from engine.trace.cpu.packets import PacketTracer, find_packets
-from engine.trace.cpu.single_rays import SingleRayTracer
-from engine.trace.embree_library import Handle
-from engine.trace.kernels_native import int32_pointer
-from engine.trace.protocol import TraceResult
+from octasplat.engine.files import read_scene
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import octagon_radii
+from octasplat.engine.gaussians.order import morton_order
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.bundles import Forward, Hits, Limits, Parameters, Rays, Scene
+from octasplat.engine.trace.cpu.kernels_hit import CONTEXT_WORDS, RECORD_WORDS, intersect_octagon
+from octasplat.engine.trace.cpu.kernels_records import write_boxes, write_records
+from octasplat.engine.trace.cpu.memory import Pool, aligned_empty, empty_result, outputs
+from octasplat.engine.trace.cpu.packets import PacketTracer, find_packets
+from octasplat.engine.trace.cpu.single_rays import SingleRayTracer
+from octasplat.engine.trace.embree_library import Handle
+from octasplat.engine.trace.kernels_native import int32_pointer
+from octasplat.engine.trace.protocol import TraceResult
 
 THREADS, REPEATS = 2, 7
 INSTANCE, REFIT, FLOAT3X4_COLUMN_MAJOR = 121, 3, 0x9234

@@ -19,10 +19,10 @@ from pathlib import Path
 import psutil
 from PIL import Image
 
-from engine.config import resolve_config
-from workers.records.sizes import Sizes
-from workers.work.kinds.estimates import estimate_reconstruction
-from workers.work.kinds.options import ReconstructOptions
+from octasplat.engine.config import resolve_config
+from octasplat.workers.records.sizes import Sizes
+from octasplat.workers.work.kinds.estimates import estimate_reconstruction
+from octasplat.workers.work.kinds.options import ReconstructOptions
 
 
 def main() -> None:
@@ -40,7 +40,7 @@ def main() -> None:
     cores = len(os.sched_getaffinity(0))
     asked = ReconstructOptions.model_validate(config.model_dump(mode="json"))
     expected = estimate_reconstruction(asked, sizes, cores)
-    command = [sys.executable, "-m", "workers", "reconstruct", str(options.scene), "--quiet"]
+    command = [sys.executable, "-m", "octasplat", "reconstruct", str(options.scene), "--quiet"]
     command += ["--preset", options.preset]
     command += ["--max-side", str(options.max_side)] if options.max_side else []
     for assignment in options.assignments:

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.files import export_scene
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.files import export_scene
+from octasplat.engine.gaussians.model import FlatGaussians
 
 NAMES = {
     "mesh-ply": "scene.mesh.ply",

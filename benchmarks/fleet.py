@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 import psutil
-
 from benchmarks.chaos_machine import FAST, ROOT
-from workers.postgres.embedded import EmbeddedPostgres
+
+from octasplat.workers.postgres.embedded import EmbeddedPostgres
 
 STOP_SECONDS = 60.0
 KINDS = '["benchmarks.chaos_kind"]'
@@ -23,11 +23,18 @@ KINDS = '["benchmarks.chaos_kind"]'
 
 def release(commit: str, folder: Path) -> Path:
     """The programs of a commit, in a folder of their own."""
-    command = ["git", "archive", "--format=tar", commit, "engine", "workers", "service", "benchmarks"]
+    command = ["git", "archive", "--format=tar", commit]
     archive = subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout
     folder.mkdir(parents=True)
     subprocess.run(["tar", "-x"], cwd=folder, input=archive, check=True)
     return folder
+
+
+def program(root: Path, *arguments: str) -> tuple[str, ...]:
+    """Return what ``python -m`` runs of the version in ``root``; until 0.1 the packages stood alone."""
+    if (root / "src").exists():
+        return ("octasplat", *arguments)
+    return ("service",) if arguments == ("api",) else ("workers", *arguments)
 
 
 @dataclass
@@ -71,7 +78,7 @@ class Fleet:
         """What a command of the front end's version says."""
         root = self.roots["front"]
         done = subprocess.run(
-            [sys.executable, "-m", "workers", *arguments],
+            [sys.executable, "-m", *program(root), *arguments],
             cwd=root, env=self._environment(root, {}), capture_output=True, text=True, check=True,
         )  # fmt: skip
         return done.stdout.strip()
@@ -81,7 +88,7 @@ class Fleet:
         before, root = self._processes.pop("front", None), self.roots["front"]
         with self._log("front") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "service"],
+                [sys.executable, "-m", *program(root, "api")],
                 cwd=root, env=self._environment(root, {"PORT": "0"}), stdout=subprocess.PIPE, stderr=log,
                 start_new_session=True,
             )  # fmt: skip
@@ -103,7 +110,7 @@ class Fleet:
     def start_worker(self, name: str) -> None:
         """Start a worker."""
         root = self.roots[name]
-        command = [sys.executable, "-m", "workers", "worker", "--queues", "cpu", "--name", name]
+        command = [sys.executable, "-m", *program(root), "worker", "--queues", "cpu", "--name", name]
         environment = self._environment(root, {"WORK": str(self.data / f"work-{name}")})
         with self._log(name) as log:
             self._processes[name] = subprocess.Popen(
@@ -158,6 +165,6 @@ class Fleet:
             **os.environ,
             **{f"OCTASPLAT_{name}": value for name, value in settings.items()},
             "DATABASE_URL": self._conninfo,
-            "PYTHONPATH": str(root),
+            "PYTHONPATH": os.pathsep.join((str(root / "src"), str(root))),
             "OMP_NUM_THREADS": "1",
         }

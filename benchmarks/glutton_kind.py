@@ -5,10 +5,10 @@ import time
 
 from pydantic import BaseModel, ConfigDict
 
-from engine.events import StageProgress, StageStarted
-from workers.work.kinds import JobKind, register
-from workers.work.kinds.table import validated
-from workers.work.task import Task
+from octasplat.engine.events import StageProgress, StageStarted
+from octasplat.workers.work.kinds import JobKind, register
+from octasplat.workers.work.kinds.table import validated
+from octasplat.workers.work.task import Task
 
 PIECE_BYTES = 1 << 20
 MOST_PIECES = 4096

@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 from tracer_vs_mitsuba import SETTINGS, camera_rays, cloud
 
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.order import morton_order
-from engine.rays import RayBatch
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceGradients
-from engine.train.config import McmcConfig, TrainConfig
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.order import morton_order
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceGradients
+from octasplat.engine.train.config import McmcConfig, TrainConfig
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 SMALLEST = 10_000
 

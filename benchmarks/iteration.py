@@ -23,21 +23,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # else CPU time counts thre
 
 import numpy as np
 
-from engine.config import resolve_config
-from engine.scene import Dataset
-from engine.threads import use_threads
-from engine.trace.make import make_tracer
-from engine.trace.protocol import Tracer
-from engine.train.batches import BatchSource
-from engine.train.checkpoint import load_checkpoint, save_checkpoint
-from engine.train.config import TrainConfig, in_one_order
-from engine.train.densify import make_densifier
-from engine.train.initialise import initial_gaussians
-from engine.train.iteration import Machinery, iterate
-from engine.train.optimiser import Adam
-from engine.train.shading import make_shading
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.config import resolve_config
+from octasplat.engine.scene import Dataset
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.batches import BatchSource
+from octasplat.engine.train.checkpoint import load_checkpoint, save_checkpoint
+from octasplat.engine.train.config import TrainConfig, in_one_order
+from octasplat.engine.train.densify import make_densifier
+from octasplat.engine.train.initialise import initial_gaussians
+from octasplat.engine.train.iteration import Machinery, iterate
+from octasplat.engine.train.optimiser import Adam
+from octasplat.engine.train.shading import make_shading
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 STAGES = ("batch", "trace", "backward", "Adam", "refresh", "rebuild", "loss and the rest")
 

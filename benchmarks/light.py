@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.gaussians.octagon import CHI2_3_99
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.layers import GaussianLayers, stage_layers
-from engine.light.stage import (
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.gaussians.octagon import CHI2_3_99
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.layers import GaussianLayers, stage_layers
+from octasplat.engine.light.stage import (
     Diffuse,
     Glass,
     Integrator,
@@ -37,9 +37,9 @@ from engine.light.stage import (
     StageGaussians,
     StageMesh,
 )
-from engine.light.staging import LitMeshes, stage_meshes
-from engine.rays import RayBatch
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.light.staging import LitMeshes, stage_meshes
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import TraceSettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "light"))
 from light_scenes import camera
@@ -213,13 +213,13 @@ class Watched:
         self._inner, self.seen = inner, []  # type: ignore[var-annotated]
 
     def closest(self, rays: RayBatch) -> Any:
-        """See :class:`engine.trace.meshes.TriangleScene`."""
+        """See :class:`octasplat.engine.trace.meshes.TriangleScene`."""
         hits = self._inner.closest(rays)
         self.seen.append(RayBatch(rays.origins_world, rays.directions_world, rays.t_min, hits.distances))
         return hits
 
     def transmittance(self, rays: RayBatch) -> Any:
-        """See :class:`engine.trace.protocol.Tracer`."""
+        """See :class:`octasplat.engine.trace.protocol.Tracer`."""
         self.seen.append(rays)
         return self._inner.transmittance(rays)
 

@@ -17,24 +17,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from engine.colour import linear_to_srgb
-from engine.evaluate.truth import ViewTruth, read_truth
-from engine.evaluate.truth_metrics import pooled_psnr
-from engine.gaussians.channels import unstacked
-from engine.gaussians.frames import quaternions
-from engine.gaussians.materials import MATERIAL_WIDTHS
-from engine.gaussians.model import FlatGaussians
-from engine.light.arrays import SurfacePoints
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.kernels_bsdf import around
-from engine.light.layers import stage_layers
-from engine.light.stage import Environment, Integrator, Stage, StageGaussians
-from engine.light.staging import stage_meshes
-from engine.rays import ImageRays
-from engine.render.images import read_image, write_png
-from engine.render.jobs import view_shots
-from engine.scene import load_scene
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.evaluate.truth import ViewTruth, read_truth
+from octasplat.engine.evaluate.truth_metrics import pooled_psnr
+from octasplat.engine.gaussians.channels import unstacked
+from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.arrays import SurfacePoints
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.kernels_bsdf import around
+from octasplat.engine.light.layers import stage_layers
+from octasplat.engine.light.stage import Environment, Integrator, Stage, StageGaussians
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.images import read_image, write_png
+from octasplat.engine.render.jobs import view_shots
+from octasplat.engine.scene import load_scene
+from octasplat.engine.trace.protocol import TraceSettings
 
 SPACING = 0.006
 """Distance of the Gaussians, of the scene's radius."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-PIPELINE = "engine.pipeline"
+PIPELINE = "octasplat.engine.pipeline"
 SETTINGS = {
     "iterations": "30", "rays": "256", "max_gaussians": "400", "initial_points": "300", "probe_rays": "256",
 }  # fmt: skip
@@ -31,8 +31,8 @@ class Visits:
         if event != "call" or frame.f_back is None:
             return
         caller, callee = (f.f_globals.get("__name__", "") for f in (frame.f_back, frame))
-        if caller == PIPELINE and callee.startswith("engine.") and callee != PIPELINE:
-            room = callee.split(".")[1]
+        if caller == PIPELINE and callee.startswith("octasplat.engine.") and callee != PIPELINE:
+            room = callee.split(".")[2]
             if not self.rooms or self.rooms[-1] != room:
                 self.rooms.append(room)
 
@@ -43,10 +43,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent)
-    sys.path.insert(0, str(parser.parse_args().root.resolve()))
-    from engine.config import resolve_config
-    from engine.pipeline import reconstruct
-    from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+    sys.path.insert(0, str(parser.parse_args().root.resolve() / "src"))
+    from octasplat.engine.config import resolve_config
+    from octasplat.engine.pipeline import reconstruct
+    from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
     with tempfile.TemporaryDirectory() as folder:
         scene, output = Path(folder) / "scene", Path(folder) / "output"

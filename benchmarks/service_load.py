@@ -21,10 +21,10 @@ from typing import Any
 
 import httpx
 import psutil
-
 from benchmarks.chaos import make_scene
-from workers.client.api import Api, find_address, find_token
-from workers.client.upload import upload_scene
+
+from octasplat.workers.client.api import Api, find_address, find_token
+from octasplat.workers.client.upload import upload_scene
 
 TERMINAL = ('"state": "canceled"', '"state": "succeeded"', '"state": "failed"')
 

@@ -19,9 +19,9 @@ from typing import Any
 
 import httpx
 import psutil
-
 from benchmarks.chaos_machine import ROOT, free_port
-from workers.postgres.embedded import EmbeddedPostgres
+
+from octasplat.workers.postgres.embedded import EmbeddedPostgres
 
 
 def ready_after(began: float, port: int, process: "subprocess.Popen[bytes]", seconds: float = 120) -> float:

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.files import export_scene, read_scene
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.files import export_scene, read_scene
+from octasplat.engine.gaussians.model import FlatGaussians
 
 NAMES = ("scene.ply", "scene.splat", "scene.spz", "scene.splats.glb", "scene.usdc")
 

@@ -25,9 +25,12 @@ EVERYBODY = frozenset({"errors", "events", "colour", "rays", "threads"})
 
 
 def room_of(module: str) -> str | None:
-    """The folder of a module, ``engine.trace.cpu.packets`` -> ``engine.trace``; None for what all may use."""
-    parts = module.split(".")
-    if len(parts) == 1 or parts[1] in EVERYBODY or parts[1] == "__main__":
+    """The folder of a module; None for what all may use.
+
+    ``octasplat.engine.trace.cpu.packets`` -> ``engine.trace``.
+    """
+    parts = module.split(".")[1:]
+    if len(parts) < 2 or parts[0] not in PACKAGES or parts[1] in EVERYBODY:
         return None
     return ".".join(parts[:2])
 
@@ -138,8 +141,8 @@ def main() -> int:
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent)
     parser.add_argument("--drawing", action="store_true")
     arguments = parser.parse_args()
-    sys.path.insert(0, str(arguments.root.resolve()))
-    graph = grimp.build_graph(*PACKAGES, cache_dir=None)
+    sys.path.insert(0, str(arguments.root.resolve() / "src"))
+    graph = grimp.build_graph("octasplat", cache_dir=None)
     if arguments.drawing:
         print(drawing(arrows(graph)))
         return 0

@@ -17,18 +17,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from engine.config import read_config
-from engine.evaluate.truth import TRUTH, Truth, read_truth
-from engine.files import read_scene
-from engine.light.environment import EnvironmentMap, environment_frame
-from engine.light.relighting import PathRelighter
-from engine.light.split_sum_relighting import SplitSumRelighter
-from engine.light.stage import Integrator
-from engine.render.environment_map import read_environment
-from engine.render.images import read_image, write_png
-from engine.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
-from engine.scene import Dataset, load_scene
-from engine.surface.cameras import photograph_cameras
+from octasplat.engine.config import read_config
+from octasplat.engine.evaluate.truth import TRUTH, Truth, read_truth
+from octasplat.engine.files import read_scene
+from octasplat.engine.light.environment import EnvironmentMap, environment_frame
+from octasplat.engine.light.relighting import PathRelighter
+from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
+from octasplat.engine.light.stage import Integrator
+from octasplat.engine.render.environment_map import read_environment
+from octasplat.engine.render.images import read_image, write_png
+from octasplat.engine.run_folder import CONFIG, ENVIRONMENT, SCENE, run_viewpoints
+from octasplat.engine.scene import Dataset, load_scene
+from octasplat.engine.surface.cameras import photograph_cameras
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "tools"))
 from lit_surface import in_cycles, in_threejs, view_of

@@ -20,19 +20,19 @@ from jaxtyping import Float32
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from engine.colour import composited, linear_to_srgb
-from engine.config import read_config
-from engine.files import read_mesh, read_scene
-from engine.files.mesh import Mesh
-from engine.gaussians.model import FlatGaussians
-from engine.rays import ImageRays, RayBatch
-from engine.render.images import write_png
-from engine.render.jobs import gaussian_turntable, turntable_cameras
-from engine.render.renderer import background_colour, render_rays
-from engine.run_folder import CONFIG, SCENE, is_run, open_photographs, photographs_folder
-from engine.trace.make import make_tracer
-from engine.trace.meshes import TriangleScene
-from engine.trace.protocol import Tracer, TraceSettings
+from octasplat.engine.colour import composited, linear_to_srgb
+from octasplat.engine.config import read_config
+from octasplat.engine.files import read_mesh, read_scene
+from octasplat.engine.files.mesh import Mesh
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.render.images import write_png
+from octasplat.engine.render.jobs import gaussian_turntable, turntable_cameras
+from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.run_folder import CONFIG, SCENE, is_run, open_photographs, photographs_folder
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.meshes import TriangleScene
+from octasplat.engine.trace.protocol import Tracer, TraceSettings
 
 TURNTABLE = {"frames": 8, "width_px": 480, "height_px": 480}
 OFFSETS = (-0.25, 0.25)

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from engine.errors import ConfigError
-from engine.train.config import TrainConfig, preset, with_materials
-from engine.train.preset_names import PresetName
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.train.config import TrainConfig, preset, with_materials
+from octasplat.engine.train.preset_names import PresetName
 
 
 class ReconstructionConfig(BaseModel):
@@ -58,7 +58,8 @@ def resolve_config(
 
     Args:
         preset_name: ``fast``, ``standard`` or ``paper``.
-        materials: learn materials and the environment too, see :func:`engine.train.config.with_materials`.
+        materials: learn materials and the environment too, see
+            :func:`octasplat.engine.train.config.with_materials`.
         settings: fields of :class:`ReconstructionConfig`; None values are left at their defaults.
         assignments: of any setting, values as JSON: ``rates.mean=2e-4``, which is
             ``train.rates.mean=2e-4``, or ``test_every=4``.

@@ -12,7 +12,7 @@ from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
-from engine.writing import telling_of_room
+from octasplat.engine.writing import telling_of_room
 
 
 @dataclass(frozen=True)

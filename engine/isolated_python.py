@@ -12,8 +12,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-ROOT = Path(__file__).absolute().parent.parent
-"""Folder of the packages: that of a checkout, or where a wheel was unpacked."""
+ROOT = Path(__file__).absolute().parents[2]
+"""Folder that the package is imported from: ``src`` of a checkout, or where a wheel was unpacked."""
 _FLAGS = ("-E", "-P")
 """Neither variables such as PYTHONPATH nor the current folder; a user's own installation stays."""
 

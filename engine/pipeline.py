@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.config import ReconstructionConfig, read_config
-from engine.errors import (
+from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.errors import (
     Cancelled,
     CheckpointError,
     ConfigError,
@@ -24,8 +24,8 @@ from engine.errors import (
     ExportFailed,
     OutputError,
 )
-from engine.evaluate.runs import measure_run
-from engine.events import (
+from octasplat.engine.evaluate.runs import measure_run
+from octasplat.engine.events import (
     JsonLinesListener,
     Listener,
     RunFinished,
@@ -33,16 +33,16 @@ from engine.events import (
     Warned,
     broadcast,
 )
-from engine.files import ExportOptions, check_writable, read_facts
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.files.several import export_files
-from engine.gaussians.materials import reflective_share
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.scene_facts import SceneFacts
-from engine.plain_colours import PlainScene
-from engine.render.environment_map import write_background, write_environment
-from engine.render.jobs import trained_pixel_rad
-from engine.run_folder import (
+from octasplat.engine.files import ExportOptions, check_writable, read_facts
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.files.several import export_files
+from octasplat.engine.gaussians.materials import reflective_share
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.plain_colours import PlainScene
+from octasplat.engine.render.environment_map import write_background, write_environment
+from octasplat.engine.render.jobs import trained_pixel_rad
+from octasplat.engine.run_folder import (
     BACKGROUND,
     CACHE,
     CHECKPOINTS,
@@ -60,28 +60,28 @@ from engine.run_folder import (
     open_photographs,
     run_scene,
 )
-from engine.run_poses import find_missing_poses, free_lenses, place_misfits
-from engine.scene import Dataset, write_held_out
-from engine.scene.near import NearZones, nearest_distances
-from engine.scene.seen import SeenSpace
-from engine.scene.views_file import ViewsRecord, read_views, write_views
-from engine.shading.protocol import ShadingModel
-from engine.stages import StageClock, stage
-from engine.threads import use_threads
-from engine.trace.protocol import Tracer
-from engine.train.batches import BatchSource
-from engine.train.checkpoint import newest_state
-from engine.train.config import TrainConfig, iteration_count
-from engine.train.exposure_changes import with_exposure_decided
-from engine.train.fingerprint import run_fingerprint
-from engine.train.first_state import first_state
-from engine.train.floors import ScaleFloor
-from engine.train.shading import background_of, deferred_of, exposures_of
-from engine.train.shown import shown_share
-from engine.train.trainer import Trainer
-from engine.train.within import make_plan, read_plan, write_plan
-from engine.versions import versions
-from engine.writing import write_json
+from octasplat.engine.run_poses import find_missing_poses, free_lenses, place_misfits
+from octasplat.engine.scene import Dataset, write_held_out
+from octasplat.engine.scene.near import NearZones, nearest_distances
+from octasplat.engine.scene.seen import SeenSpace
+from octasplat.engine.scene.views_file import ViewsRecord, read_views, write_views
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.stages import StageClock, stage
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.batches import BatchSource
+from octasplat.engine.train.checkpoint import newest_state
+from octasplat.engine.train.config import TrainConfig, iteration_count
+from octasplat.engine.train.exposure_changes import with_exposure_decided
+from octasplat.engine.train.fingerprint import run_fingerprint
+from octasplat.engine.train.first_state import first_state
+from octasplat.engine.train.floors import ScaleFloor
+from octasplat.engine.train.shading import background_of, deferred_of, exposures_of
+from octasplat.engine.train.shown import shown_share
+from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.within import make_plan, read_plan, write_plan
+from octasplat.engine.versions import versions
+from octasplat.engine.writing import write_json
 
 LEAST_REFLECTIVE = 0.01
 """Share of the surface that must reflect for materials and the environment to be more than guesses."""
@@ -107,8 +107,9 @@ def reconstruct(
     ``checkpoints/``, ``config.json``, ``held_out.json``, ``views.json`` and ``events.jsonl``.
 
     Args:
-        scene: folder with photographs and a COLMAP model, see :meth:`engine.scene.Dataset.open`; one of
-            photographs alone, if ``config`` says that poses are to be found, which then are in ``poses/``.
+        scene: folder with photographs and a COLMAP model, see :meth:`octasplat.engine.scene.Dataset.open`;
+            one of photographs alone, if ``config`` says that poses are to be found, which then are in
+            ``poses/``.
         output: a folder that does not exist, is empty, or holds the same run if ``resume``.
         config: all settings.
         resume: go on with the run that is in ``output``; only ``exports`` may then be others than the run's.

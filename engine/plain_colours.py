@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from engine.config import read_config
-from engine.errors import OctasplatError
-from engine.gaussians.model import FlatGaussians
-from engine.rays import ImageRays
-from engine.render.jobs import view_shots
-from engine.render.one_colour import colours_for_cameras, with_colours
-from engine.run_folder import CONFIG, run_viewpoints
-from engine.surface.cameras import cameras_around
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.config import read_config
+from octasplat.engine.errors import OctasplatError
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.jobs import view_shots
+from octasplat.engine.render.one_colour import colours_for_cameras, with_colours
+from octasplat.engine.run_folder import CONFIG, run_viewpoints
+from octasplat.engine.surface.cameras import cameras_around
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 SIDE_PX = 160
 MAX_VIEWS = 48

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.config import ReconstructionConfig, read_config
-from engine.errors import ConfigError, DatasetError
-from engine.events import Listener, StageProgress, Warned
-from engine.render.environment_map import read_background
-from engine.scene import Dataset, load_scene
-from engine.scene.near import NearZones
-from engine.scene.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
-from engine.shading.exposure import ExposuresByName
-from engine.shading.learnt_background import LearntBackground
+from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.events import Listener, StageProgress, Warned
+from octasplat.engine.render.environment_map import read_background
+from octasplat.engine.scene import Dataset, load_scene
+from octasplat.engine.scene.near import NearZones
+from octasplat.engine.scene.views_file import SplitViewpoints, ViewsRecord, read_views, scene_viewpoints
+from octasplat.engine.shading.exposure import ExposuresByName
+from octasplat.engine.shading.learnt_background import LearntBackground
 
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
@@ -87,7 +87,7 @@ def run_viewpoints(
 
 
 def run_near_zones(output: Path, share: float) -> NearZones | None:
-    """Where nothing of a run's scene should stand, see :mod:`engine.scene.near`.
+    """Where nothing of a run's scene should stand, see :mod:`octasplat.engine.scene.near`.
 
     Args:
         output: folder of the run.

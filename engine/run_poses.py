@@ -3,19 +3,19 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from engine.config import ReconstructionConfig
-from engine.errors import DatasetError, PosesCrashed
-from engine.events import Listener, StageProgress, Warned
-from engine.poses import Given, adjust_lenses, find_poses, lens_is_in_doubt, place_doubtful
-from engine.poses.find import read_record
-from engine.run_folder import POSES, found_model
-from engine.scene import Dataset
-from engine.scene.colmap import find_model_folder, has_model
-from engine.scene.load import photograph_folder
-from engine.stages import stage
-from engine.train.config import iteration_count
-from engine.train.doubts import ITERATIONS as CHECK_ITERATIONS
-from engine.train.doubts import doubtful_views
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.errors import DatasetError, PosesCrashed
+from octasplat.engine.events import Listener, StageProgress, Warned
+from octasplat.engine.poses import Given, adjust_lenses, find_poses, lens_is_in_doubt, place_doubtful
+from octasplat.engine.poses.find import read_record
+from octasplat.engine.run_folder import POSES, found_model
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.colmap import find_model_folder, has_model
+from octasplat.engine.scene.load import photograph_folder
+from octasplat.engine.stages import stage
+from octasplat.engine.train.config import iteration_count
+from octasplat.engine.train.doubts import ITERATIONS as CHECK_ITERATIONS
+from octasplat.engine.train.doubts import doubtful_views
 
 CHECKED_FROM, CHECKED_FROM_MINUTES = 1000, 10.0
 """Given poses are checked before a training of so many iterations, or of so many minutes."""
@@ -109,8 +109,8 @@ def free_lenses(
 ) -> bool:
     """Give each photograph a principal point of its own if the lens moved; whether it did.
 
-    The model is then the one in the run's ``poses/``; see :mod:`engine.poses.lens_doubt` for what is asked
-    first, which takes no time worth a stage.
+    The model is then the one in the run's ``poses/``; see :mod:`octasplat.engine.poses.lens_doubt` for what
+    is asked first, which takes no time worth a stage.
 
     Raises:
         Cancelled: stopped as asked.

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol, runtime_checkable
 
-from engine.errors import Cancelled
-from engine.events import Event, Listener, StageFinished, StageProgress, StageStarted
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import Event, Listener, StageFinished, StageProgress, StageStarted
 
 DOING = {
     "load": "Loading",
@@ -89,8 +89,8 @@ def counted_stage(name: str, tell: Listener, steps: int = 0) -> Iterator[Count]:
 def stopping(listener: Listener, should_stop: Callable[[], bool], message: str | None = None) -> Listener:
     """``listener``, but stopping the work at its next event if so asked; training does it by itself.
 
-    The returned listener raises :class:`engine.errors.Cancelled` with ``message``, or one that names the
-    stage.
+    The returned listener raises :class:`octasplat.engine.errors.Cancelled` with ``message``, or one that
+    names the stage.
     """
 
     def listen(event: Event) -> None:

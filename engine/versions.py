@@ -2,7 +2,7 @@
 
 import importlib.metadata
 
-import engine
+from octasplat.engine import __version__
 
 PACKAGES = (
     "embreex",  # Embree: which rays meet which boxes
@@ -25,4 +25,4 @@ anew under another, rather than gone on with."""
 
 def versions() -> dict[str, str]:
     """Version of the project and of each package that it computes with, by name."""
-    return {"octasplat": engine.__version__, **{name: importlib.metadata.version(name) for name in PACKAGES}}
+    return {"octasplat": __version__, **{name: importlib.metadata.version(name) for name in PACKAGES}}

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from engine.errors import NoSpaceLeft
+from octasplat.engine.errors import NoSpaceLeft
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Errors of the system that mean a full disk, a spent quota, or a limit on the size of files."""

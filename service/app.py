@@ -8,26 +8,36 @@ from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
 
-import engine
-from engine.errors import OctasplatError
-from service.auditing import AuditTrail
-from service.forwarding import ProxyHeaders
-from service.gate import Gate
-from service.guards import BodyGuard, HostGuard, OriginGuard, SafeHeaders
-from service.guesses import Guesses
-from service.hub import EventHub
-from service.making_room import RoomMaker
-from service.problems import ProblemDocument, add_problem_handlers
-from service.routes import artifacts, audit, datasets, estimates, jobs, journal, metrics, system, webhooks
-from service.settings import ServiceSettings
-from service.state import Service
-from service.web import mount_pages
-from workers.ending import end
-from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.records.database import open_pool
-from workers.records.migrate import migrate
-from workers.records.tokens import add_environment_token, any_token
-from workers.store.opening import open_storage
+from octasplat.engine import __version__
+from octasplat.engine.errors import OctasplatError
+from octasplat.service.auditing import AuditTrail
+from octasplat.service.forwarding import ProxyHeaders
+from octasplat.service.gate import Gate
+from octasplat.service.guards import BodyGuard, HostGuard, OriginGuard, SafeHeaders
+from octasplat.service.guesses import Guesses
+from octasplat.service.hub import EventHub
+from octasplat.service.making_room import RoomMaker
+from octasplat.service.problems import ProblemDocument, add_problem_handlers
+from octasplat.service.routes import (
+    artifacts,
+    audit,
+    datasets,
+    estimates,
+    jobs,
+    journal,
+    metrics,
+    system,
+    webhooks,
+)
+from octasplat.service.settings import ServiceSettings
+from octasplat.service.state import Service
+from octasplat.service.web import mount_pages
+from octasplat.workers.ending import end
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.records.database import open_pool
+from octasplat.workers.records.migrate import migrate
+from octasplat.workers.records.tokens import add_environment_token, any_token
+from octasplat.workers.store.opening import open_storage
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +80,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
 
     app = FastAPI(
         title="octasplat",
-        version=engine.__version__,
+        version=__version__,
         summary="A reconstruction service",
         description=DESCRIPTION,
         lifespan=lifespan,

@@ -8,10 +8,10 @@ from psycopg_pool import PoolTimeout
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from workers.records.audit import add_entry
+from octasplat.workers.records.audit import add_entry
 
 if TYPE_CHECKING:
-    from service.state import Service
+    from octasplat.service.state import Service
 
 logger = logging.getLogger(__name__)
 

@@ -11,13 +11,13 @@ from typing import Annotated, Literal
 from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
-from service.forwarding import passed_through_proxy
-from service.problems import Problem
-from service.state import Service, ServiceDep
-from workers.records.audit import add_entry
-from workers.records.rows import Token
-from workers.records.sessions import find_session
-from workers.records.tokens import LOCAL_OWNER, any_token, find_token, get_token
+from octasplat.service.forwarding import passed_through_proxy
+from octasplat.service.problems import Problem
+from octasplat.service.state import Service, ServiceDep
+from octasplat.workers.records.audit import add_entry
+from octasplat.workers.records.rows import Token
+from octasplat.workers.records.sessions import find_session
+from octasplat.workers.records.tokens import LOCAL_OWNER, any_token, find_token, get_token
 
 Scope = Literal["read", "write", "admin"]
 COOKIE = "octasplat_session"

@@ -7,10 +7,10 @@ from pathlib import PurePosixPath
 from fastapi import Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
-from service.etags import matches
-from service.intake.receive import format_digest
-from service.problems import Problem
-from service.state import Service
+from octasplat.service.etags import matches
+from octasplat.service.intake.receive import format_digest
+from octasplat.service.problems import Problem
+from octasplat.service.state import Service
 
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 _INLINE = ("image/png", "image/jpeg", "application/json", "text/plain", "model/gltf-binary")

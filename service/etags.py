@@ -2,7 +2,7 @@
 
 from fastapi import Request
 
-from service.problems import Problem
+from octasplat.service.problems import Problem
 
 
 def matches(header: str | None, etag: str) -> bool:

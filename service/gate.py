@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from service.problems import Problem
+from octasplat.service.problems import Problem
 
 RETRY_SECONDS = 10
 

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import psycopg
 from psycopg.conninfo import make_conninfo
 
-from workers.records.database import KEEPALIVES
-from workers.records.journal import CHANNEL
+from octasplat.workers.records.database import KEEPALIVES
+from octasplat.workers.records.journal import CHANNEL
 
 logger = logging.getLogger(__name__)
 _RECONNECT_SECONDS = 1.0

@@ -6,9 +6,9 @@ import uuid
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from service.auth import Principal
-from service.problems import Problem
-from workers.records.database import Connection
+from octasplat.service.auth import Principal
+from octasplat.service.problems import Problem
+from octasplat.workers.records.database import Connection
 
 
 def fingerprint(*parts: Any) -> str:

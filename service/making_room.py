@@ -8,13 +8,13 @@ from contextlib import asynccontextmanager
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from service.threads import Threads, in_thread
-from workers.ending import end
-from workers.queue.storing import Note, storing
-from workers.records.database import Pool
-from workers.store.errors import StorageError, StorageFull
-from workers.store.protocol import Storage
-from workers.upkeep.collecting import collect_at_once
+from octasplat.service.threads import Threads, in_thread
+from octasplat.workers.ending import end
+from octasplat.workers.queue.storing import Note, storing
+from octasplat.workers.records.database import Pool
+from octasplat.workers.store.errors import StorageError, StorageFull
+from octasplat.workers.store.protocol import Storage
+from octasplat.workers.upkeep.collecting import collect_at_once
 
 logger = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from prometheus_client import CollectorRegistry, Counter, PlatformCollector, Pro
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from workers.queue.numbers import Numbers
+from octasplat.workers.queue.numbers import Numbers
 
 _TOTALS = {
     "attempts": "Starts of jobs.",

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from fastapi import Query, Request, Response
 
-from service.problems import Problem
+from octasplat.service.problems import Problem
 
 Limit = Annotated[int, Query(ge=1, le=200, description="Most entries of one answer.")]
 Cursor = Annotated[str | None, Query(max_length=2000, description="`next` of the answer before.")]

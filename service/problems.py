@@ -13,12 +13,12 @@ from psycopg_pool import PoolTimeout
 from pydantic import BaseModel, ConfigDict, ValidationError
 from starlette.exceptions import HTTPException
 
-from engine.errors import OctasplatError
-from engine.light.stage_file import stage_complaint, stage_keys
-from service.intake.faults import IntakeRefused
-from workers.records.errors import Conflict, Missing
-from workers.records.quotas import QuotaExceeded
-from workers.store.errors import (
+from octasplat.engine.errors import OctasplatError
+from octasplat.engine.light.stage_file import stage_complaint, stage_keys
+from octasplat.service.intake.faults import IntakeRefused
+from octasplat.workers.records.errors import Conflict, Missing
+from octasplat.workers.records.quotas import QuotaExceeded
+from octasplat.workers.store.errors import (
     BlobMissing,
     DigestMismatch,
     StorageError,
@@ -26,7 +26,7 @@ from workers.store.errors import (
     StorageUnavailable,
     TooLarge,
 )
-from workers.work.places import without_paths
+from octasplat.workers.work.places import without_paths
 
 MEDIA_TYPE = "application/problem+json"
 TYPES = "urn:octasplat:problem:"

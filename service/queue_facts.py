@@ -5,12 +5,12 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from engine.files import exporter_for, exporters
-from service.problems import Problem
-from workers.records.database import Connection
-from workers.records.rows import WorkerRow
-from workers.records.workers import live_workers
-from workers.work.kinds import JobKind
+from octasplat.engine.files import exporter_for, exporters
+from octasplat.service.problems import Problem
+from octasplat.workers.records.database import Connection
+from octasplat.workers.records.rows import WorkerRow
+from octasplat.workers.records.workers import live_workers
+from octasplat.workers.work.kinds import JobKind
 
 
 async def workers_of(connection: Connection, queue: str, stale_seconds: float) -> list[WorkerRow]:

@@ -4,15 +4,15 @@ import ipaddress
 
 from pydantic import Field, IPvAnyNetwork, SecretStr
 
-from engine.errors import ConfigError
-from service.forwarding import Dialect
-from service.intake.dataset import DatasetLimits
-from service.intake.model_check import ModelLimits
-from service.intake.receive import UploadLimits
-from service.intake.spool import Spool
-from workers.records.quotas import Quota
-from workers.settings import PREFIX, WorkerSettings
-from workers.work.kinds.demands import CEILINGS
+from octasplat.engine.errors import ConfigError
+from octasplat.service.forwarding import Dialect
+from octasplat.service.intake.dataset import DatasetLimits
+from octasplat.service.intake.model_check import ModelLimits
+from octasplat.service.intake.receive import UploadLimits
+from octasplat.service.intake.spool import Spool
+from octasplat.workers.records.quotas import Quota
+from octasplat.workers.settings import PREFIX, WorkerSettings
+from octasplat.workers.work.kinds.demands import CEILINGS
 
 DEFAULT_PORT = 8642
 
@@ -100,7 +100,7 @@ class ServiceSettings(WorkerSettings):
 
     @property
     def ceilings(self) -> dict[str, int]:
-        """By the names of :data:`workers.work.kinds.demands.CEILINGS`."""
+        """By the names of :data:`octasplat.workers.work.kinds.demands.CEILINGS`."""
         found = {name: getattr(self, f"max_{name}") for name in CEILINGS}
         return found if self.max_workspace_bytes else {**found, "workspace_bytes": 1 << 62}
 

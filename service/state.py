@@ -7,16 +7,16 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from service.gate import Gate
-from service.guesses import Guesses
-from service.hub import EventHub
-from service.intake.spool import Spool
-from service.making_room import RoomMaker
-from service.metrics import Metrics
-from service.settings import ServiceSettings
-from workers.queue.port import Slips
-from workers.records.database import Pool
-from workers.store.protocol import Storage
+from octasplat.service.gate import Gate
+from octasplat.service.guesses import Guesses
+from octasplat.service.hub import EventHub
+from octasplat.service.intake.spool import Spool
+from octasplat.service.making_room import RoomMaker
+from octasplat.service.metrics import Metrics
+from octasplat.service.settings import ServiceSettings
+from octasplat.workers.queue.port import Slips
+from octasplat.workers.records.database import Pool
+from octasplat.workers.store.protocol import Storage
 
 
 @dataclass

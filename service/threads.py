@@ -19,7 +19,7 @@ class Threads(Enum):
     UNPACKING = auto()
     """Reading archives that have come."""
     CHECKS = auto()
-    """Checking datasets; how many at once is bounded further, see :class:`service.gate.Gate`."""
+    """Checking datasets; how many at once is bounded further, see :class:`octasplat.service.gate.Gate`."""
     DOWNLOADS = auto()
     """Looking up what is read."""
     LOOKS = auto()

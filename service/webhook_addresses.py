@@ -1,8 +1,8 @@
 """Addresses of webhooks, refused before anything is stored."""
 
-from service.problems import Problem
-from service.state import Service
-from workers.upkeep.webhooks.addresses import AddressRefused, check_url
+from octasplat.service.problems import Problem
+from octasplat.service.state import Service
+from octasplat.workers.upkeep.webhooks.addresses import AddressRefused, check_url
 
 
 def check_address(service: Service, url: str, pointer: str = "#/url") -> None:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import jaxtyping
 import numpy as np
 import pytest
+
 from longest_first import LONGEST_FIRST
 
 if TYPE_CHECKING:
-    from engine.gaussians.model import FlatGaussians
+    from octasplat.engine.gaussians.model import FlatGaussians
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before OpenMP is loaded, as the command line does
 
@@ -25,7 +26,11 @@ def checked_modules() -> list[str]:
     importing anything here would be too early.
     """
     files = (path.relative_to(ROOT).with_suffix("") for path in sorted((ROOT / "engine").rglob("*.py")))
-    return [".".join(file.parts) for file in files if not file.name.startswith(("__init__", "kernels"))]
+    return [
+        ".".join(("octasplat", *file.parts))
+        for file in files
+        if not file.name.startswith(("__init__", "kernels"))
+    ]
 
 
 jaxtyping.install_import_hook(checked_modules(), "shape_checks.check")
@@ -54,7 +59,7 @@ def scenes_root() -> Path:
 @pytest.fixture
 def make_gaussians() -> "Callable[..., FlatGaussians]":
     """Makes random flat Gaussians."""
-    from engine.gaussians.model import FlatGaussians  # after the hook
+    from octasplat.engine.gaussians.model import FlatGaussians  # after the hook
 
     def make(count: int, sh_degree: int = 0, seed: int = 0) -> FlatGaussians:
         random = np.random.default_rng(seed)

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from engine.scene.generated import GeneratedSceneConfig
-from engine.scene.generated.cameras import lens, views
-from engine.scene.generated.dataset import lit_scene
-from engine.scene.generated.files import write_photograph
-from engine.scene.generated.photographs import Photographer
+from octasplat.engine.scene.generated import GeneratedSceneConfig
+from octasplat.engine.scene.generated.cameras import lens, views
+from octasplat.engine.scene.generated.dataset import lit_scene
+from octasplat.engine.scene.generated.files import write_photograph
+from octasplat.engine.scene.generated.photographs import Photographer
 
 
 def write_neighbours(folder: Path, count: int) -> dict[str, Float64[np.ndarray, "3"]]:

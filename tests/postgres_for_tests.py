@@ -13,8 +13,8 @@ import psycopg
 import pytest
 from psycopg.conninfo import make_conninfo
 
-from workers.postgres.embedded import EmbeddedPostgres
-from workers.records.migrate import migrate
+from octasplat.workers.postgres.embedded import EmbeddedPostgres
+from octasplat.workers.records.migrate import migrate
 
 
 @pytest.fixture(scope="session")

@@ -14,24 +14,24 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial import cKDTree
 
-from engine.edit.affine import rotation, transform, translation
-from engine.edit.cleaning import CleanOptions, clean
-from engine.edit.deform import deform
-from engine.edit.recovery import recover_edit
-from engine.edit.selection import inside_box, merge, with_sh_degree
-from engine.files import export_losses, export_scene, exporters, importers, read_mesh, read_scene
-from engine.files.encodings import half_turned
-from engine.gaussians.channels import Channels
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.gaussians.octagon import SIDES, octagon_triangles
-from engine.gaussians.order import morton_order
-from engine.train.checkpoint import load_best, load_checkpoint, save_best, save_checkpoint
-from engine.train.config import McmcConfig, PaperConfig
-from engine.train.densify import Mcmc, Paper
-from engine.train.optimiser import Adam
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
-from workers.cli.main import cli
+from octasplat.engine.edit.affine import rotation, transform, translation
+from octasplat.engine.edit.cleaning import CleanOptions, clean
+from octasplat.engine.edit.deform import deform
+from octasplat.engine.edit.recovery import recover_edit
+from octasplat.engine.edit.selection import inside_box, merge, with_sh_degree
+from octasplat.engine.files import export_losses, export_scene, exporters, importers, read_mesh, read_scene
+from octasplat.engine.files.encodings import half_turned
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
+from octasplat.engine.gaussians.order import morton_order
+from octasplat.engine.train.checkpoint import load_best, load_checkpoint, save_best, save_checkpoint
+from octasplat.engine.train.config import McmcConfig, PaperConfig
+from octasplat.engine.train.densify import Mcmc, Paper
+from octasplat.engine.train.optimiser import Adam
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
+from octasplat.workers.cli.main import cli
 
 sys.path.append(str(Path(__file__).parent / "train"))
 from flat_world import FlatWorld, small_config

@@ -13,11 +13,11 @@ from pathlib import Path
 import numba
 import pytest
 
-from engine.config import ReconstructionConfig, resolve_config
-from engine.errors import Cancelled, CheckpointError, ConfigError, OutputError, TrainingFailure
-from engine.events import CheckpointWritten, Event
-from engine.pipeline import reconstruct
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.config import ReconstructionConfig, resolve_config
+from octasplat.engine.errors import Cancelled, CheckpointError, ConfigError, OutputError, TrainingFailure
+from octasplat.engine.events import CheckpointWritten, Event
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 pytestmark = pytest.mark.heavy
 
@@ -25,8 +25,8 @@ ITERATIONS, EVERY = 300, 25
 RUN = """
 import sys
 from pathlib import Path
-from engine.config import ReconstructionConfig
-from engine.pipeline import reconstruct
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.pipeline import reconstruct
 scene, output, config, threads = sys.argv[1:]
 reconstruct(
     Path(scene),

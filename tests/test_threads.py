@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.scene.images import resize
-from engine.threads import one_torch_thread, use_threads
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.scene.images import resize
+from octasplat.engine.threads import one_torch_thread, use_threads
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +63,7 @@ def test_a_run_on_one_thread_uses_one(tmp_path: Path) -> None:
         scene, GeneratedSceneConfig(views=8, width_px=64, height_px=48, samples_per_side=1, points=500)
     )
     command = [
-        sys.executable, "-m", "workers", "reconstruct", str(scene), "-o", str(tmp_path / "out"), "--quiet",
+        sys.executable, "-m", "octasplat", "reconstruct", str(scene), "-o", str(tmp_path / "out"), "--quiet",
         "--threads", "1", "--max-side", "48", "--iterations", "100", "--rays", "4096",
     ]  # fmt: skip
     began = time.perf_counter()
@@ -78,7 +78,7 @@ def test_nothing_goes_on_working_after_hierarchies_were_built_on_one_thread() ->
     script = """
 import time
 import numpy as np
-from engine.trace.embree_library import Device, MeshScene
+from octasplat.engine.trace.embree_library import Device, MeshScene
 corners = np.random.default_rng(0).normal(size=(3000, 3)).astype(np.float32)
 faces = np.arange(3000, dtype=np.uint32).reshape(-1, 3)
 scenes = [MeshScene(Device(1), corners, faces) for _ in range(4)]

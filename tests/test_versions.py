@@ -5,7 +5,7 @@ import importlib.metadata
 import sys
 from pathlib import Path
 
-from engine.versions import versions
+from octasplat.engine.versions import versions
 
 ROOT = Path(__file__).resolve().parent.parent
 HARMLESS = {"pydantic", "jaxtyping", "Jinja2", "pyoidn"}
@@ -14,7 +14,7 @@ HARMLESS = {"pydantic", "jaxtyping", "Jinja2", "pyoidn"}
 
 def imported_names(module: str) -> set[str]:
     """Full names of all modules that a module of the engine imports anywhere in its text."""
-    path = ROOT / Path(*module.split("."))
+    path = ROOT / "src" / Path(*module.split("."))
     source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
     names: set[str] = set()
     for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
@@ -26,7 +26,7 @@ def imported_names(module: str) -> set[str]:
 
 
 def is_module(name: str) -> bool:
-    path = ROOT / Path(*name.split("."))
+    path = ROOT / "src" / Path(*name.split("."))
     return path.is_dir() or path.with_suffix(".py").is_file()
 
 
@@ -39,16 +39,16 @@ def packages_behind(module: str) -> set[str]:
             continue
         seen.add(name)
         for imported in imported_names(name):
-            if imported.startswith("engine."):
+            if imported.startswith("octasplat.engine."):
                 waiting += [imported] if is_module(imported) else []
             else:
                 outside.add(imported.partition(".")[0])
-    return outside - set(sys.stdlib_module_names) - {"engine"}
+    return outside - set(sys.stdlib_module_names) - {"octasplat"}
 
 
 def test_every_package_behind_a_reconstruction_is_counted() -> None:
     owners = importlib.metadata.packages_distributions()
-    behind = {owners[name][0] for name in packages_behind("engine.pipeline")} - HARMLESS
+    behind = {owners[name][0] for name in packages_behind("octasplat.engine.pipeline")} - HARMLESS
     counted = versions()
     assert behind >= {"torch", "numba", "pycolmap"}
     assert not behind - set(counted)

@@ -4,7 +4,7 @@ import contextlib
 import os
 import signal
 
-from workers.isolation.kernel import PR_SET_PDEATHSIG, prctl
+from octasplat.workers.isolation.kernel import PR_SET_PDEATHSIG, prctl
 
 PARENT = "OCTASPLAT_PARENT_PID"
 

@@ -11,8 +11,8 @@ import platformdirs
 from pydantic import AliasChoices, Field, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from engine.errors import ConfigError
-from workers.postgres.embedded import EmbeddedPostgres
+from octasplat.engine.errors import ConfigError
+from octasplat.workers.postgres.embedded import EmbeddedPostgres
 
 PREFIX = "OCTASPLAT_"
 ADDRESS_FILE = "serve.json"
@@ -126,7 +126,7 @@ class WorkerSettings(BaseSettings):
 
     @property
     def storage_address(self) -> str:
-        """What :func:`workers.store.opening.open_storage` takes."""
+        """What :func:`octasplat.workers.store.opening.open_storage` takes."""
         return self.storage or str(self.data.absolute() / "store")
 
     @property

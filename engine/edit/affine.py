@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64
 
-from engine.edit.apply import apply_legs
-from engine.edit.local_maps import legs_world
-from engine.errors import ConfigError
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.edit.apply import apply_legs
+from octasplat.engine.edit.local_maps import legs_world
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.model import FlatGaussians
 
 AXES: dict[str, Float64[np.ndarray, "3"]] = {
     sign + name: (1.0 if not sign else -1.0) * np.eye(3)[k]

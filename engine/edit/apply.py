@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from engine.edit.local_maps import frames_from_skewed_legs, has_area, surface_turns
-from engine.gaussians.harmonics import rotate_sh
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.edit.local_maps import frames_from_skewed_legs, has_area, surface_turns
+from octasplat.engine.gaussians.harmonics import rotate_sh
+from octasplat.engine.gaussians.model import FlatGaussians
 
 ROWS_AT_ONCE = 1 << 15
 """Rows of a block: its temporary arrays stay in the processor's cache, and small against the scene."""

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from engine.files import Mesh
-from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
+from octasplat.engine.files import Mesh
+from octasplat.engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
 
 Axes = Literal["x0", "x90", "x180", "x270"]
 """Angle in degrees by which a file's coordinates must be turned about x to be the scene's."""

@@ -14,10 +14,10 @@ from pydantic import (
     model_validator,
 )
 
-from engine.colour import srgb_to_linear
-from engine.edit.where import MAX_LENGTH, check_where
-from engine.errors import ConfigError
-from engine.gaussians.materials import MATERIAL_WIDTHS
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.edit.where import MAX_LENGTH, check_where
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
 
 _HEX = re.compile(r"#([0-9a-fA-F]{6})")
 

@@ -9,8 +9,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from engine.gaussians.model import FlatGaussians
-from engine.scene.near import NearZones
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.scene.near import NearZones
 
 WIDEST_LINK = 8.0
 """A Gaussian reaches no further than this many times the distance to its nearest neighbours, so that one huge

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from engine.edit.apply import apply_legs_to, blocks
-from engine.edit.local_maps import has_area, legs_world
-from engine.edit.octagon_fit import fit_octagons
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import SIDES, corner_directions
+from octasplat.engine.edit.apply import apply_legs_to, blocks
+from octasplat.engine.edit.local_maps import has_area, legs_world
+from octasplat.engine.edit.octagon_fit import fit_octagons
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import SIDES, corner_directions
 
 CUBATURE_RADIUS = float(np.sqrt(2.0))
 """Eight corners at this radius have the mean and covariance of the Gaussian itself, so that the affine map

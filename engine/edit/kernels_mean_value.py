@@ -13,7 +13,7 @@ from numba import njit, prange, types
 from numba.extending import intrinsic
 from numpy.polynomial import Chebyshev, Polynomial
 
-from engine.trace.cpu.kernels_simd import DOUBLE8, LANES, Lanes, broadcast
+from octasplat.engine.trace.cpu.kernels_simd import DOUBLE8, LANES, Lanes, broadcast
 
 GROUPS_AT_ONCE = 16
 FLAT = 1e-9

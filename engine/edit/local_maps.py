@@ -7,8 +7,8 @@ whose derivative is F takes them to F legs, which in general are neither orthogo
 import numpy as np
 from jaxtyping import Float, Float64
 
-from engine.gaussians.frames import quaternions, rotation_matrices
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.frames import quaternions, rotation_matrices
+from octasplat.engine.gaussians.model import FlatGaussians
 
 LEAST_RATIO = 1e-12
 """Legs whose smaller extent is less than this share of the larger one count as having no area."""

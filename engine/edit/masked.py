@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from engine.config import read_config
-from engine.errors import ConfigError, DatasetError
-from engine.gaussians.model import FlatGaussians
-from engine.rays import ImageRays, RayBatch
-from engine.render.images import read_image
-from engine.render.jobs import view_shots
-from engine.render.renderer import tile_order
-from engine.run_folder import CONFIG, is_run, run_viewpoints
-from engine.scene.model import Viewpoints
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceGradients, Tracer
+from octasplat.engine.config import read_config
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.render.images import read_image
+from octasplat.engine.render.jobs import view_shots
+from octasplat.engine.render.renderer import tile_order
+from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
+from octasplat.engine.scene.model import Viewpoints
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceGradients, Tracer
 
 WHITE = 0.5
 

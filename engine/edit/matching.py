@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from engine.edit.apply import blocks
-from engine.edit.octagon_fit import LEAST_CORNERS
-from engine.errors import SceneFileError
-from engine.files import Mesh
-from engine.gaussians.octagon import SIDES, corner_directions
+from octasplat.engine.edit.apply import blocks
+from octasplat.engine.edit.octagon_fit import LEAST_CORNERS
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import Mesh
+from octasplat.engine.gaussians.octagon import SIDES, corner_directions
 
 ID_TOLERANCE = 1e-3
 """Numbers that an editor blended between vertices are further than this from whole ones."""

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from engine.colour import linear_to_srgb
-from engine.edit.choices import MaterialChange
-from engine.gaussians.channels import stacked
-from engine.gaussians.harmonics import sh_basis, spread_directions
-from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
-from engine.gaussians.model import FlatGaussians
-from engine.shading.environment_levels import LightLevels
-from engine.shading.split_sum import Surface, shade
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.edit.choices import MaterialChange
+from octasplat.engine.gaussians.channels import stacked
+from octasplat.engine.gaussians.harmonics import sh_basis, spread_directions
+from octasplat.engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.shading.environment_levels import LightLevels
+from octasplat.engine.shading.split_sum import Surface, shade
 
 _AT_ONCE = 1 << 14
 _DIRECTIONS = 64

@@ -9,19 +9,29 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from engine.config import read_config
-from engine.edit.choices import MaterialChange, Selection
-from engine.edit.material_change import with_harmonics_following, with_materials
-from engine.errors import ConfigError, OutputError
-from engine.files import read_facts
-from engine.files.gaussian_ply import write_gaussian_ply
-from engine.gaussians.materials import require_materials
-from engine.gaussians.model import FlatGaussians
-from engine.render.environment_map import read_environment
-from engine.run_folder import CONFIG, ENVIRONMENT, EVENTS, HELD_OUT, POSES, SCENE, TRAINING, VIEWS, is_run
-from engine.shading.environment_frame import environment_frame
-from engine.shading.learnt_light import LearntLight
-from engine.writing import telling_of_room, write_json
+from octasplat.engine.config import read_config
+from octasplat.engine.edit.choices import MaterialChange, Selection
+from octasplat.engine.edit.material_change import with_harmonics_following, with_materials
+from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.files import read_facts
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.gaussians.materials import require_materials
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.environment_map import read_environment
+from octasplat.engine.run_folder import (
+    CONFIG,
+    ENVIRONMENT,
+    EVENTS,
+    HELD_OUT,
+    POSES,
+    SCENE,
+    TRAINING,
+    VIEWS,
+    is_run,
+)
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.shading.learnt_light import LearntLight
+from octasplat.engine.writing import telling_of_room, write_json
 
 EDITS = "edits.json"
 """What was changed since the training, first to last."""

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from engine.edit.local_maps import legs_world
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import SIDES, corner_directions
+from octasplat.engine.edit.local_maps import legs_world
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import SIDES, corner_directions
 
 LEAST_CORNERS = 3
 """An affine map of a plane is fixed by three points; no three corners of an octagon lie on a line."""

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
-from engine.edit.apply import ROWS_AT_ONCE, blocks
-from engine.edit.kernels_mean_value import mean_value_weights, winding_numbers
-from engine.edit.kernels_proxy import blend, triangle_weights
-from engine.edit.mirroring import was_mirrored
-from engine.errors import SceneFileError
+from octasplat.engine.edit.apply import ROWS_AT_ONCE, blocks
+from octasplat.engine.edit.kernels_mean_value import mean_value_weights, winding_numbers
+from octasplat.engine.edit.kernels_proxy import blend, triangle_weights
+from octasplat.engine.edit.mirroring import was_mirrored
+from octasplat.engine.errors import SceneFileError
 
 Method = Literal["nearest", "mvc"]
 CANDIDATES = 24

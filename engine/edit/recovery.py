@@ -8,17 +8,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from pydantic import BaseModel, ConfigDict, Field
 
-from engine.edit.apply import apply_legs_to, blocks
-from engine.edit.axes import TURNS, Axes, detect_axes, infer_q, usual_axes
-from engine.edit.local_maps import has_area, legs_world, solid_derivatives
-from engine.edit.matching import Octagons, match_octagons
-from engine.edit.octagon_fit import LEAST_CORNERS, fit_octagons
-from engine.edit.surroundings import carry, flipped_against, neighbour_turns
-from engine.errors import SceneFileError
-from engine.files import Mesh
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.gaussians.octagon import (
+from octasplat.engine.edit.apply import apply_legs_to, blocks
+from octasplat.engine.edit.axes import TURNS, Axes, detect_axes, infer_q, usual_axes
+from octasplat.engine.edit.local_maps import has_area, legs_world, solid_derivatives
+from octasplat.engine.edit.matching import Octagons, match_octagons
+from octasplat.engine.edit.octagon_fit import LEAST_CORNERS, fit_octagons
+from octasplat.engine.edit.surroundings import carry, flipped_against, neighbour_turns
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import Mesh
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.gaussians.octagon import (
     CHI2_2_99,
     coordinate_rounding,
     frames_from_octagons,

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from engine.edit.axes import infer_q
-from engine.edit.choices import Selection
-from engine.edit.matching import match_octagons
-from engine.edit.where import where
-from engine.errors import ConfigError
-from engine.files import Mesh
-from engine.gaussians.channels import common_widths
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.gaussians.octagon import CHI2_2_99, octagon_radii
+from octasplat.engine.edit.axes import infer_q
+from octasplat.engine.edit.choices import Selection
+from octasplat.engine.edit.matching import match_octagons
+from octasplat.engine.edit.where import where
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.files import Mesh
+from octasplat.engine.gaussians.channels import common_widths
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.gaussians.octagon import CHI2_2_99, octagon_radii
 
 
 def chosen_by(gaussians: FlatGaussians, selection: Selection) -> Bool[np.ndarray, " n"]:
@@ -99,7 +99,7 @@ def merge(scenes: Sequence[FlatGaussians], sh_degree: int | None = None) -> Flat
     """All Gaussians of ``scenes``, in order, with harmonics of one degree.
 
     The result has the channels of all scenes; Gaussians of a scene without one have 0 there
-    (:data:`engine.gaussians.channels.FILL`).
+    (:data:`octasplat.engine.gaussians.channels.FILL`).
 
     Args:
         scenes: at least one.

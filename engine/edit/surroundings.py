@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import KDTree
 
-from engine.edit.apply import blocks
+from octasplat.engine.edit.apply import blocks
 
 NEIGHBOURS = 12
 LEAST_AGREEMENT = 0.8

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from engine.errors import ConfigError
-from engine.gaussians.channels import column_names
-from engine.gaussians.materials import ALBEDO
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.channels import column_names
+from octasplat.engine.gaussians.materials import ALBEDO
+from octasplat.engine.gaussians.model import FlatGaussians
 
 MAX_LENGTH = 1000
 _COMPARISONS: Mapping[type[ast.cmpop], Callable[[Any, Any], Any]] = {

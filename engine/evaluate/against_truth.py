@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from engine.colour import srgb_to_linear
-from engine.evaluate.truth import Truth, ViewTruth
-from engine.evaluate.truth_metrics import (
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.evaluate.truth import Truth, ViewTruth
+from octasplat.engine.evaluate.truth_metrics import (
     TRUTH_DEFINITIONS,
     best_scales,
     depth_along_axis,
@@ -19,14 +19,14 @@ from engine.evaluate.truth_metrics import (
     normal_errors_degrees,
     pooled_psnr,
 )
-from engine.events import Listener, StageProgress, Warned
-from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
-from engine.light.environment import EnvironmentMap, environment_frame
-from engine.light.relighting import Relighter, RelitImage
-from engine.rays import ImageRays
-from engine.render.environment_map import read_environment
-from engine.render.renderer import RenderedImage
-from engine.scene import Dataset
+from octasplat.engine.events import Listener, StageProgress, Warned
+from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
+from octasplat.engine.light.environment import EnvironmentMap, environment_frame
+from octasplat.engine.light.relighting import Relighter, RelitImage
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.environment_map import read_environment
+from octasplat.engine.render.renderer import RenderedImage
+from octasplat.engine.scene import Dataset
 
 COVERED = 0.5
 _DECIMALS = 6

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from engine.render.images import resized, write_webp
+from octasplat.engine.render.images import resized, write_webp
 
 WORST = 12
 BEST = 4

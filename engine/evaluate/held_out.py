@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numba
 
-from engine.colour import composited
-from engine.evaluate.against_truth import TruthMeasures
-from engine.evaluate.gallery import ViewImages, WorstAndBest
-from engine.evaluate.layers import shown_environment, shown_layers
-from engine.evaluate.report import write_report
-from engine.evaluate.truth import Truth
-from engine.evaluate.views import (
+from octasplat.engine.colour import composited
+from octasplat.engine.evaluate.against_truth import TruthMeasures
+from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBest
+from octasplat.engine.evaluate.layers import shown_environment, shown_layers
+from octasplat.engine.evaluate.report import write_report
+from octasplat.engine.evaluate.truth import Truth
+from octasplat.engine.evaluate.views import (
     MeasuredView,
     RenderedView,
     ViewMetrics,
@@ -21,21 +21,21 @@ from engine.evaluate.views import (
     measure_view,
     summarise,
 )
-from engine.events import Listener, StageProgress, read_events
-from engine.gaussians.materials import ALBEDO
-from engine.gaussians.model import FlatGaussians
-from engine.light.environment import EnvironmentMap
-from engine.light.relighting import Relighter
-from engine.render.images import write_png
-from engine.render.names import render_names
-from engine.render.oversampling import render_filtered
-from engine.render.renderer import background_colour, front_normals
-from engine.scene import Dataset
-from engine.shading.protocol import ShadingModel
-from engine.trace.make import make_tracer
-from engine.trace.protocol import Tracer, TraceSettings
-from engine.train.shading import background_of, exposed_as
-from engine.writing import write_json
+from octasplat.engine.events import Listener, StageProgress, read_events
+from octasplat.engine.gaussians.materials import ALBEDO
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.environment import EnvironmentMap
+from octasplat.engine.light.relighting import Relighter
+from octasplat.engine.render.images import write_png
+from octasplat.engine.render.names import render_names
+from octasplat.engine.render.oversampling import render_filtered
+from octasplat.engine.render.renderer import background_colour, front_normals
+from octasplat.engine.scene import Dataset
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import Tracer, TraceSettings
+from octasplat.engine.train.shading import background_of, exposed_as
+from octasplat.engine.writing import write_json
 
 SIDE = 2
 """So many rays across a pixel, and as many down, where a shading model shades; else one at its centre."""

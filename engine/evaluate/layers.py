@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float32
 
-from engine.colour import linear_to_srgb
-from engine.render.renderer import RenderedImage
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.render.renderer import RenderedImage
 
 COVERED = 0.5
 FAR_GREY = 0.15

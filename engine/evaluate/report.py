@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float32
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from engine.errors import OutputError
-from engine.evaluate.curves import duration, training_charts
-from engine.evaluate.gallery import (
+from octasplat.engine.errors import OutputError
+from octasplat.engine.evaluate.curves import duration, training_charts
+from octasplat.engine.evaluate.gallery import (
     BEST,
     MAGMA,
     MAX_SIDE_PX,
@@ -26,9 +26,9 @@ from engine.evaluate.gallery import (
     embedded_names,
     magma,
 )
-from engine.evaluate.layers import LABELS, shown_environment
-from engine.render.images import resized
-from engine.writing import write_text
+from octasplat.engine.evaluate.layers import LABELS, shown_environment
+from octasplat.engine.render.images import resized
+from octasplat.engine.writing import write_text
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def write_report(
         OutputError: The page cannot be written.
     """
     environment = Environment(
-        loader=PackageLoader("engine.evaluate", package_path=""),
+        loader=PackageLoader("octasplat.engine.evaluate", package_path=""),
         autoescape=select_autoescape(["html"]),
         undefined=StrictUndefined,
         trim_blocks=True,

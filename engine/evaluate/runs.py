@@ -6,21 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.config import ReconstructionConfig, read_config
-from engine.errors import ConfigError, OutputError
-from engine.evaluate.held_out import evaluate_held_out
-from engine.evaluate.scales import measure_scales
-from engine.evaluate.truth import Truth, find_truth
-from engine.events import Listener, StageProgress, Warned
-from engine.files import read_facts
-from engine.files.gaussian_ply import read_gaussian_ply
-from engine.gaussians.materials import has_materials
-from engine.light.environment import EnvironmentMap, environment_frame
-from engine.light.split_sum_relighting import SplitSumRelighter
-from engine.poses.find import read_record
-from engine.render.environment_map import read_background, read_environment
-from engine.render.renderer import background_colour
-from engine.run_folder import (
+from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.evaluate.held_out import evaluate_held_out
+from octasplat.engine.evaluate.scales import measure_scales
+from octasplat.engine.evaluate.truth import Truth, find_truth
+from octasplat.engine.events import Listener, StageProgress, Warned
+from octasplat.engine.files import read_facts
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.gaussians.materials import has_materials
+from octasplat.engine.light.environment import EnvironmentMap, environment_frame
+from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
+from octasplat.engine.poses.find import read_record
+from octasplat.engine.render.environment_map import read_background, read_environment
+from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.run_folder import (
     BACKGROUND,
     CACHE,
     CONFIG,
@@ -35,16 +35,16 @@ from engine.run_folder import (
     photographs_folder,
     run_exposures,
 )
-from engine.scene import Dataset
-from engine.scene.views_file import read_views, write_views
-from engine.shading.protocol import ShadingModel
-from engine.stages import counted_stage, stage
-from engine.threads import use_threads
-from engine.trace.make import make_tracer
-from engine.train.config import TrainConfig
-from engine.train.shading import background_of, deferred_of, exposures_of, make_shading
-from engine.versions import versions
-from engine.writing import write_json
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.views_file import read_views, write_views
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.stages import counted_stage, stage
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.shading import background_of, deferred_of, exposures_of, make_shading
+from octasplat.engine.versions import versions
+from octasplat.engine.writing import write_json
 
 SCALES = "scales.json"
 GUESSED = "held-out views are shown as exposed as their brightness and the views beside them suggest"
@@ -102,7 +102,9 @@ def evaluate_scales(
     threads: int = 0,
     listener: Listener = lambda _event: None,
 ) -> dict[str, dict[str, float]]:
-    """Measure a finished run at smaller sizes, see :mod:`engine.evaluate.scales`; writes ``scales.json``.
+    """Measure a finished run at smaller sizes and write ``scales.json``.
+
+    See :mod:`octasplat.engine.evaluate.scales`.
 
     Args:
         output: folder of the run.

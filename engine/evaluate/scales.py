@@ -9,15 +9,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from engine.colour import composited
-from engine.evaluate.metrics import rounded_to_8_bits
-from engine.psnr import psnr
-from engine.rays import ImageRays
-from engine.render.oversampling import render_averaged
-from engine.scene import Dataset
-from engine.shading.protocol import ShadingModel
-from engine.trace.protocol import Tracer
-from engine.train.shading import exposed_as
+from octasplat.engine.colour import composited
+from octasplat.engine.evaluate.metrics import rounded_to_8_bits
+from octasplat.engine.psnr import psnr
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.oversampling import render_averaged
+from octasplat.engine.scene import Dataset
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.shading import exposed_as
 
 
 def measure_scales(

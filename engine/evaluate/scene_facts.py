@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.rows import row_arrays
-from engine.rays import ImageRays
-from engine.render.framing import SeenBounds, seen_bounds, solid_middle
-from engine.render.renderer import tile_order
-from engine.trace.protocol import Tracer
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import row_arrays
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.framing import SeenBounds, seen_bounds, solid_middle
+from octasplat.engine.render.renderer import tile_order
+from octasplat.engine.trace.protocol import Tracer
 
 OPACITY_EDGES = (0.0, 0.01, 0.1, 0.3, 0.6, 0.9, 1.0)
 QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)

@@ -13,9 +13,9 @@ import OpenImageIO as oiio
 from jaxtyping import Bool, Float32, Float64
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from engine.colour import srgb_to_linear
-from engine.errors import ConfigError, DatasetError
-from engine.render.images import read_image, resized
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.render.images import read_image, resized
 
 TRUTH = "truth.json"
 _FORMULA = re.compile(r"\bv(?:/(\d+(?:\.\d+)?))?(?:\*(\d+(?:\.\d+)?))?([+-]\d+(?:\.\d+)?)?(?![\w*/+])")

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 from scipy.optimize import minimize_scalar
 
-from engine.colour import linear_to_srgb
-from engine.light.environment import EnvironmentMap
-from engine.light.lights import light_arrays, look_up_environment
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.light.environment import EnvironmentMap
+from octasplat.engine.light.lights import light_arrays, look_up_environment
 
 _OCTAVES = 8.0
 """Scales are looked for between 2 to the power of minus and plus this."""

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from engine.errors import DatasetError
-from engine.evaluate.metrics import (
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.evaluate.metrics import (
     DEFINITIONS,
     filled_outside,
     flip,
@@ -18,7 +18,7 @@ from engine.evaluate.metrics import (
     rounded_to_8_bits,
     ssim_both,
 )
-from engine.psnr import colour_corrected, psnr
+from octasplat.engine.psnr import colour_corrected, psnr
 
 FOREGROUND_ALPHA = 0.5
 BOOTSTRAP_DRAWS = 2000

@@ -3,12 +3,12 @@
 The rest of the engine knows the functions that are named here, and no format.
 """
 
-from engine.files.channel_columns import ChannelChoice
-from engine.files.exporting import check_surface_path, export_losses, export_scene, write_surface
-from engine.files.mesh import Mesh
-from engine.files.options import ExportOptions
-from engine.files.reading import read_facts, read_mesh, read_scene
-from engine.files.registry import (
+from octasplat.engine.files.channel_columns import ChannelChoice
+from octasplat.engine.files.exporting import check_surface_path, export_losses, export_scene, write_surface
+from octasplat.engine.files.mesh import Mesh
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.reading import read_facts, read_mesh, read_scene
+from octasplat.engine.files.registry import (
     Exporter,
     Importer,
     MeshReader,
@@ -21,7 +21,7 @@ from engine.files.registry import (
     register,
     writable_formats,
 )
-from engine.gaussians.flattening import ImportReport
+from octasplat.engine.gaussians.flattening import ImportReport
 
 __all__ = [
     "ChannelChoice",

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-from engine.errors import SceneFileError
-from engine.gaussians.channels import grouped, is_usable
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.gaussians.channels import grouped, is_usable
 
 ChannelChoice = Literal["own", "all"] | tuple[str, ...]
 """``own``: those that the file says are channels, as ours do; ``all``: every column of which nothing else is

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int, UInt32
 
-from engine.errors import SceneFileError
-from engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes, sh0_from_rgb
-from engine.files.ply_container import PlyHeader, columns, read_ply, read_ply_header
-from engine.files.registry import Importer, register
-from engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes, sh0_from_rgb
+from octasplat.engine.files.ply_container import PlyHeader, columns, read_ply, read_ply_header
+from octasplat.engine.files.registry import Importer, register
+from octasplat.engine.gaussians.flattening import GaussianCloud
 
 PATTERNS = ("*.compressed.ply",)
 CHUNK = 256

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, UInt32
 
-from engine.files.compressed_ply import CHUNK, PATTERNS, SH_RANGE
-from engine.files.encodings import SQRT_HALF, smallest_three
-from engine.files.options import ExportOptions
-from engine.files.ply_container import PlyWriteElement, write_ply
-from engine.files.registry import Exporter, register
-from engine.files.selection import selected
-from engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
+from octasplat.engine.files.compressed_ply import CHUNK, PATTERNS, SH_RANGE
+from octasplat.engine.files.encodings import SQRT_HALF, smallest_three
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
+from octasplat.engine.files.registry import Exporter, register
+from octasplat.engine.files.selection import selected
+from octasplat.engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
 
 _AXES_BITS = 10
 """Steps along each axis of the curve that the Gaussians are sorted along, as a power of two."""

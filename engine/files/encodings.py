@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 
 SQRT_HALF = float(np.sqrt(0.5))
 HALF_TURN_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)

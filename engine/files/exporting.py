@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from engine.errors import ConfigError, SceneFileError
-from engine.files.options import ExportOptions
-from engine.files.registry import SurfaceWriter, exporter_for, surface_suffixes, surface_writer_for
-from engine.gaussians.model import FlatGaussians
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import SurfaceWriter, exporter_for, surface_suffixes, surface_writer_for
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.surface.mesh import TriangleMesh
 
 
 def export_scene(

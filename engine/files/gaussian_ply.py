@@ -18,11 +18,11 @@ from typing import Literal
 
 import numpy as np
 
-from engine.errors import ConfigError, SceneFileError
-from engine.files.channel_columns import ChannelChoice, chosen_columns
-from engine.files.octagon_reading import is_octagon_ply
-from engine.files.options import ExportOptions
-from engine.files.ply_container import (
+from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
+from octasplat.engine.files.octagon_reading import is_octagon_ply
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.ply_container import (
     PlyElement,
     PlyWriteElement,
     columns,
@@ -30,12 +30,12 @@ from engine.files.ply_container import (
     read_ply_header,
     write_ply,
 )
-from engine.files.registry import Exporter, Importer, register
-from engine.files.selection import selected
-from engine.gaussians.channels import Channels, column_names, stacked
-from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
+from octasplat.engine.files.registry import Exporter, Importer, register
+from octasplat.engine.files.selection import selected
+from octasplat.engine.gaussians.channels import Channels, column_names, stacked
+from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud, ImportReport, flatten
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
 
 MAX_SH_DEGREE = 3
 ROWS_AT_ONCE = 65536

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from engine.errors import SceneFileError
-from engine.files.gltf import GlbFile
-from engine.files.mesh_looks import FileImage, MeshMaterial
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.gltf import GlbFile
+from octasplat.engine.files.mesh_looks import FileImage, MeshMaterial
 
 UNDERSTOOD = ("emissive_strength", "ior", "transmission", "unlit", "volume")
 SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/webp": ".webp"}

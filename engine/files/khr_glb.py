@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.colour import linear_to_srgb, rounded_bytes, srgb_to_linear
-from engine.errors import ConfigError, SceneFileError
-from engine.files import gltf
-from engine.files.channel_columns import ChannelChoice, chosen_columns
-from engine.files.encodings import (
+from octasplat.engine.colour import linear_to_srgb, rounded_bytes, srgb_to_linear
+from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.files import gltf
+from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
+from octasplat.engine.files.encodings import (
     HALF_TURN_SIGNS,
     half_turn_points,
     half_turn_quats,
@@ -26,17 +26,17 @@ from engine.files.encodings import (
     sh0_from_rgb,
     unit_quats,
 )
-from engine.files.gltf import FLOAT, UNSIGNED_BYTE, GlbFile, padded, write_glb
-from engine.files.octagon_glb_reading import octagon_q, read_octagons
-from engine.files.options import ExportOptions
-from engine.files.registry import Exporter, Importer, register
-from engine.files.selection import blocks, check_scales, selected
-from engine.gaussians.channels import Channels, common_widths
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.frames import quaternions, rotation_matrices
-from engine.gaussians.harmonics import rotate_sh
-from engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
-from engine.gaussians.rows import join_rows
+from octasplat.engine.files.gltf import FLOAT, UNSIGNED_BYTE, GlbFile, padded, write_glb
+from octasplat.engine.files.octagon_glb_reading import octagon_q, read_octagons
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import Exporter, Importer, register
+from octasplat.engine.files.selection import blocks, check_scales, selected
+from octasplat.engine.gaussians.channels import Channels, common_widths
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.frames import quaternions, rotation_matrices
+from octasplat.engine.gaussians.harmonics import rotate_sh
+from octasplat.engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
+from octasplat.engine.gaussians.rows import join_rows
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOUR_SPACE = "srgb_rec709_display"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from engine.files.mesh_looks import MeshMaterial
+from octasplat.engine.files.mesh_looks import MeshMaterial
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class Mesh:
 
     Attributes:
         vertices: positions as the file gives them, with the transforms of glTF nodes applied; which axes they
-            are along is :mod:`engine.edit.axes`' business.
+            are along is :mod:`octasplat.engine.edit.axes`' business.
         triangles: vertex indices; polygons are cut into fans. Empty for a file of points.
         uv: texture coordinates as the file has them (v may count up or down), or None; NaN where a vertex has
             none, and the last where it has several.

@@ -24,27 +24,27 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int, Int32, UInt8
 
-from engine.colour import srgb_to_linear
-from engine.errors import ConfigError, SceneFileError
-from engine.files import gltf
-from engine.files.glb_materials import glb_materials, texture_frame
-from engine.files.gltf import GlbFile, channel_attributes, padded, write_glb
-from engine.files.mesh import Mesh
-from engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout
-from engine.files.octagon_soup import OctagonBatch, OctagonSoup
-from engine.files.options import ExportOptions
-from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
-from engine.files.spatial import kd_chunks
-from engine.files.textures import (
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.files import gltf
+from octasplat.engine.files.glb_materials import glb_materials, texture_frame
+from octasplat.engine.files.gltf import GlbFile, channel_attributes, padded, write_glb
+from octasplat.engine.files.mesh import Mesh
+from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout
+from octasplat.engine.files.octagon_soup import OctagonBatch, OctagonSoup
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
+from octasplat.engine.files.spatial import kd_chunks
+from octasplat.engine.files.textures import (
     material_ramp_png,
     material_ramp_uv,
     png_bytes,
     white_with_alpha_png,
 )
-from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, has_materials
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import SIDES, octagon_triangles
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS, has_materials
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
+from octasplat.engine.surface.mesh import TriangleMesh
 
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 ATTRIBUTES = {"uv": "TEXCOORD_0", "gid": "_GID", "corner": "_CORNER", "radius": "_RADIUS"}

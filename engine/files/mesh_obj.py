@@ -16,19 +16,19 @@ from typing import IO, Any
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from engine.colour import srgb_to_linear
-from engine.errors import SceneFileError
-from engine.files.mesh import Mesh, stated_q, upright
-from engine.files.mesh_looks import MeshMaterial
-from engine.files.obj_materials import read_mtl
-from engine.files.octagon_soup import BATCH, OctagonBatch, OctagonSoup
-from engine.files.options import ExportOptions
-from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
-from engine.files.textures import grey_png, png_bytes
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import SIDES, octagon_triangles
-from engine.surface.mesh import TriangleMesh
-from engine.writing import replacing, write_text
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.mesh import Mesh, stated_q, upright
+from octasplat.engine.files.mesh_looks import MeshMaterial
+from octasplat.engine.files.obj_materials import read_mtl
+from octasplat.engine.files.octagon_soup import BATCH, OctagonBatch, OctagonSoup
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
+from octasplat.engine.files.textures import grey_png, png_bytes
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.writing import replacing, write_text
 
 BLOCK_BYTES = 1 << 22
 NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int, Int64
 
-from engine.colour import srgb_to_linear, to_bytes
-from engine.errors import SceneFileError
-from engine.files.gaussian_ply import channel_comments
-from engine.files.mesh import Mesh, stated_q, upright
-from engine.files.octagon_soup import BATCH, OctagonSoup
-from engine.files.options import ExportOptions
-from engine.files.ply_container import (
+from octasplat.engine.colour import srgb_to_linear, to_bytes
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.gaussian_ply import channel_comments
+from octasplat.engine.files.mesh import Mesh, stated_q, upright
+from octasplat.engine.files.octagon_soup import BATCH, OctagonSoup
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.ply_container import (
     COUNT_SUFFIX,
     PlyWriteElement,
     columns,
@@ -24,11 +24,11 @@ from engine.files.ply_container import (
     read_ply,
     write_ply,
 )
-from engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
-from engine.gaussians.channels import column_names
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import FAN, SIDES, octagon_triangles
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.files.registry import Exporter, MeshReader, SurfaceWriter, register
+from octasplat.engine.gaussians.channels import column_names
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import FAN, SIDES, octagon_triangles
+from octasplat.engine.surface.mesh import TriangleMesh
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 COLOURS = ("red", "green", "blue")

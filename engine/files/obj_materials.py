@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from engine.errors import SceneFileError
-from engine.files.mesh_looks import MeshMaterial, image_beside
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.mesh_looks import MeshMaterial, image_beside
 
 MAX_BYTES = 64 << 20
 NUMBERS = {"Ns", "Ni", "d", "Tr", "Pr", "Pm", "illum"}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engine.files.gltf import (
+from octasplat.engine.files.gltf import (
     ARRAY_BUFFER,
     CLAMP_TO_EDGE,
     CORES,
@@ -22,9 +22,9 @@ from engine.files.gltf import (
     padded,
     vector_type,
 )
-from engine.files.options import ExportOptions
-from engine.gaussians.octagon import FAN, SIDES
-from engine.shading.environment_frame import environment_frame
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.gaussians.octagon import FAN, SIDES
+from octasplat.engine.shading.environment_frame import environment_frame
 
 OPAQUE_CUTOFF = 0.2
 """``opaque``: a pixel is drawn where opacity times fall-off reaches this; best of 0.03 to 0.6 on a

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.colour import linear_to_srgb
-from engine.files import gltf
-from engine.files.channel_columns import ChannelChoice, chosen_columns
-from engine.files.encodings import sh0_from_rgb
-from engine.files.gltf import GlbFile
-from engine.files.octagon_reading import TOLERANCE, edited, notes, placed_octagons
-from engine.gaussians.channels import Channels
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.octagon import SIDES, corner_directions
-from engine.gaussians.rows import join_rows, select_rows
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.files import gltf
+from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
+from octasplat.engine.files.encodings import sh0_from_rgb
+from octasplat.engine.files.gltf import GlbFile
+from octasplat.engine.files.octagon_reading import TOLERANCE, edited, notes, placed_octagons
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.octagon import SIDES, corner_directions
+from octasplat.engine.gaussians.rows import join_rows, select_rows
 
 UNLIT = "KHR_materials_unlit"
 

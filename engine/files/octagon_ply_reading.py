@@ -4,18 +4,18 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.errors import ConfigError, SceneFileError
-from engine.files.channel_columns import ChannelChoice, chosen_columns
-from engine.files.encodings import logits_from_bytes, sh0_from_rgb
-from engine.files.gaussian_ply import declared_channels
-from engine.files.mesh_ply import COLOURS, PATTERNS, VERTEX
-from engine.files.octagon_reading import edited, is_octagon_ply, notes, placed_octagons
-from engine.files.ply_container import columns, read_ply
-from engine.files.registry import Importer, register
-from engine.gaussians.channels import Channels
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.octagon import SIDES
-from engine.gaussians.rows import select_rows
+from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
+from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb
+from octasplat.engine.files.gaussian_ply import declared_channels
+from octasplat.engine.files.mesh_ply import COLOURS, PATTERNS, VERTEX
+from octasplat.engine.files.octagon_reading import edited, is_octagon_ply, notes, placed_octagons
+from octasplat.engine.files.ply_container import columns, read_ply
+from octasplat.engine.files.registry import Importer, register
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.octagon import SIDES
+from octasplat.engine.gaussians.rows import select_rows
 
 _SIZE = "octasplat_gaussians"
 _OF_EACH = (*COLOURS, "alpha", "gid", "radius")

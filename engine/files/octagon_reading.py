@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from engine.errors import SceneFileError
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.octagon import coordinate_rounding, corner_directions, frames_from_octagons
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.octagon import coordinate_rounding, corner_directions, frames_from_octagons
 
 TOLERANCE = 1e-3
 """Octagons further from a regular one than this, as a share of their size, were edited."""

@@ -8,11 +8,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int
 
-from engine.errors import SceneFileError
-from engine.files.options import ExportOptions
-from engine.gaussians.channels import Channels
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import APOTHEM, corner_directions, octagon_corners_world, octagon_radii
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import (
+    APOTHEM,
+    corner_directions,
+    octagon_corners_world,
+    octagon_radii,
+)
 
 MAX_FLOAT_ID = 1 << 24
 """Numbers below this are exact in float32, the only type that mesh editors keep for custom attributes."""

@@ -4,8 +4,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from engine.gaussians.octagon import CHI2_2_99
-from engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
+from octasplat.engine.gaussians.octagon import CHI2_2_99
+from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
 
 
 class ExportOptions(BaseModel):

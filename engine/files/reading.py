@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.errors import SceneFileError
-from engine.events import Listener, StageFinished, StageStarted, ignore
-from engine.files.channel_columns import ChannelChoice
-from engine.files.gaussian_ply import read_ply_facts
-from engine.files.mesh import Mesh
-from engine.files.registry import importer_for, mesh_reader_for
-from engine.gaussians.flattening import ImportReport, flatten
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.events import Listener, StageFinished, StageStarted, ignore
+from octasplat.engine.files.channel_columns import ChannelChoice
+from octasplat.engine.files.gaussian_ply import read_ply_facts
+from octasplat.engine.files.mesh import Mesh
+from octasplat.engine.files.registry import importer_for, mesh_reader_for
+from octasplat.engine.gaussians.flattening import ImportReport, flatten
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
 
 FOLDER_FILES = ("scene.ply", "meta.json")
 """What a folder is read by: the scene of a run, or the description of an unpacked SOG."""

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, TypeVar
 
-from engine.errors import SceneFileError
-from engine.files.channel_columns import ChannelChoice
-from engine.files.format_table import Entry, FormatTable
-from engine.files.mesh import Mesh
-from engine.files.options import ExportOptions
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.model import FlatGaussians
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.channel_columns import ChannelChoice
+from octasplat.engine.files.format_table import Entry, FormatTable
+from octasplat.engine.files.mesh import Mesh
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.surface.mesh import TriangleMesh
 
 HEAD_BYTES = 4096
 

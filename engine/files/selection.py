@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.errors import SceneFileError
-from engine.files.options import ExportOptions
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.gaussians.model import FlatGaussians
 
 ROWS_AT_ONCE = 65536
 LARGEST_LOG_SCALE = float(np.log(np.finfo(np.float32).max)) - 1e-3

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from engine.errors import NoSpaceLeft, OctasplatError
-from engine.files.exporting import export_losses, export_scene
-from engine.files.options import ExportOptions
-from engine.files.registry import exporter_for
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import NoSpaceLeft, OctasplatError
+from octasplat.engine.files.exporting import export_losses, export_scene
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import exporter_for
+from octasplat.engine.gaussians.model import FlatGaussians
 
 
 def export_files(

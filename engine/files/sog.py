@@ -15,16 +15,16 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from engine.errors import SceneFileError
-from engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
-from engine.files.gaussian_ply import write_gaussian_ply
-from engine.files.options import ExportOptions
-from engine.files.registry import Exporter, Importer, register
-from engine.files.selection import selected
-from engine.files.splat_transform import convert, lacking
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.model import FlatGaussians
-from engine.writing import replacing
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.encodings import SQRT_HALF, from_smallest_three, logits_from_bytes
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import Exporter, Importer, register
+from octasplat.engine.files.selection import selected
+from octasplat.engine.files.splat_transform import convert, lacking
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.writing import replacing
 
 META = "meta.json"
 PALETTE_COLUMNS = 64

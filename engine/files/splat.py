@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.colour import rounded_bytes
-from engine.errors import SceneFileError
-from engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
-from engine.files.options import ExportOptions
-from engine.files.registry import Exporter, Importer, register
-from engine.files.selection import blocks, check_scales, selected
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.model import FLAT_SCALE, FlatGaussians
-from engine.writing import replacing
+from octasplat.engine.colour import rounded_bytes
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.encodings import logits_from_bytes, sh0_from_rgb, unit_quats
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import Exporter, Importer, register
+from octasplat.engine.files.selection import blocks, check_scales, selected
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from octasplat.engine.writing import replacing
 
 SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat_wxyz", "u1", 4)])
 

@@ -5,7 +5,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from engine.errors import SceneFileError
+from octasplat.engine.errors import SceneFileError
 
 PACKAGE = "@playcanvas/splat-transform"
 PROGRAM = "splat-transform"

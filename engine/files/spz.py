@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from engine.colour import rounded_bytes
-from engine.errors import SceneFileError
-from engine.files.encodings import (
+from octasplat.engine.colour import rounded_bytes
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.encodings import (
     SQRT_HALF,
     from_smallest_three,
     half_turn_points,
@@ -17,14 +17,14 @@ from engine.files.encodings import (
     logits_from_bytes,
     smallest_three,
 )
-from engine.files.gaussian_ply import MAX_SH_DEGREE
-from engine.files.options import ExportOptions
-from engine.files.registry import Exporter, Importer, register
-from engine.files.selection import blocks, selected
-from engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, read_spz, write_spz
-from engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud
-from engine.gaussians.model import FlatGaussians
-from engine.writing import replacing
+from octasplat.engine.files.gaussian_ply import MAX_SH_DEGREE
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import Exporter, Importer, register
+from octasplat.engine.files.selection import blocks, selected
+from octasplat.engine.files.spz_container import ANTIALIASED, GZIP_MAGIC, MAGIC, SpzFile, read_spz, write_spz
+from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.writing import replacing
 
 COLOUR_SCALE = 0.15
 """Constant harmonics h are written as the byte 255 (0.15 h + 0.5)."""

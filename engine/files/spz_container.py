@@ -13,7 +13,7 @@ from typing import IO
 
 import zstandard
 
-from engine.errors import SceneFileError
+from octasplat.engine.errors import SceneFileError
 
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b"

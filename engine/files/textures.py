@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from engine.colour import to_bytes
+from octasplat.engine.colour import to_bytes
 
 RAMP_SIDE = 256
 
@@ -50,7 +50,9 @@ def material_ramp_uv(
 
 def png_bytes(rgb_srgb: UInt8[np.ndarray, "h w 3"]) -> bytes:
     """An image as it stands in a PNG file."""
-    from engine.render.images import write_png  # loads the image library, which the front end has not
+    from octasplat.engine.render.images import (
+        write_png,  # loads the image library, which the front end has not
+    )
 
     with tempfile.TemporaryDirectory(prefix="octasplat-") as folder:
         path = Path(folder) / "texture.png"

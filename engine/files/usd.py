@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from engine.colour import srgb_to_linear
-from engine.errors import SceneFileError
-from engine.files.encodings import half_turned, unit_quats
-from engine.files.options import ExportOptions
-from engine.files.registry import Exporter, register
-from engine.files.selection import check_scales, selected
-from engine.gaussians.flattening import turned
-from engine.gaussians.model import FLAT_SCALE, FlatGaussians
-from engine.writing import replacing
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.encodings import half_turned, unit_quats
+from octasplat.engine.files.options import ExportOptions
+from octasplat.engine.files.registry import Exporter, register
+from octasplat.engine.files.selection import check_scales, selected
+from octasplat.engine.gaussians.flattening import turned
+from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from octasplat.engine.writing import replacing
 
 ROOT, FIELD = "/octasplat", "/octasplat/gaussians"
 COLOUR_SPACE = "srgb_rec709_scene"

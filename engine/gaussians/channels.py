@@ -2,8 +2,8 @@
 
 A channel has a name and f numbers a Gaussian. Every number is a scalar: where a scene is moved, turned or
 mirrored, channels stay as they are, so directions do not belong into one. Which channels a scene has is set
-once (:meth:`engine.gaussians.model.FlatGaussians.with_channels`); from then on they go wherever the Gaussians
-go. Whether one is trained is for the trainer to say.
+once (:meth:`octasplat.engine.gaussians.model.FlatGaussians.with_channels`); from then on they go wherever the
+Gaussians go. Whether one is trained is for the trainer to say.
 """
 
 import re
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from engine.errors import ConfigError
+from octasplat.engine.errors import ConfigError
 
 FILL = 0.0
 """What Gaussians have that come to a scene from one without the channel."""

@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from engine.errors import SceneFileError
-from engine.gaussians.channels import Channels, check_rows
-from engine.gaussians.model import FLAT_SCALE, FlatGaussians
-from engine.gaussians.rows import select_rows
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.gaussians.channels import Channels, check_rows
+from octasplat.engine.gaussians.model import FLAT_SCALE, FlatGaussians
+from octasplat.engine.gaussians.rows import select_rows
 
 FLAT_LOG_SCALE = np.float32(np.log(FLAT_SCALE))
 ROUNDING = np.float32(1e-5)
@@ -33,7 +33,7 @@ class GaussianCloud:
         log_scales: ln of the standard deviations along all three axes, or along the two in the plane.
         opacity_logits: opacity is their sigmoid; infinite where it is 0 or 1.
         sh: coefficients of the display colour, coefficient-major, as in
-            :class:`engine.gaussians.model.FlatGaussians`.
+            :class:`octasplat.engine.gaussians.model.FlatGaussians`.
         notes: what the reader of the file left out or had to assume, one sentence each.
         channels: what else is known of each, by name.
         thinnest: the smallest ln scale that the format can hold; what is no thicker counts as flat.

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, Float32
 
-from engine.gaussians.model import SH_C0
+from octasplat.engine.gaussians.model import SH_C0
 
 ROWS_AT_ONCE = 65536
 SAMPLES = 16

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from engine.errors import ConfigError
-from engine.gaussians.channels import Channels
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.model import FlatGaussians
 
 ALBEDO, METALLIC, ROUGHNESS = "albedo", "metallic", "roughness"
 MATERIAL_WIDTHS: Mapping[str, int] = {ALBEDO: 3, METALLIC: 1, ROUGHNESS: 1}

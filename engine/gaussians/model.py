@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float32
 
-from engine.gaussians.channels import Channels, check_rows
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.rows import Index, join_rows, map_rows, put_rows, row_arrays, select_rows
+from octasplat.engine.gaussians.channels import Channels, check_rows
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.rows import Index, join_rows, map_rows, put_rows, row_arrays, select_rows
 
 FLAT_SCALE = 1e-5
 """Standard deviation along the normal, s1 = eps of the paper, in world units."""

@@ -6,8 +6,8 @@
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from engine.gaussians.frames import quaternions
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.model import FlatGaussians
 
 SIDES = 8
 CHI2_3_99 = 11.344866730144373

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.channels import Channels
 
 Index = np.ndarray | slice
 

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from engine.gaussians.materials import ALBEDO
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.materials import ALBEDO
+from octasplat.engine.gaussians.model import FlatGaussians
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class SceneFacts:
     Attributes:
         near_world: distance from a camera at which the scene begins to be seen, as in its training.
         pixel_rad: the angle of a pixel in the middle of a training view.
-        turned_beyond: of :class:`engine.trace.protocol.TraceSettings`; 0: normals have no side.
+        turned_beyond: of :class:`octasplat.engine.trace.protocol.TraceSettings`; 0: normals have no side.
     """
 
     near_world: float = 0.0

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import coordinate_rounding, frames_from_legs
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import coordinate_rounding, frames_from_legs
 
 
 def triangles_world(gaussians: FlatGaussians) -> Float[np.ndarray, "n 3 3"]:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt32
 
-from engine.trace.kernels_triangles import TriangleQuery
-from engine.trace.meshes import new_scratch
+from octasplat.engine.trace.kernels_triangles import TriangleQuery
+from octasplat.engine.trace.meshes import new_scratch
 
 BLOCK = 1024
 """Rows that a thread works on at a time: few enough for the nearest cache."""
@@ -36,7 +36,7 @@ class Materials(NamedTuple):
     """``m`` materials.
 
     Attributes:
-        kinds: which of the kinds of :mod:`engine.light.kernels_surface`.
+        kinds: which of the kinds of :mod:`octasplat.engine.light.kernels_surface`.
         colours_linear: base colour, reflectance or tint.
         metallic: share of the metal.
         roughness: perceptual.
@@ -98,9 +98,9 @@ class Paths(NamedTuple):
         albedo_linear: colour of that mesh, white where it mirrors or lets through, times the same share.
         normals_world: its shading normal times the same share.
         densities: of the last direction over solid angle; 0 for the camera, mirrors and glass.
-        viewers: where on the next ray its viewer stands, see :class:`engine.rays.RayBatch`.
+        viewers: where on the next ray its viewer stands, see :class:`octasplat.engine.rays.RayBatch`.
         inside: material that the path is in, -1 for air.
-        marks: bits of :mod:`engine.light.kernels_path`.
+        marks: bits of :mod:`octasplat.engine.light.kernels_path`.
         alive: whether the path goes on.
     """
 
@@ -182,7 +182,7 @@ class Scratch(NamedTuple):
     """What one thread's kernels work in, ``b`` rows at a time.
 
     Attributes:
-        embree: see :func:`engine.trace.meshes.new_scratch`.
+        embree: see :func:`octasplat.engine.trace.meshes.new_scratch`.
         keys: of paths.
         samples: of paths.
         numbers: pairs of uniform numbers.
@@ -225,7 +225,10 @@ class View(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """The numbers of an integrator that the kernels read; see :class:`engine.light.stage.Integrator`."""
+    """The numbers of an integrator that the kernels read.
+
+    See :class:`octasplat.engine.light.stage.Integrator`.
+    """
 
     seed: int
     max_depth: int

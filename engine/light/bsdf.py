@@ -11,9 +11,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-from engine.light.kernels_bsdf import BURLEY, COUPLED
-from engine.light.kernels_bsdf_arrays import fresnel_values, integrate_albedo, opaque_samples, opaque_values
-from engine.light.kernels_frosted import frosted_samples, frosted_values, integrate_frosted
+from octasplat.engine.light.kernels_bsdf import BURLEY, COUPLED
+from octasplat.engine.light.kernels_bsdf_arrays import (
+    fresnel_values,
+    integrate_albedo,
+    opaque_samples,
+    opaque_values,
+)
+from octasplat.engine.light.kernels_frosted import frosted_samples, frosted_values, integrate_frosted
 
 TABLE_ROUGHNESSES = 32
 TABLE_COSINES = 64

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float32
 
-from engine.errors import ConfigError
-from engine.light.film import Filter
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.light.film import Filter
 
 
 def denoiser() -> Filter:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.shading.environment_frame import environment_frame as environment_frame
+from octasplat.engine.shading.environment_frame import environment_frame as environment_frame
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engine.colour import linear_to_srgb
-from engine.errors import ConfigError
-from engine.files.mesh_looks import FileImage, MeshMaterial
-from engine.light.stage import Glass, Material, MetallicRoughness
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.files.mesh_looks import FileImage, MeshMaterial
+from octasplat.engine.light.stage import Glass, Material, MetallicRoughness
 
 MOST_IOR = 4.0
 THIN = 1.0

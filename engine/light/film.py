@@ -1,7 +1,8 @@
 """What paths gathered, pixel by pixel, and the picture that it makes.
 
 A pixel has a front layer of Gaussians (premultiplied display colour, transmittance, and the factor that the
-stage's lights give to it) and linear light behind it; see :mod:`engine.light.kernels_layer` for the reason.
+stage's lights give to it) and linear light behind it; see :mod:`octasplat.engine.light.kernels_layer` for the
+reason.
 
 Gaussians with materials that the camera sees are a part of the pixel of their own, encoded by itself, so that
 their edges blend in display values as photographs with alpha do.
@@ -19,10 +20,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.colour import linear_to_srgb, srgb_to_linear
-from engine.light.arrays import Paths
-from engine.light.kernels_film import add_up
-from engine.light.kernels_scatter import FRONT
+from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
+from octasplat.engine.light.arrays import Paths
+from octasplat.engine.light.kernels_film import add_up
+from octasplat.engine.light.kernels_scatter import FRONT
 
 Tone = Literal["none", "reinhard", "filmic"]
 Filter = Callable[

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from engine.light.arrays import (
+from octasplat.engine.light.arrays import (
     BLOCK,
     Paths,
     Rules,
@@ -23,20 +23,20 @@ from engine.light.arrays import (
     new_scratches,
     new_shadow_rays,
 )
-from engine.light.denoising import denoiser
-from engine.light.film import Film
-from engine.light.kernels_follow import follow_paths
-from engine.light.kernels_layer import add_layer_light, meet_layers
-from engine.light.kernels_material_layer import meet_materials, start_at_points
-from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
-from engine.light.kernels_shadows import let_through
-from engine.light.layers import GaussianLayers
-from engine.light.stage import Integrator, Stage
-from engine.light.staging import LitMeshes, stage_meshes
-from engine.rays import ImageRays, RayBatch
-from engine.render.renderer import tile_order
-from engine.threads import use_threads
-from engine.trace.protocol import Tracer
+from octasplat.engine.light.denoising import denoiser
+from octasplat.engine.light.film import Film
+from octasplat.engine.light.kernels_follow import follow_paths
+from octasplat.engine.light.kernels_layer import add_layer_light, meet_layers
+from octasplat.engine.light.kernels_material_layer import meet_materials, start_at_points
+from octasplat.engine.light.kernels_path import add_lit, meet_surfaces, start_paths
+from octasplat.engine.light.kernels_shadows import let_through
+from octasplat.engine.light.layers import GaussianLayers
+from octasplat.engine.light.stage import Integrator, Stage
+from octasplat.engine.light.staging import LitMeshes, stage_meshes
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.render.renderer import tile_order
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.protocol import Tracer
 
 PATHS_AT_ONCE = 1 << 18
 """Paths that are traced together through Gaussians."""

@@ -4,22 +4,22 @@ Directions are in the frame of the shading normal (z), ``o`` towards the viewer 
 both of unit length. Values are linear and already hold the cosine to the light. Everything is a pure
 function of its arguments.
 
-Microfacets are those of :mod:`engine.shading.kernels_microfacets`. Light that facets throw at each other:
-"Practical multiple scattering compensation for microfacet models" (Turquin 2019). The ground under a coat
-takes what the coat leaves, in both directions: "A Microfacet Based Coupled Specular-Matte BRDF Model"
+Microfacets are those of :mod:`octasplat.engine.shading.kernels_microfacets`. Light that facets throw at each
+other: "Practical multiple scattering compensation for microfacet models" (Turquin 2019). The ground under a
+coat takes what the coat leaves, in both directions: "A Microfacet Based Coupled Specular-Matte BRDF Model"
 (Kelemen and Szirmay-Kalos 2001).
 """
 
 import math
 
-from engine.shading.kernels_microfacets import (
+from octasplat.engine.shading.kernels_microfacets import (
     ggx_density,
     ggx_masking,
     sample_visible_normal,
     schlick_weight,
     table_value,
 )
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_native import lean
 
 LEAST_ALPHA = 1e-3
 COUPLED, BURLEY = 0, 1

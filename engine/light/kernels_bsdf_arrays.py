@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from engine.light.kernels_bsdf import LEAST_ALPHA, fresnel_dielectric, opaque_sample, opaque_value
-from engine.light.kernels_random import SCALE, reversed_bits
-from engine.shading.kernels_microfacets import ggx_masking, sample_visible_normal
+from octasplat.engine.light.kernels_bsdf import LEAST_ALPHA, fresnel_dielectric, opaque_sample, opaque_value
+from octasplat.engine.light.kernels_random import SCALE, reversed_bits
+from octasplat.engine.shading.kernels_microfacets import ggx_masking, sample_visible_normal
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -1,6 +1,6 @@
 """Sums over the paths of each pixel."""
 
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_native import lean
 
 
 @lean(cache=True, nogil=True)

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from engine.light.arrays import BLOCK
-from engine.light.kernels_path import add_lit, meet_surfaces, start_paths
-from engine.light.kernels_shadows import let_through
-from engine.trace.kernels_native import lean
-from engine.trace.kernels_triangles import closest_hits
+from octasplat.engine.light.arrays import BLOCK
+from octasplat.engine.light.kernels_path import add_lit, meet_surfaces, start_paths
+from octasplat.engine.light.kernels_shadows import let_through
+from octasplat.engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_triangles import closest_hits
 
 
 @lean(cache=True, nogil=True)

@@ -12,10 +12,10 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from engine.light.kernels_bsdf import LEAST_ALPHA, fresnel_dielectric
-from engine.light.kernels_random import SCALE, reversed_bits
-from engine.shading.kernels_microfacets import ggx_density, ggx_masking, sample_visible_normal
-from engine.trace.kernels_native import lean
+from octasplat.engine.light.kernels_bsdf import LEAST_ALPHA, fresnel_dielectric
+from octasplat.engine.light.kernels_random import SCALE, reversed_bits
+from octasplat.engine.shading.kernels_microfacets import ggx_density, ggx_masking, sample_visible_normal
+from octasplat.engine.trace.kernels_native import lean
 
 LEAST_FROST = 0.03
 """Glass of less roughness is smooth."""

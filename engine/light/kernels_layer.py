@@ -14,13 +14,13 @@ composited as such, into one layer of premultiplied colour g and transmittance T
 
 import math
 
-from engine.light.arrays import PAIRS_OF_SURFACE
-from engine.light.kernels_lights import FAR, adding_share, pick_light, sample_light
-from engine.light.kernels_path import ENDED, PAIRS_OF_CAMERA, add_radiance, beyond
-from engine.light.kernels_random import uniform_pair
-from engine.light.kernels_scatter import CLEAR, LAYER_PLACE, PICK, SHORT_OF_LIGHT
-from engine.light.kernels_surface import unit
-from engine.trace.kernels_native import lean
+from octasplat.engine.light.arrays import PAIRS_OF_SURFACE
+from octasplat.engine.light.kernels_lights import FAR, adding_share, pick_light, sample_light
+from octasplat.engine.light.kernels_path import ENDED, PAIRS_OF_CAMERA, add_radiance, beyond
+from octasplat.engine.light.kernels_random import uniform_pair
+from octasplat.engine.light.kernels_scatter import CLEAR, LAYER_PLACE, PICK, SHORT_OF_LIGHT
+from octasplat.engine.light.kernels_surface import unit
+from octasplat.engine.trace.kernels_native import lean
 
 NOTHING = 1e-6
 ONE_SURFACE = 0.05

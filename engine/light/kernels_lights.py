@@ -1,17 +1,17 @@
 """Compiled functions of lights: which one to ask, a way to it, and how likely that way was.
 
-``lights`` is :class:`engine.light.lights.LightArrays`; p is the point that is lit. Weights of lights at a
-point are what they would bring to a surface that faces them, so that the nearest and strongest is asked
-most.
+``lights`` is :class:`octasplat.engine.light.lights.LightArrays`; p is the point that is lit. Weights of
+lights at a point are what they would bring to a surface that faces them, so that the nearest and strongest is
+asked most.
 """
 
 import math
 
 from numba import njit
 
-from engine.light.kernels_bsdf import around
-from engine.light.kernels_texture import texture_value
-from engine.trace.kernels_native import lean
+from octasplat.engine.light.kernels_bsdf import around
+from octasplat.engine.light.kernels_texture import texture_value
+from octasplat.engine.trace.kernels_native import lean
 
 POINT, SPOT, DIRECTIONAL, RECTANGLE, ENVIRONMENT, BALL, MESH = 0, 1, 2, 3, 4, 5, 6
 FAR = 1e30

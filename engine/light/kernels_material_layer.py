@@ -7,16 +7,16 @@ and else goes on to what is behind; so no light is counted twice, and rays of al
 
 import math
 
-from engine.light.kernels_bsdf import BURLEY
-from engine.light.kernels_layer import NOTHING
-from engine.light.kernels_path import ENDED
-from engine.light.kernels_random import pixel_key, uniform_pair
-from engine.light.kernels_scatter import CHOICE, DIRECTION, FRONT, PICK, PLACE, STRAIGHT, scatter
-from engine.light.kernels_surface import unit
-from engine.trace.kernels_native import lean
+from octasplat.engine.light.kernels_bsdf import BURLEY
+from octasplat.engine.light.kernels_layer import NOTHING
+from octasplat.engine.light.kernels_path import ENDED
+from octasplat.engine.light.kernels_random import pixel_key, uniform_pair
+from octasplat.engine.light.kernels_scatter import CHOICE, DIRECTION, FRONT, PICK, PLACE, STRAIGHT, scatter
+from octasplat.engine.light.kernels_surface import unit
+from octasplat.engine.trace.kernels_native import lean
 
 MATERIAL, ALBEDO, METALLIC, ROUGHNESS, LIFT = 3, 4, 7, 8, 9
-"""Features of Gaussians behind those of :mod:`engine.light.kernels_layer`.
+"""Features of Gaussians behind those of :mod:`octasplat.engine.light.kernels_layer`.
 
 Whether they have a material, this, and how far off their surface rays begin, world units.
 """

@@ -7,10 +7,10 @@ several threads can share the work.
 
 import math
 
-from engine.light.arrays import BLOCK, PAIRS_OF_SURFACE
-from engine.light.kernels_bsdf import around, fresnel_dielectric
-from engine.light.kernels_frosted import LEAST_FROST, frosted_sample, frosted_value
-from engine.light.kernels_lights import (
+from octasplat.engine.light.arrays import BLOCK, PAIRS_OF_SURFACE
+from octasplat.engine.light.kernels_bsdf import around, fresnel_dielectric
+from octasplat.engine.light.kernels_frosted import LEAST_FROST, frosted_sample, frosted_value
+from octasplat.engine.light.kernels_lights import (
     emitted,
     environment_density,
     environment_radiance,
@@ -19,8 +19,8 @@ from engine.light.kernels_lights import (
     sample_light,
     seen_density,
 )
-from engine.light.kernels_random import fill_pairs, pixel_key
-from engine.light.kernels_scatter import (
+from octasplat.engine.light.kernels_random import fill_pairs, pixel_key
+from octasplat.engine.light.kernels_scatter import (
     CHOICE,
     CLEAR,
     DIRECTION,
@@ -32,7 +32,7 @@ from engine.light.kernels_scatter import (
     leave,
     scatter,
 )
-from engine.light.kernels_surface import (
+from octasplat.engine.light.kernels_surface import (
     DIFFUSE,
     GLASS,
     LIGHT,
@@ -47,8 +47,8 @@ from engine.light.kernels_surface import (
     unit,
     vertex_colour,
 )
-from engine.shading.kernels_microfacets import table_value
-from engine.trace.kernels_native import lean
+from octasplat.engine.shading.kernels_microfacets import table_value
+from octasplat.engine.trace.kernels_native import lean
 
 ENDED = -2
 """In place of a face: the ray ended in front of what it would have met."""

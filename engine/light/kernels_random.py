@@ -9,7 +9,7 @@ cannot matter.
 import numpy as np
 from numba import njit
 
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_native import lean
 
 SCALE = 2.0**-32
 BELOW_ONE = 1.0 - 2.0**-24

@@ -8,11 +8,11 @@ import math
 
 import numpy as np
 
-from engine.light.kernels_bsdf import around, opaque_sample, opaque_value, sample_cosine
-from engine.light.kernels_lights import FAR, pick_light, sample_light
-from engine.light.kernels_surface import unit
-from engine.rays import AT_INFINITY
-from engine.trace.kernels_native import lean
+from octasplat.engine.light.kernels_bsdf import around, opaque_sample, opaque_value, sample_cosine
+from octasplat.engine.light.kernels_lights import FAR, pick_light, sample_light
+from octasplat.engine.light.kernels_surface import unit
+from octasplat.engine.rays import AT_INFINITY
+from octasplat.engine.trace.kernels_native import lean
 
 CLEAR = 1
 """Mark: every surface so far passed on all light in one direction; the first layer goes on."""

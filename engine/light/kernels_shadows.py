@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from engine.light.arrays import BLOCK
-from engine.light.kernels_bsdf import fresnel_dielectric
-from engine.light.kernels_frosted import LEAST_FROST
-from engine.light.kernels_surface import face_normal
-from engine.trace.kernels_native import lean
-from engine.trace.kernels_triangles import any_hits, closest_hits
+from octasplat.engine.light.arrays import BLOCK
+from octasplat.engine.light.kernels_bsdf import fresnel_dielectric
+from octasplat.engine.light.kernels_frosted import LEAST_FROST
+from octasplat.engine.light.kernels_surface import face_normal
+from octasplat.engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_triangles import any_hits, closest_hits
 
 MOST_SURFACES = 16
 PAST = np.float32(1 + 1e-6)

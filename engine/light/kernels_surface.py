@@ -2,8 +2,8 @@
 
 import math
 
-from engine.light.kernels_texture import texture_value
-from engine.trace.kernels_native import lean
+from octasplat.engine.light.kernels_texture import texture_value
+from octasplat.engine.trace.kernels_native import lean
 
 DIFFUSE, MIRROR, GLASS, OPAQUE, LIGHT = 0, 1, 2, 3, 4
 OFFSET = 5e-6

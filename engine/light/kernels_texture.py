@@ -2,7 +2,7 @@
 
 import math
 
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_native import lean
 
 
 @lean(forceinline=True)

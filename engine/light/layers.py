@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from engine.edit.affine import scaling, transform, translation
-from engine.edit.selection import merge
-from engine.errors import ConfigError
-from engine.gaussians.channels import stacked
-from engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.light.kernels_layer import AMBIENT, RELIT, SHADOWED
-from engine.light.kernels_material_layer import ALBEDO, COLUMNS, LIFT, MATERIAL
-from engine.light.meshes import rotation_matrix
-from engine.light.stage import Stage, StageGaussians
-from engine.rays import RayBatch
-from engine.trace.facing import faced
-from engine.trace.make import make_tracer
-from engine.trace.protocol import Tracer, TraceResult, TraceSettings
+from octasplat.engine.edit.affine import scaling, transform, translation
+from octasplat.engine.edit.selection import merge
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.channels import stacked
+from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS, has_materials
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.light.kernels_layer import AMBIENT, RELIT, SHADOWED
+from octasplat.engine.light.kernels_material_layer import ALBEDO, COLUMNS, LIFT, MATERIAL
+from octasplat.engine.light.meshes import rotation_matrix
+from octasplat.engine.light.stage import Stage, StageGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.facing import faced
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import Tracer, TraceResult, TraceSettings
 
 FEATURES = 3
 BIAS_OF_SIZE = 0.03
@@ -33,14 +33,14 @@ class GaussianLayers:
     """Gaussians, with features that say how they take light.
 
     Attributes:
-        tracer: all Gaussians, with the features of :mod:`engine.light.kernels_layer`.
+        tracer: all Gaussians, with the features of :mod:`octasplat.engine.light.kernels_layer`.
         spent_below: transmittance at which a ray counts as ended.
         on_meshes: those that cast shadows on meshes; None where none do.
         on_gaussians: those that cast shadows on Gaussians.
         not_on_gaussians: those that do not; the light that they keep off is in the colours already.
         shadow_bias: Gaussians nearer than this to a lit layer keep nothing off it, world units.
         with_materials: whether some are surfaces of their materials, with the features of
-            :mod:`engine.light.kernels_material_layer`.
+            :mod:`octasplat.engine.light.kernels_material_layer`.
     """
 
     tracer: Tracer

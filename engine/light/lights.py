@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from engine.colour import srgb_to_linear
-from engine.light.environment import EnvironmentMap, environment_sampler, irradiance_mean
-from engine.light.kernels_lights import (
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.light.environment import EnvironmentMap, environment_sampler, irradiance_mean
+from octasplat.engine.light.kernels_lights import (
     BALL,
     DIRECTIONAL,
     ENVIRONMENT,
@@ -20,7 +20,7 @@ from engine.light.kernels_lights import (
     environment_values,
     light_samples,
 )
-from engine.light.stage import DirectionalLight, Light, PointLight, RectangleLight, SpotLight
+from octasplat.engine.light.stage import DirectionalLight, Light, PointLight, RectangleLight, SpotLight
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class LightArrays(NamedTuple):
     """``l`` lights: those of the stage, shining meshes, and the environment where there is one.
 
     Attributes:
-        kinds: which of the kinds of :mod:`engine.light.kernels_lights`.
+        kinds: which of the kinds of :mod:`octasplat.engine.light.kernels_lights`.
         positions_world: of points and spots; centres of rectangles, balls and meshes.
         axes: unit vectors: the way that the light goes, or a rectangle faces.
         rgb_linear: intensity, irradiance or radiance; of the environment pi times its mean radiance.
@@ -60,10 +60,10 @@ class LightArrays(NamedTuple):
         mesh_sums: cumulative shares of the triangles' areas, from 0 to 1 for each mesh.
         mesh_corners_world: of the triangles of all meshes.
         mesh_uv: likewise.
-        texels_linear: see :class:`engine.light.arrays.Materials`, as the next one.
+        texels_linear: see :class:`octasplat.engine.light.arrays.Materials`, as the next one.
         texture_sizes: first texel, height and width of each.
         environment_linear: the map, one black pixel without one.
-        environment_rows: see :class:`engine.light.environment.EnvironmentSampler`, as the next two.
+        environment_rows: see :class:`octasplat.engine.light.environment.EnvironmentSampler`, as the next two.
         environment_columns: cumulative shares within each row.
         environment_shares: share of each pixel.
         environment_frame: rows are right, up, forward of the map.

@@ -8,14 +8,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32
 
-from engine.colour import srgb_to_linear
-from engine.errors import ConfigError, DatasetError
-from engine.files.mesh_looks import FileImage
-from engine.light.arrays import Materials
-from engine.light.bsdf import albedo_table, frosted_table
-from engine.light.kernels_bsdf import BURLEY, COUPLED
-from engine.light.kernels_surface import DIFFUSE, GLASS, LIGHT, MIRROR, OPAQUE
-from engine.light.stage import (
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.files.mesh_looks import FileImage
+from octasplat.engine.light.arrays import Materials
+from octasplat.engine.light.bsdf import albedo_table, frosted_table
+from octasplat.engine.light.kernels_bsdf import BURLEY, COUPLED
+from octasplat.engine.light.kernels_surface import DIFFUSE, GLASS, LIGHT, MIRROR, OPAQUE
+from octasplat.engine.light.stage import (
     Bumped,
     Dielectric,
     Diffuse,
@@ -26,7 +26,7 @@ from engine.light.stage import (
     Mirror,
     Shining,
 )
-from engine.render.images import read_image
+from octasplat.engine.render.images import read_image
 
 MAX_TEXELS = 1 << 27
 Use = Literal["colour", "light", "data"]

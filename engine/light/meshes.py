@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial.transform import Rotation
 
-from engine.errors import ConfigError
-from engine.files import read_mesh
-from engine.files.mesh_looks import MeshMaterial
-from engine.light.kernels_normals import smooth_normals
-from engine.light.stage import Placed
-from engine.surface.mesh import edge_report
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.files import read_mesh
+from octasplat.engine.files.mesh_looks import MeshMaterial
+from octasplat.engine.light.kernels_normals import smooth_normals
+from octasplat.engine.light.stage import Placed
+from octasplat.engine.surface.mesh import edge_report
 
 SPHERE_DIVISIONS = 5
 WELD = 1e-6

@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
-from engine.errors import ConfigError
-from engine.gaussians.model import FlatGaussians
-from engine.light.meshes import placed, upright_turn
-from engine.light.stage import Rest, Stage
-from engine.light.stage_file import BALL_OF_SIZE, StageFacts
-from engine.light.staging import stage_shape, up_axis
-from engine.rays import RayBatch
-from engine.trace.protocol import Tracer
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.meshes import placed, upright_turn
+from octasplat.engine.light.stage import Rest, Stage
+from octasplat.engine.light.stage_file import BALL_OF_SIZE, StageFacts
+from octasplat.engine.light.staging import stage_shape, up_axis
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import Tracer
 
 Ray = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]
 RayOfPixel = Callable[[str, tuple[float, float]], Ray]

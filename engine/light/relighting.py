@@ -8,16 +8,16 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.colour import linear_to_srgb
-from engine.gaussians.model import FlatGaussians
-from engine.light.environment import EnvironmentMap
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.layers import stage_layers
-from engine.light.lights import light_arrays, look_up_environment
-from engine.light.stage import Integrator, Stage, StageGaussians
-from engine.light.staging import stage_meshes
-from engine.rays import ImageRays
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.environment import EnvironmentMap
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.layers import stage_layers
+from octasplat.engine.light.lights import light_arrays, look_up_environment
+from octasplat.engine.light.stage import Integrator, Stage, StageGaussians
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.trace.protocol import TraceSettings
 
 Part = Callable[[float], None]
 

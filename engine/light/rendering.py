@@ -3,12 +3,12 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from engine.light.film import StageImage
-from engine.light.integrator import PathTracer
-from engine.light.stage import Integrator
-from engine.light.staging import LitMeshes, refuse_inside_glass
-from engine.render.images import write_exr, write_png
-from engine.render.jobs import Paint, Shot
+from octasplat.engine.light.film import StageImage
+from octasplat.engine.light.integrator import PathTracer
+from octasplat.engine.light.stage import Integrator
+from octasplat.engine.light.staging import LitMeshes, refuse_inside_glass
+from octasplat.engine.render.images import write_exr, write_png
+from octasplat.engine.render.jobs import Paint, Shot
 
 
 def stage_paint(tracer: PathTracer, settings: Integrator) -> Paint:

@@ -3,16 +3,16 @@
 import numpy as np
 from jaxtyping import Float32
 
-from engine.gaussians.materials import AMBIENT, with_room_for_bounced
-from engine.gaussians.model import FlatGaussians
-from engine.light.environment import EnvironmentMap
-from engine.light.relighting import Part, RelitImage, silent
-from engine.rays import ImageRays
-from engine.render.oversampling import pixel_means
-from engine.shading.deferred import Deferred
-from engine.shading.material_settings import MaterialSettings
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.materials import AMBIENT, with_room_for_bounced
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.environment import EnvironmentMap
+from octasplat.engine.light.relighting import Part, RelitImage, silent
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.oversampling import pixel_means
+from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 HEIGHT = 256
 """Texels of the environment from up to down."""
@@ -21,7 +21,7 @@ HEIGHT = 256
 class SplitSumRelighter:
     """Deferred shading with traced visibility; what a reflected ray meets is shaded by the split sum itself.
 
-    Follows :class:`engine.light.relighting.Relighter`.
+    Follows :class:`octasplat.engine.light.relighting.Relighter`.
 
     Args:
         gaussians: a scene with materials.

@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from engine.errors import ConfigError
-from engine.light.stage import Stage
-from engine.writing import write_text
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.light.stage import Stage
+from octasplat.engine.writing import write_text
 
 MAX_STAGE_BYTES = 16 << 20
 TEXTURES = ("texture", "metallic_roughness_texture", "normal_texture", "emission_texture")

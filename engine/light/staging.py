@@ -7,15 +7,21 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from engine.colour import srgb_to_linear
-from engine.errors import ConfigError
-from engine.light.arrays import Materials, MeshQueries, Surfaces
-from engine.light.environment import EnvironmentMap, environment_frame
-from engine.light.file_materials import FileMaterial, file_material
-from engine.light.kernels_surface import GLASS
-from engine.light.lights import LightArrays, ShiningMesh, light_arrays, rectangle_sides, triangle_areas
-from engine.light.material_table import MaterialTable
-from engine.light.meshes import (
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.light.arrays import Materials, MeshQueries, Surfaces
+from octasplat.engine.light.environment import EnvironmentMap, environment_frame
+from octasplat.engine.light.file_materials import FileMaterial, file_material
+from octasplat.engine.light.kernels_surface import GLASS
+from octasplat.engine.light.lights import (
+    LightArrays,
+    ShiningMesh,
+    light_arrays,
+    rectangle_sides,
+    triangle_areas,
+)
+from octasplat.engine.light.material_table import MaterialTable
+from octasplat.engine.light.meshes import (
     Shape,
     corner_normals,
     open_edges,
@@ -25,10 +31,19 @@ from engine.light.meshes import (
     simple_shape,
     upright_turn,
 )
-from engine.light.stage import Diffuse, Glass, Light, PointLight, RectangleLight, Shining, Stage, StageMesh
-from engine.rays import RayBatch
-from engine.render.environment_map import read_environment
-from engine.trace.meshes import TriangleScene
+from octasplat.engine.light.stage import (
+    Diffuse,
+    Glass,
+    Light,
+    PointLight,
+    RectangleLight,
+    Shining,
+    Stage,
+    StageMesh,
+)
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.render.environment_map import read_environment
+from octasplat.engine.trace.meshes import TriangleScene
 
 SMOOTH_DEGREES = 30.0
 Say = Callable[[str], None]

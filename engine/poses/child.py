@@ -1,7 +1,7 @@
-"""The process in which COLMAP works; see :mod:`engine.poses.find`, which starts it.
+"""The process in which COLMAP works; see :mod:`octasplat.engine.poses.find`, which starts it.
 
-Run as ``python -m engine.poses.child``. The first line of stdin is the request as JSON, its end means that
-nobody waits any more. Events go to stdout, one JSON object a line, and then ``done`` or ``error``.
+Run as ``python -m octasplat.engine.poses.child``. The first line of stdin is the request as JSON, its end
+means that nobody waits any more. Events go to stdout, one JSON object a line, and then ``done`` or ``error``.
 """
 
 import json
@@ -11,9 +11,9 @@ import sys
 import threading
 from typing import NoReturn
 
-from engine.errors import DatasetError
-from engine.events import Event
-from engine.poses.config import FOUND, Request
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.events import Event
+from octasplat.engine.poses.config import FOUND, Request
 
 _CRASHES = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
 """COLMAP would print where it was first, which can wait for ever for a lock that the crash left closed."""
@@ -35,9 +35,9 @@ def main() -> NoReturn:
         write(event.as_dict())
 
     try:
-        from engine.poses.lenses import write_with_lenses
-        from engine.poses.misplaced import place_misplaced
-        from engine.poses.search import Search
+        from octasplat.engine.poses.lenses import write_with_lenses
+        from octasplat.engine.poses.misplaced import place_misplaced
+        from octasplat.engine.poses.search import Search
 
         for number in _CRASHES:
             signal.signal(number, signal.SIG_DFL)

@@ -63,7 +63,7 @@ DEFAULT_CONFIG = PosesConfig()
 
 
 class Given(BaseModel):
-    """A model of which some poses may be wrong: see :func:`engine.poses.misplaced.place_misplaced`.
+    """A model of which some poses may be wrong: see :func:`octasplat.engine.poses.misplaced.place_misplaced`.
 
     Attributes:
         model: folder of the COLMAP model.
@@ -81,8 +81,8 @@ class Given(BaseModel):
 class Request(BaseModel):
     """What the process in which COLMAP works is asked.
 
-    With ``given`` see :mod:`engine.poses.misplaced`; with the folder of a model, ``lenses_of``, see
-    :mod:`engine.poses.lenses`; without either :class:`engine.poses.search.Search`.
+    With ``given`` see :mod:`octasplat.engine.poses.misplaced`; with the folder of a model, ``lenses_of``, see
+    :mod:`octasplat.engine.poses.lenses`; without either :class:`octasplat.engine.poses.search.Search`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pycolmap
 
-from engine.poses.config import PosesConfig
-from engine.poses.pairs import (
+from octasplat.engine.poses.config import PosesConfig
+from octasplat.engine.poses.pairs import (
     Pair,
     all_pairs,
     chosen_pairs,

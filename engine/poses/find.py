@@ -13,12 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from engine.errors import Cancelled, DatasetError, PosesCrashed
-from engine.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
-from engine.isolated_python import python_command
-from engine.poses.config import DEFAULT_CONFIG, FOUND, RECORD, Given, PosesConfig, Request
-from engine.poses.photographs import photographs_in, photographs_sha256
-from engine.writing import write_json
+from octasplat.engine.errors import Cancelled, DatasetError, PosesCrashed
+from octasplat.engine.events import Event, Listener, StageProgress, StageStarted, event_from, ignore
+from octasplat.engine.isolated_python import python_command
+from octasplat.engine.poses.config import DEFAULT_CONFIG, FOUND, RECORD, Given, PosesConfig, Request
+from octasplat.engine.poses.photographs import photographs_in, photographs_sha256
+from octasplat.engine.writing import write_json
 
 _LOOK_SECONDS = 0.5
 _SIGN_SECONDS = 30.0
@@ -137,7 +137,7 @@ def adjust_lenses(
 ) -> dict[str, float] | None:
     """Give each photograph of a model a principal point of its own, where that explains far more.
 
-    There is one stage, ``lenses``. See :mod:`engine.poses.lenses`.
+    There is one stage, ``lenses``. See :mod:`octasplat.engine.poses.lenses`.
 
     Args:
         model: folder of the COLMAP model.
@@ -268,7 +268,7 @@ def _process(request: Request, noise: IO[bytes]) -> Iterator["subprocess.Popen[b
     """The process at work; killed in the end, whatever happens. In the caller's group, to die with it."""
     environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1")}  # COLMAP has threads of its own
     process = subprocess.Popen(  # noqa: S603 - a program of ours
-        python_command("engine.poses.child"),
+        python_command("octasplat.engine.poses.child"),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=noise,

@@ -11,10 +11,10 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64
 
-from engine.scene.cameras import Camera
-from engine.scene.flow import flow_by_pose
-from engine.scene.model import Observations, SparsePoints, Viewpoints
-from engine.scene.seen import turned
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.flow import flow_by_pose
+from octasplat.engine.scene.model import Observations, SparsePoints, Viewpoints
+from octasplat.engine.scene.seen import turned
 
 FEWEST_OBSERVATIONS = 100
 """Photographs that show fewer points are not asked, nor given a lens of their own."""

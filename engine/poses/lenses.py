@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from engine.events import Listener
-from engine.poses.config import FOUND, LENSES, RECORD, Request
-from engine.poses.lens_doubt import FEWEST_OBSERVATIONS
-from engine.poses.workshop import stage_of
-from engine.writing import write_json
+from octasplat.engine.events import Listener
+from octasplat.engine.poses.config import FOUND, LENSES, RECORD, Request
+from octasplat.engine.poses.lens_doubt import FEWEST_OBSERVATIONS
+from octasplat.engine.poses.workshop import stage_of
+from octasplat.engine.writing import write_json
 
 LEAST_GAIN = 0.15
 """The reprojection error must fall by this share, or the given model stays."""

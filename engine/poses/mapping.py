@@ -11,7 +11,7 @@ from typing import Any
 
 import pycolmap
 
-from engine.poses.config import MIN_PHOTOGRAPHS, PosesConfig
+from octasplat.engine.poses.config import MIN_PHOTOGRAPHS, PosesConfig
 
 Counted = Callable[[int], None]
 

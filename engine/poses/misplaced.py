@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from engine.errors import DatasetError
-from engine.events import Listener
-from engine.poses.config import FEATURES, FOUND, MATCHES, PLACING, RECORD, Given, Request
-from engine.poses.features import find_features, make_database, match_pairs
-from engine.poses.placing import Matches, Pose, fits, matches_of, placed_anew
-from engine.poses.workshop import linked_photographs, stage_of
-from engine.scene.images import read_image_info
-from engine.writing import write_json
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.events import Listener
+from octasplat.engine.poses.config import FEATURES, FOUND, MATCHES, PLACING, RECORD, Given, Request
+from octasplat.engine.poses.features import find_features, make_database, match_pairs
+from octasplat.engine.poses.placing import Matches, Pose, fits, matches_of, placed_anew
+from octasplat.engine.poses.workshop import linked_photographs, stage_of
+from octasplat.engine.scene.images import read_image_info
+from octasplat.engine.writing import write_json
 
 
 def place_misplaced(request: Request, given: Given, tell: Listener) -> None:

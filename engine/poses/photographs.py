@@ -4,8 +4,8 @@ import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from engine.errors import DatasetError
-from engine.poses.config import MIN_PHOTOGRAPHS
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from engine.poses.config import PosesConfig
+from octasplat.engine.poses.config import PosesConfig
 
 Pose = tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]
 """Rotation and translation, camera from world."""

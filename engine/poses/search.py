@@ -7,16 +7,22 @@ from typing import Any
 
 import pycolmap
 
-from engine.errors import DatasetError
-from engine.events import Listener, Warned
-from engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, RECORD, STAGE, PosesConfig
-from engine.poses.features import feature_counts, find_features, make_database, match_pairs, quick_pairs
-from engine.poses.folds import false_pairs, pair_votes, without_pairs
-from engine.poses.mapping import map_photographs, rank
-from engine.poses.pairs import Pair, all_pairs, pairs_with
-from engine.poses.workshop import linked_photographs, stage_of
-from engine.scene.images import read_image_info
-from engine.writing import write_json
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.events import Listener, Warned
+from octasplat.engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, RECORD, STAGE, PosesConfig
+from octasplat.engine.poses.features import (
+    feature_counts,
+    find_features,
+    make_database,
+    match_pairs,
+    quick_pairs,
+)
+from octasplat.engine.poses.folds import false_pairs, pair_votes, without_pairs
+from octasplat.engine.poses.mapping import map_photographs, rank
+from octasplat.engine.poses.pairs import Pair, all_pairs, pairs_with
+from octasplat.engine.poses.workshop import linked_photographs, stage_of
+from octasplat.engine.scene.images import read_image_info
+from octasplat.engine.writing import write_json
 
 SMALL_PX = 480
 """Below this, what COLMAP finds was seen to be wrong without any sign of it."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
-from engine.rays import ImageRays
+from octasplat.engine.rays import ImageRays
 
 
 @dataclass(frozen=True)

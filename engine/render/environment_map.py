@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from engine.colour import linear_to_srgb, srgb_to_linear
-from engine.errors import ConfigError, DatasetError
-from engine.render.images import read_image, write_exr, write_rgbe
+from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.render.images import read_image, write_exr, write_rgbe
 
 MAX_PIXELS = 1 << 27
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.model import FlatGaussians
 
 MARGIN = 1.08
 """Images are this much wider than what they frame."""

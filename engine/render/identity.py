@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-import engine
+from octasplat.engine import __version__
 
 
 def identity_of(*parts: Any) -> str:
@@ -18,7 +18,7 @@ def identity_of(*parts: Any) -> str:
     Paths count by the content of their files and not by their names, so that the same things elsewhere are
     the same; those within a dataclass say where it came from and do not count. The version of octasplat does.
     """
-    digest = hashlib.sha256(engine.__version__.encode())
+    digest = hashlib.sha256(__version__.encode())
     for part in parts:
         _add(digest, part)
     return digest.hexdigest()

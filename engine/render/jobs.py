@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import ImageRays
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.framing import fitting_distance, seen_bounds
-from engine.render.images import exr_layers, write_exr, write_png
-from engine.render.names import render_names
-from engine.render.oversampling import rays_across, render_averaged
-from engine.render.paths import Turntable, fit_turntable
-from engine.scene import Camera, PosedView, Viewpoints
-from engine.shading.plain import PLAIN
-from engine.shading.protocol import ShadingModel
-from engine.trace.protocol import Tracer
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.framing import fitting_distance, seen_bounds
+from octasplat.engine.render.images import exr_layers, write_exr, write_png
+from octasplat.engine.render.names import render_names
+from octasplat.engine.render.oversampling import rays_across, render_averaged
+from octasplat.engine.render.paths import Turntable, fit_turntable
+from octasplat.engine.scene import Camera, PosedView, Viewpoints
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
 
 DEFAULT_FOV_Y_DEGREES = 50.0
 _FOV_RANGE_DEGREES = (20.0, 90.0)
@@ -43,7 +43,7 @@ class Shot:
 Paint = Callable[[Shot, Path, Callable[[float], None]], None]
 """Renders a shot and writes it to a file, whose suffix says the format; told the share that is done.
 
-It raises :class:`engine.errors.OutputError` where the file cannot be written.
+It raises :class:`octasplat.engine.errors.OutputError` where the file cannot be written.
 """
 
 

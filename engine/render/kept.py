@@ -8,8 +8,8 @@ import hashlib
 import json
 from pathlib import Path
 
-from engine.errors import ConfigError, OutputError
-from engine.writing import telling_of_room, write_text
+from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.writing import telling_of_room, write_text
 
 RECORD = "unfinished.jsonl"
 

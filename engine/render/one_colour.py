@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from engine.gaussians.channels import Channels
-from engine.gaussians.harmonics import sh_basis
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.rays import ImageRays, RayBatch
-from engine.render.renderer import tile_order
-from engine.trace.protocol import TraceGradients, Tracer
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.render.renderer import tile_order
+from octasplat.engine.trace.protocol import TraceGradients, Tracer
 
 STEPS = 4
 """More follow the given cameras closer, and others less."""

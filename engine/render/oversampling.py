@@ -7,11 +7,17 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float32
 
-from engine.colour import linear_to_srgb
-from engine.rays import ImageRays
-from engine.render.renderer import RenderedImage, background_colour, layer_at, render_rays, tile_order
-from engine.shading.protocol import ShadingModel
-from engine.trace.protocol import Tracer
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.renderer import (
+    RenderedImage,
+    background_colour,
+    layer_at,
+    render_rays,
+    tile_order,
+)
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
 
 MOST_ACROSS = 4
 """More rays than 16 a pixel are not worth their time."""

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from engine.errors import ConfigError, OutputError
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.paths import PosePath
-from engine.writing import write_json
+from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.paths import PosePath
+from octasplat.engine.writing import write_json
 
 MAX_FRAMES = 100_000
 _RIGID_TOLERANCE = 1e-3

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.hashing import unit_numbers
-from engine.rays import ImageRays, RayBatch
-from engine.shading.plain import PLAIN
-from engine.shading.protocol import ShadingModel, Sight
-from engine.trace.facing import faced
-from engine.trace.protocol import Tracer
+from octasplat.engine.hashing import unit_numbers
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.trace.facing import faced
+from octasplat.engine.trace.protocol import Tracer
 
 RAYS_AT_ONCE = 1 << 18
 FRONT = 0.005

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from engine.errors import OutputError
-from engine.render.images import read_image
-from engine.render.jobs import Paint, Shot
-from engine.render.kept import KeptImages
-from engine.render.video import VideoWriter
-from engine.stages import Count
+from octasplat.engine.errors import OutputError
+from octasplat.engine.render.images import read_image
+from octasplat.engine.render.jobs import Paint, Shot
+from octasplat.engine.render.kept import KeptImages
+from octasplat.engine.render.video import VideoWriter
+from octasplat.engine.stages import Count
 
 FILM = "film.mp4"
 """Name of a film among its frames while it is written."""

@@ -14,9 +14,9 @@ import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float32
 
-from engine.colour import to_bytes
-from engine.errors import OutputError
-from engine.writing import replacing
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.errors import OutputError
+from octasplat.engine.writing import replacing
 
 DEFAULT_CRF = 18
 

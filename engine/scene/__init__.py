@@ -6,16 +6,16 @@ This package knows nothing of Gaussians. :class:`Dataset` is what training and e
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from engine.scene.cameras import Camera
-from engine.scene.model import PosedView, SceneModel, SparsePoints, View, Viewpoints, scene_extent
-from engine.scene.split import split_views, write_held_out
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.model import PosedView, SceneModel, SparsePoints, View, Viewpoints, scene_extent
+from octasplat.engine.scene.split import split_views, write_held_out
 
 if TYPE_CHECKING:
-    from engine.scene.dataset import Dataset
-    from engine.scene.load import load_scene
+    from octasplat.engine.scene.dataset import Dataset
+    from octasplat.engine.scene.load import load_scene
 
 # Compilers and image libraries come with these; whoever only checks a COLMAP model has neither.
-_HEAVY = {"Dataset": "engine.scene.dataset", "load_scene": "engine.scene.load"}
+_HEAVY = {"Dataset": "octasplat.engine.scene.dataset", "load_scene": "octasplat.engine.scene.load"}
 
 __all__ = [
     "Camera",

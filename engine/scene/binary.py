@@ -10,7 +10,7 @@ from typing import Any
 
 import pycolmap
 
-from engine.errors import DatasetError
+from octasplat.engine.errors import DatasetError
 
 
 def check_binary_model(folder: Path) -> None:

@@ -19,13 +19,13 @@ from typing import TypedDict
 import numpy as np
 from jaxtyping import Int64
 
-from engine.errors import DatasetError, NoSpaceLeft, OutputError
-from engine.scene.image_info import ImageInfo
-from engine.scene.images import read_mask, read_photo
-from engine.scene.mapped import MappedArray
-from engine.scene.model import SceneModel, View
-from engine.scene.views_file import FileDigests
-from engine.writing import replacing, write_json
+from octasplat.engine.errors import DatasetError, NoSpaceLeft, OutputError
+from octasplat.engine.scene.image_info import ImageInfo
+from octasplat.engine.scene.images import read_mask, read_photo
+from octasplat.engine.scene.mapped import MappedArray
+from octasplat.engine.scene.model import SceneModel, View
+from octasplat.engine.scene.views_file import FileDigests
+from octasplat.engine.writing import replacing, write_json
 
 CACHE_VERSION = 2
 """Raised whenever the contents of the cache files change for the same photographs."""

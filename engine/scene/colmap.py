@@ -10,12 +10,12 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64, Int64
 
-from engine.errors import DatasetError
-from engine.scene.binary import check_binary_model
-from engine.scene.cameras import Camera
-from engine.scene.model import SparsePoints
-from engine.scene.pose_check import check_poses
-from engine.scene.text import fault_in_text_model
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.scene.binary import check_binary_model
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.model import SparsePoints
+from octasplat.engine.scene.pose_check import check_poses
+from octasplat.engine.scene.text import fault_in_text_model
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where a scene keeps its model; the first that holds one counts."""

@@ -7,12 +7,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64, Int, Int64
 
-from engine.errors import DatasetError
-from engine.rays import ImageRays, RayBatch
-from engine.scene import kernels
-from engine.scene.cache import PixelCache, file_digests, open_pixel_cache
-from engine.scene.cameras import Camera
-from engine.scene.directions import (
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.scene import kernels
+from octasplat.engine.scene.cache import PixelCache, file_digests, open_pixel_cache
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.directions import (
     MAX_TABLE_BYTES,
     NO_TABLE_DIRECT,
     RayTables,
@@ -20,10 +20,10 @@ from engine.scene.directions import (
     open_ray_tables,
     rows_at_once,
 )
-from engine.scene.load import load_scene
-from engine.scene.model import Observations, SceneModel, SparsePoints, View, Viewpoints
-from engine.scene.split import measured_views, split_views
-from engine.scene.views_file import ViewsRecord, views_record
+from octasplat.engine.scene.load import load_scene
+from octasplat.engine.scene.model import Observations, SceneModel, SparsePoints, View, Viewpoints
+from octasplat.engine.scene.split import measured_views, split_views
+from octasplat.engine.scene.views_file import ViewsRecord, views_record
 
 MaskUse = Literal["ignore", "alpha"]
 
@@ -46,7 +46,7 @@ class Dataset:
         warnings: one sentence each on what is odd but usable.
         has_alpha: whether any pixel can have an alpha below 1.
         has_masks: whether any view has a mask.
-        extent: radius of the training cameras, see :func:`engine.scene.model.scene_extent`.
+        extent: radius of the training cameras, see :func:`octasplat.engine.scene.model.scene_extent`.
         near_world: distance from the cameras at which anything is seen; where it is given, all views are
             held out.
     """

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from engine.errors import OutputError
-from engine.scene.cameras import ROUND_TRIP_TOLERANCE_PX, Camera
-from engine.scene.mapped import MappedArray
-from engine.writing import replacing, write_text
+from octasplat.engine.errors import OutputError
+from octasplat.engine.scene.cameras import ROUND_TRIP_TOLERANCE_PX, Camera
+from octasplat.engine.scene.mapped import MappedArray
+from octasplat.engine.writing import replacing, write_text
 
 MAX_TABLE_BYTES = 4 << 30
 """Cameras whose tables do not fit in here are un-projected at every call."""

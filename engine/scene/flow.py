@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float64
 
-from engine.scene.cameras import Camera
+from octasplat.engine.scene.cameras import Camera
 
 DEPTH_SHARE = 1e-4
 """Slopes of the projection are differences over this share of the middle depth."""

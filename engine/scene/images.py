@@ -7,10 +7,10 @@ import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float32, UInt8
 
-from engine.colour import linear_to_srgb
-from engine.errors import DatasetError
-from engine.scene.image_info import ImageInfo
-from engine.threads import one_torch_thread
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.scene.image_info import ImageInfo
+from octasplat.engine.threads import one_torch_thread
 
 Pixels = np.ndarray[Any, np.dtype[Any]]
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from engine.errors import ConfigError, DatasetError
-from engine.scene.cameras import Camera
-from engine.scene.colmap import ColmapModel, PosedImage, read_colmap_model
-from engine.scene.image_info import ImageInfo
-from engine.scene.images import read_image_info
-from engine.scene.model import Observations, SceneModel, View
-from engine.scene.views_file import capped_size
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.colmap import ColmapModel, PosedImage, read_colmap_model
+from octasplat.engine.scene.image_info import ImageInfo
+from octasplat.engine.scene.images import read_image_info
+from octasplat.engine.scene.model import Observations, SceneModel, View
+from octasplat.engine.scene.views_file import capped_size
 
 MIN_VIEWS = 3
 """Fewer photographs than this do not make a scene."""
@@ -49,11 +49,11 @@ def load_scene(
     """Read the model of a scene and the headers of its photographs, but no pixels.
 
     Args:
-        root: folder with ``images/``, a COLMAP model (see :mod:`engine.scene.colmap`) and, if there are any,
-            ``masks/<image name>.png``.
+        root: folder with ``images/``, a COLMAP model (see :mod:`octasplat.engine.scene.colmap`) and, if there
+            are any, ``masks/<image name>.png``.
         max_side: cap on the longer side of the photographs, in pixels.
-        model_folder: of a model that was found for the photographs, see :mod:`engine.poses`; ``root`` may
-            then be a bare folder of photographs.
+        model_folder: of a model that was found for the photographs, see :mod:`octasplat.engine.poses`;
+            ``root`` may then be a bare folder of photographs.
         least_views: so many photographs must be posed.
         for_training: warn of what matters to training only.
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from engine.scene.cameras import Camera
-from engine.scene.image_info import ImageInfo
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.image_info import ImageInfo
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from scipy.spatial import cKDTree
 
-from engine.scene.model import PosedView, SparsePoints, Viewpoints
+from octasplat.engine.scene.model import PosedView, SparsePoints, Viewpoints
 
 LEAST_POINTS = 50
 """Fewer points say nothing about what is near."""

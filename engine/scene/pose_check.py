@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from engine.errors import DatasetError
-from engine.scene.model import SparsePoints
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.scene.model import SparsePoints
 
 FAR = 10.0
 """Cameras farther off than this many times what is usual in the scene are told; of ten real scenes none goes

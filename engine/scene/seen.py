@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
-from engine.scene.cameras import Camera
-from engine.scene.model import PosedView, Viewpoints
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.model import PosedView, Viewpoints
 
 
 @dataclass(frozen=True, eq=False)

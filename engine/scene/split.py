@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from engine.errors import ConfigError, DatasetError
-from engine.writing import write_json
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.writing import write_json
 
 
 def split_views(

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Int64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from engine.errors import ConfigError
-from engine.scene.cameras import Camera
-from engine.scene.model import PosedView, SceneModel, SparsePoints, Viewpoints, scene_extent
-from engine.scene.split import split_views
-from engine.writing import write_text
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.model import PosedView, SceneModel, SparsePoints, Viewpoints, scene_extent
+from octasplat.engine.scene.split import split_views
+from octasplat.engine.writing import write_text
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Row = tuple[_Finite, _Finite, _Finite]
@@ -41,7 +41,8 @@ class SplitViewpoints(Viewpoints):
     Attributes:
         train_indices: views trained on.
         test_indices: views held out.
-        extent: radius of the training cameras in world units, see :func:`engine.scene.model.scene_extent`.
+        extent: radius of the training cameras in world units, see
+            :func:`octasplat.engine.scene.model.scene_extent`.
     """
 
     train_indices: Int64[np.ndarray, " train"]

@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.shading.buffer import Leaving
-from engine.trace.protocol import Tracer
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.buffer import Leaving
+from octasplat.engine.trace.protocol import Tracer
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 RAYS_AT_ONCE = 1 << 18

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from engine.rays import AT_INFINITY, RayBatch
-from engine.shading.split_sum import Surface
-from engine.trace.facing import Faced, faced
-from engine.trace.protocol import TraceResult
+from octasplat.engine.rays import AT_INFINITY, RayBatch
+from octasplat.engine.shading.split_sum import Surface
+from octasplat.engine.trace.facing import Faced, faced
+from octasplat.engine.trace.protocol import TraceResult
 
 LEAST_RISE = 0.01
 """Cosine to the normal that reflected rays have at least."""

@@ -12,24 +12,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.colour import linear_to_srgb, srgb_to_linear
-from engine.gaussians.channels import stacked
-from engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.shading.ambient import OPEN, ambient_visibility, bounced_light
-from engine.shading.buffer import Buffer, Leaving, gather, spread_back
-from engine.shading.environment_frame import environment_frame
-from engine.shading.geometry_terms import neighbour_terms, spread_term
-from engine.shading.incoming import ByLobes, ByOneRay, Incoming
-from engine.shading.learnt_light import LearntLight
-from engine.shading.material_settings import SEED_MATERIAL, MaterialSettings
-from engine.shading.parted import Parted, part, whole
-from engine.shading.protocol import Developed, Reversed, Sight
-from engine.shading.reflections import Follower
-from engine.shading.slopes import clipped, encoding_slope
-from engine.shading.split_sum import Surface, shade, shade_reverse
-from engine.trace.protocol import GaussianGradients, TraceGradients, Tracer, TraceResult
+from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
+from octasplat.engine.gaussians.channels import stacked
+from octasplat.engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.ambient import OPEN, ambient_visibility, bounced_light
+from octasplat.engine.shading.buffer import Buffer, Leaving, gather, spread_back
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.shading.geometry_terms import neighbour_terms, spread_term
+from octasplat.engine.shading.incoming import ByLobes, ByOneRay, Incoming
+from octasplat.engine.shading.learnt_light import LearntLight
+from octasplat.engine.shading.material_settings import SEED_MATERIAL, MaterialSettings
+from octasplat.engine.shading.parted import Parted, part, whole
+from octasplat.engine.shading.protocol import Developed, Reversed, Sight
+from octasplat.engine.shading.reflections import Follower
+from octasplat.engine.shading.slopes import clipped, encoding_slope
+from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse
+from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, Tracer, TraceResult
 
 AMBIENT_COLUMN = 5
 BOUNCED_COLUMNS = slice(6, 9)
@@ -58,7 +58,7 @@ class Deferred:
         extent_world: the scene's extent.
         sided: whether normals point outwards, so that only one side of each Gaussian is lit.
         window_rays: rays of a window of the training's batches, see
-            :class:`engine.train.batches.BatchSource`; 1 where there are none.
+            :class:`octasplat.engine.train.batches.BatchSource`; 1 where there are none.
 
     Attributes:
         light: the environment.

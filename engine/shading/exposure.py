@@ -4,7 +4,7 @@ A phone sets its exposure anew for every photograph. Without a model of that, Ga
 different from where each photograph was taken. The scene keeps the exposure that is the mean of all.
 
 Nothing is fitted to views that were not trained on: their exposure is guessed from what they show of the
-scene and from the photographs beside them (:mod:`engine.shading.exposure_guess`).
+scene and from the photographs beside them (:mod:`octasplat.engine.shading.exposure_guess`).
 """
 
 import copy
@@ -13,11 +13,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.gaussians.model import FlatGaussians
-from engine.shading.exposure_guess import guessed, times_of
-from engine.shading.plain import PLAIN
-from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
-from engine.trace.protocol import GaussianGradients, Tracer
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.shading.exposure_guess import guessed, times_of
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from octasplat.engine.trace.protocol import GaussianGradients, Tracer
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 ExposuresByName = Mapping[str, Mapping[str, Sequence[float]]]
@@ -28,7 +28,8 @@ _STATE = ("log_gains", "offsets", "first", "second", "steps")
 class Exposures:
     """Of each view and channel: shown colour = exp(log_gain) * developed colour + offset.
 
-    Follows :class:`engine.shading.protocol.ShadingModel`. What is seen by no view has the mean exposure.
+    Follows :class:`octasplat.engine.shading.protocol.ShadingModel`. What is seen by no view has the mean
+    exposure.
 
     Args:
         views: how many there are, whether they are trained on or not.
@@ -97,7 +98,7 @@ class Exposures:
     def guess_others(self, names: Sequence[str], brightness: Float64[np.ndarray, " v"] | None = None) -> None:
         """Give views that were not trained on the exposures that the trained ones suggest.
 
-        See :mod:`engine.shading.exposure_guess`.
+        See :mod:`octasplat.engine.shading.exposure_guess`.
 
         Args:
             names: of all views.

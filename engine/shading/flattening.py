@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32
 
-from engine.shading.geometry_terms import depth_normal_term
-from engine.shading.plain import Plain
-from engine.shading.protocol import Developed, Reversed, Sight
+from octasplat.engine.shading.geometry_terms import depth_normal_term
+from octasplat.engine.shading.plain import Plain
+from octasplat.engine.shading.protocol import Developed, Reversed, Sight
 
 
 class Flattening(Plain):

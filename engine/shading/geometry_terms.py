@@ -9,9 +9,9 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from engine.shading.buffer import Buffer
-from engine.shading.material_settings import MaterialSettings
-from engine.shading.protocol import Sight
+from octasplat.engine.shading.buffer import Buffer
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.protocol import Sight
 
 OPAQUE = 0.9
 """Accumulated alpha from which on a ray shows a surface."""

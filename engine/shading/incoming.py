@@ -6,9 +6,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64
 
-from engine.colour import srgb_to_linear
-from engine.shading.buffer import Buffer, Leaving, reflected_rays
-from engine.shading.lobe import (
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.shading.buffer import Buffer, Leaving, reflected_rays
+from octasplat.engine.shading.lobe import (
     Lobe,
     Widening,
     by_each,
@@ -18,13 +18,13 @@ from engine.shading.lobe import (
     roughness_slope,
     widening,
 )
-from engine.shading.material_settings import SEED_REACH, MaterialSettings
-from engine.shading.parted import Parted
-from engine.shading.protocol import Sight
-from engine.shading.reflections import Follower, Seen, follow_back
-from engine.shading.slopes import encoding_slope
-from engine.shading.split_sum import ShadeGradients
-from engine.trace.protocol import Recording, TraceGradients
+from octasplat.engine.shading.material_settings import SEED_REACH, MaterialSettings
+from octasplat.engine.shading.parted import Parted
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.reflections import Follower, Seen, follow_back
+from octasplat.engine.shading.slopes import encoding_slope
+from octasplat.engine.shading.split_sum import ShadeGradients
+from octasplat.engine.trace.protocol import Recording, TraceGradients
 
 HIDDEN = 0.5
 """Transmittance below which the seed's way of seeing counts the environment as hidden."""
@@ -58,7 +58,7 @@ class Incoming(Protocol):
 
 @dataclass(frozen=True)
 class ByLobes:
-    """Pairs of rays, what they meet shaded by the split sum; see :mod:`engine.shading.lobe`.
+    """Pairs of rays, what they meet shaded by the split sum; see :mod:`octasplat.engine.shading.lobe`.
 
     Attributes:
         lobe: what they saw.

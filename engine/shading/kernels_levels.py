@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from engine.shading.kernels_microfacets import ggx_density
+from octasplat.engine.shading.kernels_microfacets import ggx_density
 
 LEAST_SQUARE = 1e-6
 """Nearer than this to a pole, a longitude has no slope."""

@@ -2,8 +2,8 @@
 
 from numba import njit, prange
 
-from engine.shading.kernels_levels import look_up
-from engine.shading.kernels_split_sum import mix
+from octasplat.engine.shading.kernels_levels import look_up
+from octasplat.engine.shading.kernels_split_sum import mix
 
 
 @njit(error_model="numpy")

@@ -7,7 +7,7 @@ https://arxiv.org/abs/2306.05044).
 
 import math
 
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_native import lean
 
 
 @lean(forceinline=True)

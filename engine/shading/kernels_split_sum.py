@@ -1,14 +1,15 @@
 """Split-sum shading of pixels, its gradients, and the table of the BRDF's half.
 
-Everything is a pure function of its arguments in float64; :mod:`engine.shading.split_sum` has the formula.
+Everything is a pure function of its arguments in float64; :mod:`octasplat.engine.shading.split_sum` has the
+formula.
 """
 
 import math
 
 from numba import njit, prange
 
-from engine.shading.kernels_levels import look_up
-from engine.shading.kernels_microfacets import ggx_masking, sample_visible_normal, schlick_weight
+from octasplat.engine.shading.kernels_levels import look_up
+from octasplat.engine.shading.kernels_microfacets import ggx_masking, sample_visible_normal, schlick_weight
 
 TAPS = 12
 """Texels that a pixel asks: four each of two levels of the lobe and of the irradiance."""
@@ -155,7 +156,7 @@ def direction_slope(texels, found, channel):
 def reverse_pixel(
     p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur, by_rgb, out
 ):
-    """Gradients of one pixel; see :class:`engine.shading.split_sum.ShadeGradients`."""
+    """Gradients of one pixel; see :class:`octasplat.engine.shading.split_sum.ShadeGradients`."""
     texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
     n_x, n_y, n_z = normal[p, 0], normal[p, 1], normal[p, 2]
     d_x, d_y, d_z = direction[p, 0], direction[p, 1], direction[p, 2]

@@ -10,14 +10,14 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.gaussians.model import FlatGaussians
-from engine.shading.environment_frame import environment_frame
-from engine.shading.environment_levels import solid_angles
-from engine.shading.kernels_map import add_to_texels, map_colours
-from engine.shading.map_steps import adam_change, unevenness
-from engine.shading.plain import PLAIN
-from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
-from engine.trace.protocol import GaussianGradients, Tracer
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.shading.environment_levels import solid_angles
+from octasplat.engine.shading.kernels_map import add_to_texels, map_colours
+from octasplat.engine.shading.map_steps import adam_change, unevenness
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from octasplat.engine.trace.protocol import GaussianGradients, Tracer
 
 UP_WORLD = (0.0, -1.0, 0.0)
 """Up in maps, about right for most worlds that COLMAP makes; it only says how the picture of a map lies."""
@@ -27,7 +27,9 @@ _STATE = ("rgb_srgb", "first", "second", "sums", "steps")
 
 
 class LearntBackground:
-    """Puts a map behind what another model develops; follows :class:`engine.shading.protocol.ShadingModel`.
+    """Puts a map behind what another model develops.
+
+    Follows :class:`octasplat.engine.shading.protocol.ShadingModel`.
 
     Args:
         height: texels from up to down; there are twice as many around.

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.shading.environment_levels import LightLevels, prefilter, resampled, solid_angles
-from engine.shading.map_steps import adam_change, unevenness
-from engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.environment_levels import LightLevels, prefilter, resampled, solid_angles
+from octasplat.engine.shading.map_steps import adam_change, unevenness
+from octasplat.engine.shading.material_settings import MaterialSettings
 
 FIRST_RADIANCE = 0.5
 _DARKEST, _BRIGHTEST = np.log(1e-4), np.log(1e4)

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from engine.hashing import unit_numbers
-from engine.rays import RayBatch, joined
-from engine.shading.buffer import Buffer, reflected_rays
-from engine.shading.reflections import Follower, Mirrored, Seen
-from engine.shading.split_sum import Surface
+from octasplat.engine.hashing import unit_numbers
+from octasplat.engine.rays import RayBatch, joined
+from octasplat.engine.shading.buffer import Buffer, reflected_rays
+from octasplat.engine.shading.reflections import Follower, Mirrored, Seen
+from octasplat.engine.shading.split_sum import Surface
 
 STEEPEST_FACET = 0.9
 """Share of GGX's facets that are sampled; the others are steeper than these."""

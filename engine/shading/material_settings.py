@@ -21,8 +21,8 @@ class MaterialSettings(BaseModel):
             Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a colour of its own from the
             harmonics, the environment stays in [0, 1], everything is in display values, visibility is
             yes or no, and materials start over when deferred shading begins.
-        up_world: up; with it :func:`engine.shading.environment_frame.environment_frame` says which way the
-            environment lies.
+        up_world: up; with it :func:`octasplat.engine.shading.environment_frame.environment_frame` says which
+            way the environment lies.
         environment_height: texels of the environment from up to down; it has twice as many around.
         environment_every: iterations between two steps of the environment.
         hand_over: when shading begins to replace the harmonics' colours, and when it has.

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, Shaped
 
-from engine.rays import RayBatch, joined
-from engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
+from octasplat.engine.rays import RayBatch, joined
+from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 
 LEAST_SHARE = 0.05
 """Of the light of a ray that each of two surfaces takes at least."""

@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float32
 
-from engine.gaussians.model import FlatGaussians
-from engine.shading.protocol import Developed, Reversed, Sight
-from engine.trace.protocol import GaussianGradients, TraceGradients, Tracer
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.shading.protocol import Developed, Reversed, Sight
+from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, Tracer
 
 
 class Plain:
-    """Changes nothing and learns nothing; follows :class:`engine.shading.protocol.ShadingModel`."""
+    """Changes nothing and learns nothing; follows :class:`octasplat.engine.shading.protocol.ShadingModel`."""
 
     name = "plain"
 

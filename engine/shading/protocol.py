@@ -14,9 +14,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 
 @dataclass(frozen=True)

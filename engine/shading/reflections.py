@@ -1,6 +1,7 @@
 """What reflected rays see: followed from surface to surface through the same Gaussians, with the way back.
 
-:mod:`engine.shading.lobe` says how they leave the first surface; from there on paths go by plain mirrors.
+:mod:`octasplat.engine.shading.lobe` says how they leave the first surface; from there on paths go by plain
+mirrors.
 """
 
 from collections.abc import Callable
@@ -10,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from engine.rays import RayBatch
-from engine.shading.buffer import Buffer, Leaving, gather, reflected_rays, spread_back
-from engine.shading.environment_levels import LightLevels
-from engine.shading.parted import Parted, part, whole
-from engine.shading.split_sum import Surface, shade, shade_reverse
-from engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.buffer import Buffer, Leaving, gather, reflected_rays, spread_back
+from octasplat.engine.shading.environment_levels import LightLevels
+from octasplat.engine.shading.parted import Parted, part, whole
+from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse
+from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer, TraceResult
 
 
 class Seen(NamedTuple):
@@ -69,7 +70,7 @@ class Follower:
         dimmed: the surface of a buffer with its ambient visibility.
         surfaces: on a path, at least 1; the last one sees nothing but the environment.
         leaving: how rays leave a surface.
-        apart_world: see :func:`engine.shading.parted.part`; 0 parts nothing.
+        apart_world: see :func:`octasplat.engine.shading.parted.part`; 0 parts nothing.
     """
 
     tracer: Tracer

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float64
 
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.mesh import TriangleMesh
 
 RINGS = 64
 CLEARANCE = 1.05

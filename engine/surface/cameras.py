@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from engine.gaussians.model import FlatGaussians
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.jobs import gaussian_turntable
-from engine.render.paths import look_at
-from engine.scene import Camera, PosedView, Viewpoints
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.jobs import gaussian_turntable
+from octasplat.engine.render.paths import look_at
+from octasplat.engine.scene import Camera, PosedView, Viewpoints
 
 MAX_SLOPE = 1.2
 """Lenses wider than this to a side (50 degrees) are cut there: a pinhole shows nothing well beyond."""

@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from engine.surface.holes import fill_holes
-from engine.surface.mesh import TriangleMesh, directed_edges, edge_report
+from octasplat.engine.surface.holes import fill_holes
+from octasplat.engine.surface.mesh import TriangleMesh, directed_edges, edge_report
 
 UNTANGLING_ROUNDS = 5
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from engine.rays import RayBatch
-from engine.render.cameras import RenderCamera
-from engine.surface.mesh import TriangleMesh
-from engine.surface.occlusion import Occluder
-from engine.trace.protocol import Tracer, TraceResult
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.occlusion import Occluder
+from octasplat.engine.trace.protocol import Tracer, TraceResult
 
 Progress = Callable[[int, int], None]
 BEST_VIEWS = 3

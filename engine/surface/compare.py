@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from scipy.spatial import cKDTree
 
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.mesh import TriangleMesh
 
 NEIGHBOURS = 8
 """Triangles tried for each point: those of the nearest samples."""

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from engine.colour import to_bytes
-from engine.rays import ImageRays
-from engine.render.cameras import RenderCamera
-from engine.render.renderer import RenderedImage, render_rays
-from engine.surface.fitting import Picture
-from engine.surface.options import SurfaceOptions
-from engine.trace.protocol import Tracer
-from engine.writing import telling_of_room
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.renderer import RenderedImage, render_rays
+from octasplat.engine.surface.fitting import Picture
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.writing import telling_of_room
 
 Progress = Callable[[int, int], None]
 EMPTY_ALPHA = 0.05

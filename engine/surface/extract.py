@@ -8,25 +8,25 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.spatial import cKDTree
 
-from engine.colour import to_bytes
-from engine.events import Listener, ignore
-from engine.render.cameras import RenderCamera
-from engine.stages import counted_stage, stopping
-from engine.surface.backdrop import with_backdrop
-from engine.surface.clean import decimate, keep_large_components
-from engine.surface.colours import COLOURS, Look, bake
-from engine.surface.depth import render_depth_maps
-from engine.surface.fitting import Palette, Picture, TexturePalette, VertexPalette, fitted
-from engine.surface.holes import fill_holes
-from engine.surface.marching import surface_of
-from engine.surface.materials import MATERIALS, with_materials
-from engine.surface.mesh import EdgeReport, TriangleMesh, edge_report
-from engine.surface.options import SurfaceOptions
-from engine.surface.region import Region, choose_region, focus
-from engine.surface.settling import settled
-from engine.surface.texture import lay_out
-from engine.surface.volume import BYTES_PER_BLOCK, Volume, fuse, solid_where_unseen
-from engine.trace.protocol import Tracer
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.stages import counted_stage, stopping
+from octasplat.engine.surface.backdrop import with_backdrop
+from octasplat.engine.surface.clean import decimate, keep_large_components
+from octasplat.engine.surface.colours import COLOURS, Look, bake
+from octasplat.engine.surface.depth import render_depth_maps
+from octasplat.engine.surface.fitting import Palette, Picture, TexturePalette, VertexPalette, fitted
+from octasplat.engine.surface.holes import fill_holes
+from octasplat.engine.surface.marching import surface_of
+from octasplat.engine.surface.materials import MATERIALS, with_materials
+from octasplat.engine.surface.mesh import EdgeReport, TriangleMesh, edge_report
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.region import Region, choose_region, focus
+from octasplat.engine.surface.settling import settled
+from octasplat.engine.surface.texture import lay_out
+from octasplat.engine.surface.volume import BYTES_PER_BLOCK, Volume, fuse, solid_where_unseen
+from octasplat.engine.trace.protocol import Tracer
 
 Points = Float32[np.ndarray, "n 3"]
 TOLERANCE_VOXELS = 2.0
@@ -100,8 +100,8 @@ def extract_levels(
         levels: at most so many triangles; None keeps all.
         scratch: folder for a temporary file of 12 bytes for every pixel of the depth maps.
         light_frame: bake materials, which the tracer then has as its first features
-            (:func:`engine.surface.materials.material_features`), for light with these rows right, up and
-            forward in the world; None bakes colours. Needs a texture.
+            (:func:`octasplat.engine.surface.materials.material_features`), for light with these rows right,
+            up and forward in the world; None bakes colours. Needs a texture.
         photographs: what colours are fitted to; without any, what the scene shows from ``cameras``.
         listener: hears the stages ``depth``, ``fusing``, ``meshing``, ``settling`` and ``decimating`` (if
             asked), ``unwrapping`` (with a texture), ``colouring`` and ``fitting`` (of colours).

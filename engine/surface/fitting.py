@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, UInt8
 from scipy.sparse import csr_matrix, identity
 
-from engine.rays import ImageRays
-from engine.surface.least_squares import conjugate_gradients, differences, share_rows
-from engine.surface.mesh import TriangleMesh, edges_of
-from engine.surface.texture import TextureLayout
-from engine.trace.meshes import TriangleScene
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.surface.least_squares import conjugate_gradients, differences, share_rows
+from octasplat.engine.surface.mesh import TriangleMesh, edges_of
+from octasplat.engine.surface.texture import TextureLayout
+from octasplat.engine.trace.meshes import TriangleScene
 
 Progress = Callable[[int, int], None]
 SMOOTHNESS = 0.3

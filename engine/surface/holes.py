@@ -5,7 +5,7 @@ import heapq
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from engine.surface.mesh import TriangleMesh, directed_edges
+from octasplat.engine.surface.mesh import TriangleMesh, directed_edges
 
 Rim = list[int]
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from engine.errors import ConfigError
-from engine.surface.kernels_marching import count_parts, place_triangles, place_vertices
-from engine.surface.marching_table import EDGES, marching_table
-from engine.surface.mesh import TriangleMesh
-from engine.surface.volume import Volume
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.surface.kernels_marching import count_parts, place_triangles, place_vertices
+from octasplat.engine.surface.marching_table import EDGES, marching_table
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.volume import Volume
 
 
 def surface_of(volume: Volume, min_weight: float) -> TriangleMesh:

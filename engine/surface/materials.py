@@ -3,14 +3,14 @@
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from engine.colour import linear_to_srgb, to_bytes
-from engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
-from engine.gaussians.model import FlatGaussians
-from engine.surface.colours import Look
-from engine.surface.mesh import MaterialMaps, TriangleMesh
-from engine.surface.tangents import in_tangent_frame, vertex_tangents
-from engine.surface.texture import TextureLayout
-from engine.trace.protocol import TraceResult
+from octasplat.engine.colour import linear_to_srgb, to_bytes
+from octasplat.engine.gaussians.materials import AMBIENT, MATERIAL_WIDTHS
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.surface.colours import Look
+from octasplat.engine.surface.mesh import MaterialMaps, TriangleMesh
+from octasplat.engine.surface.tangents import in_tangent_frame, vertex_tangents
+from octasplat.engine.surface.texture import TextureLayout
+from octasplat.engine.trace.protocol import TraceResult
 
 LEAST_RISE = 0.1
 """Normals that lean farther from the surface than this (the cosine) are laid back: a renderer that lights a

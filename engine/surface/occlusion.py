@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-from engine.rays import RayBatch
-from engine.surface.mesh import TriangleMesh
-from engine.trace.meshes import TriangleScene
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.trace.meshes import TriangleScene
 
 NEAR_SHARE = 1e-3
 """The last thousandth of the way to a point is not tested, lest the point's own triangle hide it."""

@@ -8,7 +8,7 @@ Box = tuple[float, float, float, float, float, float]
 
 
 class SurfaceOptions(BaseModel):
-    """Settings of :func:`engine.surface.extract.extract_surface`.
+    """Settings of :func:`octasplat.engine.surface.extract.extract_surface`.
 
     Attributes:
         unbounded: reach to infinity by fusing in contracted space instead of a box.

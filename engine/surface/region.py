@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float64
 
-from engine.errors import ConfigError
-from engine.render.cameras import RenderCamera
-from engine.render.paths import fit_turntable
-from engine.surface.depth import DepthMaps
-from engine.surface.options import SurfaceOptions
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.paths import fit_turntable
+from octasplat.engine.surface.depth import DepthMaps
+from octasplat.engine.surface.options import SurfaceOptions
 
 BLOCK = 8
 """Voxels along a side of a block."""

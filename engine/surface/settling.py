@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.sparse import csr_matrix
 
-from engine.rays import ImageRays, RayBatch
-from engine.surface.fitting import MIN_ALPHA, Picture, Progress, VertexPalette
-from engine.surface.kernels_settling import gather, gather_squares, linearise, show
-from engine.surface.least_squares import conjugate_gradients, differences
-from engine.surface.mesh import TriangleMesh
-from engine.trace.meshes import TriangleScene
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.surface.fitting import MIN_ALPHA, Picture, Progress, VertexPalette
+from octasplat.engine.surface.kernels_settling import gather, gather_squares, linearise, show
+from octasplat.engine.surface.least_squares import conjugate_gradients, differences
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.trace.meshes import TriangleScene
 
 SIDE_PX = 260
 """Pictures are made about this large: displacements count that are about a pixel of theirs."""

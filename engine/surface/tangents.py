@@ -9,7 +9,7 @@ of their corners there.
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.mesh import TriangleMesh
 
 
 def vertex_tangents(mesh: TriangleMesh) -> Float32[np.ndarray, "n 4"]:

@@ -7,8 +7,8 @@ from jaxtyping import Float32, Float64, Int32
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_matrix
 
-from engine.surface.kernels_texture import rasterise
-from engine.surface.mesh import TriangleMesh, directed_edges
+from octasplat.engine.surface.kernels_texture import rasterise
+from octasplat.engine.surface.mesh import TriangleMesh, directed_edges
 
 PADDING_PX = 2
 SMOOTHING_ROUNDS = 20

@@ -5,11 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from engine.errors import ConfigError
-from engine.surface.depth import DepthMaps, Progress
-from engine.surface.kernels_volume import NO_BLOCK, TILE, VOXELS, fuse_view, mark_blocks, tile_ranges
-from engine.surface.options import SurfaceOptions
-from engine.surface.region import NOTHING_SEEN, Region
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.surface.depth import DepthMaps, Progress
+from octasplat.engine.surface.kernels_volume import (
+    NO_BLOCK,
+    TILE,
+    VOXELS,
+    fuse_view,
+    mark_blocks,
+    tile_ranges,
+)
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.region import NOTHING_SEEN, Region
 
 BYTES_PER_BLOCK = VOXELS * (4 + 4 + 4 + 1)
 """Distance and weight, and what marching cubes adds: the first vertex of each voxel and its crossed edges."""

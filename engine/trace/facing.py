@@ -1,8 +1,8 @@
 """Blended normals made to face the viewer.
 
-Where normals keep their side (``turned_beyond`` of :class:`engine.trace.protocol.TraceSettings`), the blend
-of a ray that grazes an outline may point a little away from the viewer. No surface that is seen does so: it
-is laid back into the plane across the ray, but for :data:`LEAST_COSINE`.
+Where normals keep their side (``turned_beyond`` of :class:`octasplat.engine.trace.protocol.TraceSettings`),
+the blend of a ray that grazes an outline may point a little away from the viewer. No surface that is seen
+does so: it is laid back into the plane across the ray, but for :data:`LEAST_COSINE`.
 """
 
 from typing import NamedTuple

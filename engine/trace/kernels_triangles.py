@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_native import call_with_four_pointers, lean
+from octasplat.engine.trace.kernels_native import call_with_four_pointers, lean
 
 LANES = 8
 # --- RTCRayHit8: a row of eight 32-bit words each ---

@@ -1,6 +1,6 @@
 """The one place where tracers are made."""
 
-from engine.trace.protocol import Tracer, TraceSettings
+from octasplat.engine.trace.protocol import Tracer, TraceSettings
 
 
 def make_tracer(
@@ -15,15 +15,15 @@ def make_tracer(
     Args:
         settings: which tracer, and where rays are cut off.
         threads: threads for building and tracing; 0 takes all.
-        box_padding: for tracers with a hierarchy, see :class:`engine.trace.cpu.CpuTracer`.
+        box_padding: for tracers with a hierarchy, see :class:`octasplat.engine.trace.cpu.CpuTracer`.
         build_quality: likewise; 0 is for scenes that change, 2 for those that are only looked at.
     """
     settings = settings or TraceSettings()
     # Here, as each brings libraries that another one does without.
     if settings.tracer == "reference":
-        from engine.trace.reference_tracer import ReferenceTracer
+        from octasplat.engine.trace.reference_tracer import ReferenceTracer
 
         return ReferenceTracer(settings)
-    from engine.trace.cpu.tracer import CpuTracer
+    from octasplat.engine.trace.cpu.tracer import CpuTracer
 
     return CpuTracer(settings, threads=threads, box_padding=box_padding, build_quality=build_quality)

@@ -6,11 +6,11 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
-from engine.rays import RayBatch
-from engine.threads import use_threads
-from engine.trace.cpu.memory import aligned_empty
-from engine.trace.embree_library import Device, MeshScene, intersect8_address, occluded8_address
-from engine.trace.kernels_triangles import (
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.cpu.memory import aligned_empty
+from octasplat.engine.trace.embree_library import Device, MeshScene, intersect8_address, occluded8_address
+from octasplat.engine.trace.kernels_triangles import (
     LANES,
     SCRATCH_ROWS,
     TriangleQuery,
@@ -105,12 +105,12 @@ class TriangleScene:
 
     @property
     def closest_query(self) -> TriangleQuery:
-        """What :func:`engine.trace.kernels_triangles.closest_hits` is to ask; good while this lives."""
+        """What :func:`~octasplat.engine.trace.kernels_triangles.closest_hits` asks; good while this lives."""
         return TriangleQuery(intersect8_address(), self._scene.handle)
 
     @property
     def any_query(self) -> TriangleQuery:
-        """What :func:`engine.trace.kernels_triangles.any_hits` is to ask; good while this lives."""
+        """What :func:`octasplat.engine.trace.kernels_triangles.any_hits` is to ask; good while this lives."""
         return TriangleQuery(occluded8_address(), self._scene.handle)
 
     def _scratch(self, rays: int) -> Float32[np.ndarray, "c w"]:

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float32, Int32
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import CHI2_2_99
-from engine.rays import RayBatch
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import CHI2_2_99
+from octasplat.engine.rays import RayBatch
 
 
 class TraceSettings(BaseModel):
@@ -191,7 +191,7 @@ class Tracer(Protocol):
         """Follow rays with unit directions; ``record`` keeps what :meth:`backward` needs.
 
         A Gaussian is seen where ``t_min < t < t_max``, in its colour as the ray's viewer has it (``t_viewer``
-        of :class:`engine.rays.RayBatch`).
+        of :class:`octasplat.engine.rays.RayBatch`).
         """
         ...
 

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import APOTHEM
-from engine.rays import RayBatch
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import APOTHEM
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import TraceSettings
 
 GRAZING_COSINE = 1e-6
 
@@ -48,7 +48,7 @@ class ReferenceParameters:
 
 @dataclass
 class ReferenceResult:
-    """Outputs as in :class:`engine.trace.protocol.TraceResult`, float64, and the ordered ids of each ray."""
+    """Outputs as in :class:`~octasplat.engine.trace.protocol.TraceResult`, float64; ordered ids by ray."""
 
     rgb_srgb: Tensor
     transmittance: Tensor

@@ -7,11 +7,17 @@ import torch
 from jaxtyping import Float32, Float64, Int32
 from torch import Tensor
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, TraceResult, TraceSettings
-from engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
-from engine.trace.sums import heavier
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import (
+    GaussianGradients,
+    Recording,
+    TraceGradients,
+    TraceResult,
+    TraceSettings,
+)
+from octasplat.engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
+from octasplat.engine.trace.sums import heavier
 
 PAIRS_AT_ONCE = 1 << 17
 """Rays times Gaussians of one piece; each pair takes about a kilobyte while its gradient is kept."""
@@ -33,7 +39,10 @@ class ReferenceRecording:
 
 
 class ReferenceTracer:
-    """:func:`engine.trace.reference.trace_reference` behind :class:`engine.trace.protocol.Tracer`.
+    """The reference implementation behind the tracer protocol.
+
+    See :func:`octasplat.engine.trace.reference.trace_reference` and
+    :class:`octasplat.engine.trace.protocol.Tracer`.
 
     Args:
         settings: where rays are cut off.

@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from engine.trace.protocol import GaussianGradients
+from octasplat.engine.trace.protocol import GaussianGradients
 
 
 def add_gradients(parts: Sequence[GaussianGradients]) -> GaussianGradients:

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from engine.colour import composited
-from engine.scene import Camera
-from engine.scene.flow import flow_by_pose
-from engine.scene.seen import turned
-from engine.train.batches import still_background
-from engine.train.config import TrainConfig
-from engine.train.pixel_sampler import Pixels
+from octasplat.engine.colour import composited
+from octasplat.engine.scene import Camera
+from octasplat.engine.scene.flow import flow_by_pose
+from octasplat.engine.scene.seen import turned
+from octasplat.engine.train.batches import still_background
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.pixel_sampler import Pixels
 
 STEPS = 2
 MOST_PX = 1.0

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.rows import row_arrays
-from engine.train.kernels_averaging import move_towards
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import row_arrays
+from octasplat.engine.train.kernels_averaging import move_towards
 
 AVERAGE_EVERY = 10
 """Iterations between two of the states that are averaged."""

@@ -7,13 +7,13 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from engine.colour import composited
-from engine.errors import ConfigError
-from engine.rays import RayBatch
-from engine.train.config import TrainConfig, most_gaussians, window_side_px
-from engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
-from engine.train.shown import shown_share
-from engine.train.sight_lines import PhotographsOfPoints, SightLines
+from octasplat.engine.colour import composited
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.train.config import TrainConfig, most_gaussians, window_side_px
+from octasplat.engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
+from octasplat.engine.train.shown import shown_share
+from octasplat.engine.train.sight_lines import PhotographsOfPoints, SightLines
 
 TILE_PX = 8
 

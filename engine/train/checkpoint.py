@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from engine.errors import CheckpointError, DamagedCheckpoint
-from engine.events import Listener, Warned
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.rows import from_row_arrays, row_arrays
-from engine.train.averaging import RunningMean
-from engine.train.optimiser import Adam
-from engine.train.state import TrainState
-from engine.writing import replacing
+from octasplat.engine.errors import CheckpointError, DamagedCheckpoint
+from octasplat.engine.events import Listener, Warned
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import from_row_arrays, row_arrays
+from octasplat.engine.train.averaging import RunningMean
+from octasplat.engine.train.optimiser import Adam
+from octasplat.engine.train.state import TrainState
+from octasplat.engine.writing import replacing
 
 FORMAT = 6
 KEEP = 2

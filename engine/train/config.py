@@ -9,15 +9,15 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from engine.errors import ConfigError
-from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
-from engine.gaussians.octagon import CHI2_3_99
-from engine.shading.material_settings import MaterialSettings
-from engine.trace.protocol import TraceSettings
-from engine.train.preset_names import PRESETS
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
+from octasplat.engine.gaussians.octagon import CHI2_3_99
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.engine.train.preset_names import PRESETS
 
 MOST_PLANNED_ITERATIONS = 70_000
-"""Where a time decides their number, see :mod:`engine.train.within`."""
+"""Where a time decides their number, see :mod:`octasplat.engine.train.within`."""
 
 LEAST_THOUSANDS = 5
 """Of iterations, where the photographs decide their number."""
@@ -99,7 +99,7 @@ class LossWeights(_Frozen):
 
 
 class McmcConfig(_Frozen):
-    """Relocation of the dead and growth up to a cap, see :mod:`engine.train.densify.mcmc`."""
+    """Relocation of the dead and growth up to a cap, see :mod:`octasplat.engine.train.densify.mcmc`."""
 
     kind: Literal["mcmc"] = "mcmc"
     start: int = Field(100, ge=0)
@@ -124,7 +124,10 @@ class McmcConfig(_Frozen):
 
 
 class PaperConfig(_Frozen):
-    """Clone and split by the Adam step of the mean, prune; see :mod:`engine.train.densify.paper`."""
+    """Clone and split by the Adam step of the mean, prune.
+
+    See :mod:`octasplat.engine.train.densify.paper`.
+    """
 
     kind: Literal["paper"] = "paper"
     start: int = Field(400, ge=0)
@@ -319,8 +322,8 @@ def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.
 
     Large scenes learn as long as there is something to see; small ones are done after 7,000 with 7 rays a
     pixel. Rays that have an order of their own take longer, so that there are fewer of them. Where only a
-    share of the pixels shows anything (see :mod:`engine.train.shown`), the rays of the others teach little
-    and cost little, and it takes as many more; not with materials.
+    share of the pixels shows anything (see :mod:`octasplat.engine.train.shown`), the rays of the others teach
+    little and cost little, and it takes as many more; not with materials.
     """
     each = config.rays_a_pixel
     if in_one_order(config):

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from engine.rays import RayBatch
-from engine.scene import Camera, View
-from engine.train.alignment import Motion
-from engine.train.pixel_sampler import TrainingData
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.scene import Camera, View
+from octasplat.engine.train.alignment import Motion
+from octasplat.engine.train.pixel_sampler import TrainingData
 
 ROUNDS = 3
 """The common part is found for small angles, and again for what that leaves."""
@@ -18,7 +18,7 @@ ROUNDS = 3
 
 @runtime_checkable
 class PosedPhotographs(TrainingData, Protocol):
-    """Photographs with their cameras (see :class:`engine.scene.Dataset`)."""
+    """Photographs with their cameras (see :class:`octasplat.engine.scene.Dataset`)."""
 
     cameras: tuple[Camera, ...]
 

@@ -23,11 +23,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
-from engine.scene import Dataset
-from engine.train.first_background import FirstBackground
-from engine.train.kernels_patches import patch_differences
-from engine.train.lifted_points import Evidence, LiftedPoints, borne_out
-from engine.train.shown import shown_share
+from octasplat.engine.scene import Dataset
+from octasplat.engine.train.first_background import FirstBackground
+from octasplat.engine.train.kernels_patches import patch_differences
+from octasplat.engine.train.lifted_points import Evidence, LiftedPoints, borne_out
+from octasplat.engine.train.shown import shown_share
 
 GUESSES = 6
 """Depths tried for a pixel: those of the nearest points in the image."""

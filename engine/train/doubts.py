@@ -1,7 +1,8 @@
 """Photographs whose given poses are in doubt, by a training so short that it costs a few seconds.
 
 A few thousand coarse Gaussians show well enough what the photographs have in common for those that stand in
-the wrong place to be found, see :mod:`engine.train.misfits`. What is wrong with them it does not say.
+the wrong place to be found, see :mod:`octasplat.engine.train.misfits`. What is wrong with them it does not
+say.
 """
 
 import tempfile
@@ -11,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from engine.errors import Cancelled
-from engine.scene import Dataset
-from engine.threads import use_threads
-from engine.trace.make import make_tracer
-from engine.train.config import TrainConfig
-from engine.train.first_state import first_state
-from engine.train.misfits import LEAST_VIEWS, misfits, view_fits
-from engine.train.trainer import Trainer
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.scene import Dataset
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.first_state import first_state
+from octasplat.engine.train.misfits import LEAST_VIEWS, misfits, view_fits
+from octasplat.engine.train.trainer import Trainer
 
 ITERATIONS = 200
 DOUBT_SIGMAS = 3.0

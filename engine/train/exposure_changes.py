@@ -5,9 +5,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.scene.model import Observations
-from engine.train.config import TrainConfig
-from engine.train.pixel_sampler import TrainingData
+from octasplat.engine.scene.model import Observations
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.pixel_sampler import TrainingData
 
 DARKEST, BRIGHTEST = 0.1, 0.95
 """Display values beyond which a brightness says little."""
@@ -20,7 +20,7 @@ CHANGES = 0.05
 
 @runtime_checkable
 class TrackedPhotographs(TrainingData, Protocol):
-    """Photographs with the points that they show (see :class:`engine.scene.Dataset`)."""
+    """Photographs with the points that they show (see :class:`octasplat.engine.scene.Dataset`)."""
 
     observations: Observations
 

@@ -3,8 +3,8 @@
 import hashlib
 import json
 
-from engine.scene import Dataset
-from engine.train.config import TrainConfig
+from octasplat.engine.scene import Dataset
+from octasplat.engine.train.config import TrainConfig
 
 
 def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:

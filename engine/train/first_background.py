@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import cKDTree
 
-from engine.scene import Camera
-from engine.scene.model import SparsePoints
-from engine.scene.seen import is_shown, points_in_cam
-from engine.shading.learnt_background import LearntBackground
-from engine.train.pixel_sampler import TrainingData
+from octasplat.engine.scene import Camera
+from octasplat.engine.scene.model import SparsePoints
+from octasplat.engine.scene.seen import is_shown, points_in_cam
+from octasplat.engine.shading.learnt_background import LearntBackground
+from octasplat.engine.train.pixel_sampler import TrainingData
 
 ROWS = 64
 """Of the first map; finer ones are interpolated."""
@@ -35,7 +35,7 @@ SOFT_TEXELS = (2.0, 6.0)
 
 @runtime_checkable
 class MappedPhotographs(TrainingData, Protocol):
-    """Photographs with their sparse model (see :class:`engine.scene.Dataset`)."""
+    """Photographs with their sparse model (see :class:`octasplat.engine.scene.Dataset`)."""
 
     cameras: tuple[Camera, ...]
     points: SparsePoints

@@ -1,11 +1,11 @@
 """The state before the first iteration, made from the photographs."""
 
-from engine.scene import Dataset
-from engine.train.config import TrainConfig
-from engine.train.first_background import first_background
-from engine.train.initialise import initial_gaussians, with_first_materials
-from engine.train.shading import background_of, make_shading
-from engine.train.state import TrainState, fresh_state
+from octasplat.engine.scene import Dataset
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.first_background import first_background
+from octasplat.engine.train.initialise import initial_gaussians, with_first_materials
+from octasplat.engine.train.shading import background_of, make_shading
+from octasplat.engine.train.state import TrainState, fresh_state
 
 
 def first_state(dataset: Dataset, config: TrainConfig, *, threads: int = 1) -> TrainState:

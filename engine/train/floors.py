@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.model import FlatGaussians
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,17 +9,17 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
-from engine.errors import DatasetError
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.scene import Dataset
-from engine.shading.material_settings import MaterialSettings
-from engine.train.config import TrainConfig, most_gaussians
-from engine.train.dense_points import dense_points
-from engine.train.exposure_changes import evening_gains
-from engine.train.first_background import FirstBackground
-from engine.train.shown import shown_share
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.scene import Dataset
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.train.config import TrainConfig, most_gaussians
+from octasplat.engine.train.dense_points import dense_points
+from octasplat.engine.train.exposure_changes import evening_gains
+from octasplat.engine.train.first_background import FirstBackground
+from octasplat.engine.train.shown import shown_share
 
 MIN_POINTS = 50
 """Fewer sparse points than this are no use to begin from; random ones are taken."""

@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engine.errors import TrainingFailure
-from engine.shading.protocol import ShadingModel, Sight
-from engine.trace.protocol import GaussianGradients, Tracer
-from engine.trace.sums import add_gradients, heavier
-from engine.train.batches import Batch
-from engine.train.config import LossWeights, TrainConfig
-from engine.train.densify import Densifier
-from engine.train.losses import BatchLoss, batch_loss, ray_errors
-from engine.train.sight_lines import blocked_term
-from engine.train.state import TrainState
+from octasplat.engine.errors import TrainingFailure
+from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.trace.protocol import GaussianGradients, Tracer
+from octasplat.engine.trace.sums import add_gradients, heavier
+from octasplat.engine.train.batches import Batch
+from octasplat.engine.train.config import LossWeights, TrainConfig
+from octasplat.engine.train.densify import Densifier
+from octasplat.engine.train.losses import BatchLoss, batch_loss, ray_errors
+from octasplat.engine.train.sight_lines import blocked_term
+from octasplat.engine.train.state import TrainState
 
 RUNNING = 0.98
 """Weight of the past in the smoothed squared error."""

@@ -8,7 +8,7 @@ from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from engine.trace.kernels_native import ask_for, float32_pointer, lean
+from octasplat.engine.trace.kernels_native import ask_for, float32_pointer, lean
 
 LANES = 16
 GEOMETRY = 3 + 4 + 2 + 1

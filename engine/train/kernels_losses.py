@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_native import lean
 
 CHUNKS = 64
 """Parts whose sums are added up one after the other: the same on any number of threads."""

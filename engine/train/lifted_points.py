@@ -1,6 +1,6 @@
 """Points lifted from pixels, and which of those at swept depths are to be believed.
 
-How they are found is told by :mod:`engine.train.dense_points`.
+How they are found is told by :mod:`octasplat.engine.train.dense_points`.
 """
 
 from collections.abc import Sequence

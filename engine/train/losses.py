@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.ndimage import correlate1d
 
-from engine.train.batches import Batch
-from engine.train.config import LossWeights
-from engine.train.kernels_losses import CHUNKS, pixel_terms
+from octasplat.engine.train.batches import Batch
+from octasplat.engine.train.config import LossWeights
+from octasplat.engine.train.kernels_losses import CHUNKS, pixel_terms
 
 C1, C2 = 0.01**2, 0.03**2
 WINDOW, SIGMA = 11, 1.5

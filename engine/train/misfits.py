@@ -10,18 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from engine.colour import composited
-from engine.psnr import colour_corrected, psnr
-from engine.scene import View
-from engine.shading.protocol import ShadingModel
-from engine.trace.protocol import Tracer
-from engine.train.batches import still_background
-from engine.train.config import TrainConfig
-from engine.train.pixel_sampler import TrainingData
-from engine.train.view_grids import shown_on_grids
+from octasplat.engine.colour import composited
+from octasplat.engine.psnr import colour_corrected, psnr
+from octasplat.engine.scene import View
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.batches import still_background
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.pixel_sampler import TrainingData
+from octasplat.engine.train.view_grids import shown_on_grids
 
 TILES = 3
-"""So many tiles each way of a view are measured, see :func:`engine.train.batches.grid_pixels`."""
+"""So many tiles each way of a view are measured, see :func:`octasplat.engine.train.batches.grid_pixels`."""
 LEAST_VIEWS = 6
 """Among fewer views nobody can say which of them is odd."""
 NEIGHBOURS = 8

@@ -9,11 +9,11 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.gaussians.rows import join_rows, row_arrays, select_rows
-from engine.trace.protocol import GaussianGradients
-from engine.train.config import LearningRates, LossWeights
-from engine.train.kernels_adam import GEOMETRY, LANES, adam_shares, adam_step
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.gaussians.rows import join_rows, row_arrays, select_rows
+from octasplat.engine.trace.protocol import GaussianGradients
+from octasplat.engine.train.config import LearningRates, LossWeights
+from octasplat.engine.train.kernels_adam import GEOMETRY, LANES, adam_shares, adam_step
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 

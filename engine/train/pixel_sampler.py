@@ -6,8 +6,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from engine.rays import RayBatch
-from engine.scene import View
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.scene import View
 
 GOLDEN = (math.sqrt(5) - 1) / 2
 """Its multiples fill the unit interval evenly, however many there are."""
@@ -15,7 +15,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 @runtime_checkable
 class Pixels(Protocol):
-    """What training needs of a dataset (see :class:`engine.scene.Dataset`)."""
+    """What training needs of a dataset (see :class:`octasplat.engine.scene.Dataset`)."""
 
     def rays(
         self, view: Int64[np.ndarray, " r"], y: Int64[np.ndarray, " r"], x: Int64[np.ndarray, " r"]
@@ -32,7 +32,10 @@ class Pixels(Protocol):
 
 @runtime_checkable
 class TrainingData(Pixels, Protocol):
-    """The photographs: pixel access, the views and the split (see :class:`engine.scene.Dataset`)."""
+    """The photographs: pixel access, the views and the split.
+
+    See :class:`octasplat.engine.scene.Dataset`.
+    """
 
     views: tuple[View, ...]
     train_indices: Int64[np.ndarray, " t"]

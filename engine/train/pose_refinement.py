@@ -1,9 +1,9 @@
 """Small corrections of the training views' poses, learnt while the Gaussians are.
 
 Between iterations each training view is aligned with what the Gaussians show from there (see
-:mod:`engine.train.alignment`); rays are then made from the corrected poses, and both come nearer by turns.
-What all corrections have in common is taken out, so that held-out views, which keep the poses that are given,
-stay in their places. Poses that are wrong by more than some pixels are not found: steps are small, and
+:mod:`octasplat.engine.train.alignment`); rays are then made from the corrected poses, and both come nearer by
+turns. What all corrections have in common is taken out, so that held-out views, which keep the poses that are
+given, stay in their places. Poses that are wrong by more than some pixels are not found: steps are small, and
 nothing is looked for. The first Gaussians, near zones, floors on scales, meshes and renders "as the
 photographs" use the poses that are given, and so do later commands; ``training.json`` has the corrected ones.
 """
@@ -14,17 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from engine.scene.seen import turned
-from engine.shading.protocol import ShadingModel, Sight
-from engine.trace.protocol import Tracer
-from engine.train.alignment import Motion, Rendered, aligned, photograph_of
-from engine.train.batches import grid_pixels, still_background
-from engine.train.config import TrainConfig
-from engine.train.corrected_views import CorrectedViews, PosedPhotographs, without_common
-from engine.train.pixel_sampler import view_sizes_px
+from octasplat.engine.scene.seen import turned
+from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.alignment import Motion, Rendered, aligned, photograph_of
+from octasplat.engine.train.batches import grid_pixels, still_background
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.corrected_views import CorrectedViews, PosedPhotographs, without_common
+from octasplat.engine.train.pixel_sampler import view_sizes_px
 
 TILES = 5
-"""So many tiles each way of a view are aligned, see :func:`engine.train.batches.grid_pixels`."""
+"""So many tiles each way of a view are aligned, see :func:`octasplat.engine.train.batches.grid_pixels`."""
 VIEWS_AT_ONCE = 32
 TAKEN = 0.5
 """Share of a motion that is taken: what the Gaussians get wrong for the moment is averaged out."""

@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from engine.colour import composited
-from engine.errors import TrainingFailure
-from engine.events import HeldOutMeasured, Listener, Warned
-from engine.gaussians.model import FlatGaussians
-from engine.shading.protocol import ShadingModel, Sight
-from engine.trace.protocol import Tracer
-from engine.train.batches import still_background
-from engine.train.checkpoint import load_best, save_best
-from engine.train.config import TrainConfig
-from engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
-from engine.train.shading import exposures_of
-from engine.train.state import TrainState
-from engine.train.view_grids import guess_exposures
+from octasplat.engine.colour import composited
+from octasplat.engine.errors import TrainingFailure
+from octasplat.engine.events import HeldOutMeasured, Listener, Warned
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.batches import still_background
+from octasplat.engine.train.checkpoint import load_best, save_best
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
+from octasplat.engine.train.shading import exposures_of
+from octasplat.engine.train.state import TrainState
+from octasplat.engine.train.view_grids import guess_exposures
 
 EMPTY_ALPHA = 0.01
 

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from engine.train.averaging import AVERAGE_EVERY
-from engine.train.config import TrainConfig, in_one_order, iteration_count, rebuild_interval
-from engine.train.early_end import last_iteration
+from octasplat.engine.train.averaging import AVERAGE_EVERY
+from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, rebuild_interval
+from octasplat.engine.train.early_end import last_iteration
 
 EVENT_EVERY = 10
 POSES_FROM, POSES_UNTIL, POSE_ROUNDS = 0.3, 0.8, 12

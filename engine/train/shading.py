@@ -1,12 +1,12 @@
 """The shading model that a configuration asks for."""
 
-from engine.shading.deferred import Deferred
-from engine.shading.exposure import Exposures
-from engine.shading.flattening import Flattening
-from engine.shading.learnt_background import LearntBackground
-from engine.shading.plain import PLAIN
-from engine.shading.protocol import ShadingModel
-from engine.train.config import TrainConfig
+from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.exposure import Exposures
+from octasplat.engine.shading.flattening import Flattening
+from octasplat.engine.shading.learnt_background import LearntBackground
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.train.config import TrainConfig
 
 
 def make_shading(config: TrainConfig, views: int, extent_world: float) -> ShadingModel:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from engine.train.pixel_sampler import PixelSampler, TrainingData
+from octasplat.engine.train.pixel_sampler import PixelSampler, TrainingData
 
 SAMPLES = 20_000
 """Pixels that are looked at, always the same ones: the share is right to 0.4 %."""

@@ -2,19 +2,22 @@
 
 A flat Gaussian has no side of its own. Where one is known, the blend of a ray that grazes an outline can tell
 what has just turned away from the viewer from what has not (``turned_beyond`` of
-:class:`engine.trace.protocol.TraceSettings`).
+:class:`octasplat.engine.trace.protocol.TraceSettings`).
 """
 
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
 
-from engine.gaussians.model import FlatGaussians
-from engine.trace.protocol import TraceGradients, Tracer
-from engine.train.batches import grid_pixels
-from engine.train.pixel_sampler import TrainingData, view_sizes_px
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.trace.protocol import TraceGradients, Tracer
+from octasplat.engine.train.batches import grid_pixels
+from octasplat.engine.train.pixel_sampler import TrainingData, view_sizes_px
 
 TILES = 6
-"""So many tiles of a view each way tell who sees what, see :func:`engine.train.batches.grid_pixels`."""
+"""So many tiles of a view each way tell who sees what.
+
+See :func:`octasplat.engine.train.batches.grid_pixels`.
+"""
 VIEWS_AT_ONCE = 8
 
 

@@ -12,10 +12,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from engine.rays import RayBatch
-from engine.scene.cameras import Camera
-from engine.scene.model import Observations, SparsePoints, View
-from engine.trace.protocol import Recording, TraceGradients, Tracer
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.model import Observations, SparsePoints, View
+from octasplat.engine.trace.protocol import Recording, TraceGradients, Tracer
 
 LEAST_TRACK = 3
 """Points in fewer training views may be wrong matches."""
@@ -27,7 +27,10 @@ LEAST_ERROR_PX = 0.5
 
 @runtime_checkable
 class PhotographsOfPoints(Protocol):
-    """Photographs with the points that they show, and where these lie (see :class:`engine.scene.Dataset`)."""
+    """Photographs with the points that they show, and where these lie.
+
+    See :class:`octasplat.engine.scene.Dataset`.
+    """
 
     views: tuple[View, ...]
     cameras: tuple[Camera, ...]

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from engine.gaussians.model import FlatGaussians
-from engine.train.averaging import RunningMean
-from engine.train.optimiser import Adam
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.train.averaging import RunningMean
+from octasplat.engine.train.optimiser import Adam
 
 
 @dataclass

@@ -7,34 +7,34 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from engine.errors import Cancelled, ConfigError, TrainingFailure
-from engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.order import morton_order
-from engine.scene.near import NearZones
-from engine.scene.seen import SeenSpace
-from engine.shading.protocol import ShadingModel
-from engine.trace.make import make_tracer
-from engine.trace.protocol import Tracer
-from engine.train.batches import BatchSource, DrawnAhead
-from engine.train.checkpoint import save_checkpoint
-from engine.train.config import TrainConfig, most_gaussians
-from engine.train.corrected_views import PosedPhotographs
-from engine.train.densify import make_densifier
-from engine.train.densify.propagating import Propagating
-from engine.train.early_end import gains_no_more
-from engine.train.floors import ScaleFloor
-from engine.train.iteration import Differentiated, Machinery, iterate
-from engine.train.misfits import TrainingViews, ViewJudge
-from engine.train.pixel_sampler import TrainingData
-from engine.train.pose_refinement import PoseRefiner, RefinedPoses
-from engine.train.probes import Judge, decibels
-from engine.train.schedule import Schedule, Stopwatch
-from engine.train.shading import make_shading
-from engine.train.shown import shown_share
-from engine.train.sides import turn_outwards
-from engine.train.state import TrainState
-from engine.train.view_grids import guess_exposures
+from octasplat.engine.errors import Cancelled, ConfigError, TrainingFailure
+from octasplat.engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.order import morton_order
+from octasplat.engine.scene.near import NearZones
+from octasplat.engine.scene.seen import SeenSpace
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.batches import BatchSource, DrawnAhead
+from octasplat.engine.train.checkpoint import save_checkpoint
+from octasplat.engine.train.config import TrainConfig, most_gaussians
+from octasplat.engine.train.corrected_views import PosedPhotographs
+from octasplat.engine.train.densify import make_densifier
+from octasplat.engine.train.densify.propagating import Propagating
+from octasplat.engine.train.early_end import gains_no_more
+from octasplat.engine.train.floors import ScaleFloor
+from octasplat.engine.train.iteration import Differentiated, Machinery, iterate
+from octasplat.engine.train.misfits import TrainingViews, ViewJudge
+from octasplat.engine.train.pixel_sampler import TrainingData
+from octasplat.engine.train.pose_refinement import PoseRefiner, RefinedPoses
+from octasplat.engine.train.probes import Judge, decibels
+from octasplat.engine.train.schedule import Schedule, Stopwatch
+from octasplat.engine.train.shading import make_shading
+from octasplat.engine.train.shown import shown_share
+from octasplat.engine.train.sides import turn_outwards
+from octasplat.engine.train.state import TrainState
+from octasplat.engine.train.view_grids import guess_exposures
 
 GONE_LOGIT = np.float32(-12.0)
 """Opacity of what is taken away until its place is used for something else: no ray takes note of it."""
@@ -53,7 +53,7 @@ class Trainer:
         fingerprint: what the checkpoints belong to.
         listener: hears the progress.
         threads: for everything; 0 means all cores.
-        should_stop: asked wherever a run may stop, see :class:`engine.train.schedule.Schedule`.
+        should_stop: asked wherever a run may stop, see :class:`octasplat.engine.train.schedule.Schedule`.
         scale_floor: what no scale falls below.
         near_zones: where no Gaussian stays, whatever the strategy does.
         seen_space: outside of which none stays.

@@ -6,16 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from engine.shading.protocol import ShadingModel, Sight
-from engine.trace.protocol import Tracer
-from engine.train.batches import grid_pixels, still_background
-from engine.train.config import TrainConfig
-from engine.train.pixel_sampler import TrainingData, view_sizes_px
-from engine.train.shading import exposures_of
+from octasplat.engine.shading.protocol import ShadingModel, Sight
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.batches import grid_pixels, still_background
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.pixel_sampler import TrainingData, view_sizes_px
+from octasplat.engine.train.shading import exposures_of
 
 VIEWS_AT_ONCE = 64
 BRIGHTNESS_TILES = 2
-"""So many tiles each way tell how bright a view is, see :func:`engine.train.batches.grid_pixels`."""
+"""So many tiles each way tell how bright a view is.
+
+See :func:`octasplat.engine.train.batches.grid_pixels`.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +52,7 @@ def shown_on_grids(
         background_srgb: lies behind everything.
         tracer: built around the Gaussians.
         shading: makes pictures of what is traced.
-        tiles: so many each way of a view, see :func:`engine.train.batches.grid_pixels`.
+        tiles: so many each way of a view, see :func:`octasplat.engine.train.batches.grid_pixels`.
         exposed: as exposed as each view is; else as the mean exposure shows the scene.
     """
     for start in range(0, len(indices), VIEWS_AT_ONCE):

@@ -12,15 +12,15 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from engine.errors import Cancelled, ConfigError
-from engine.gaussians.model import FlatGaussians
-from engine.scene import Dataset
-from engine.trace.protocol import Tracer
-from engine.train.config import MOST_PLANNED_ITERATIONS, TrainConfig, in_one_order, most_gaussians
-from engine.train.shown import shown_share
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
-from engine.writing import write_text
+from octasplat.engine.errors import Cancelled, ConfigError
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.scene import Dataset
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, TrainConfig, in_one_order, most_gaussians
+from octasplat.engine.train.shown import shown_share
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.writing import write_text
 
 WARM, TIMED = 10, 50
 """Iterations before the clock starts, as kernels compile and caches fill, and those that it counts."""

@@ -13,10 +13,10 @@ from drop import add_film_options, triple, write_film
 from jaxtyping import Bool, Float64, Int64
 from mujoco_drop import simulate_cloth
 
-from engine.edit.deform import deform_to, deformation_corners
-from engine.edit.proxy import Proxy, bind
-from engine.files import read_scene
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.edit.deform import deform_to, deformation_corners
+from octasplat.engine.edit.proxy import Proxy, bind
+from octasplat.engine.files import read_scene
+from octasplat.engine.gaussians.model import FlatGaussians
 
 
 def round_grid(

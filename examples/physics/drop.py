@@ -14,16 +14,16 @@ import numpy as np
 from mujoco_drop import simulate
 from soft_body import Rider, belongs_to, lattice_around
 
-from engine.files import read_mesh, read_scene
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.images import write_png
-from engine.render.paths import look_at
-from engine.render.renderer import render_rays
-from engine.render.video import VideoWriter
-from engine.surface.mesh import TriangleMesh
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import Tracer
+from octasplat.engine.files import read_mesh, read_scene
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.images import write_png
+from octasplat.engine.render.paths import look_at
+from octasplat.engine.render.renderer import render_rays
+from octasplat.engine.render.video import VideoWriter
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import Tracer
 
 
 class Rides(Protocol):

@@ -6,27 +6,27 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from engine.errors import ConfigError
-from service.actions.access import owned_job, refuse_while_draining
-from service.actions.asked import accepted_kind, input_problem, resolved
-from service.actions.jobs import job_view
-from service.actions.named_files import check_named_files
-from service.auth import Principal
-from service.idempotency import fingerprint, once
-from service.limits import check_ceilings, check_priority, estimate_job
-from service.problems import Problem, refused_options
-from service.queue_facts import check_writable, workers_of
-from service.schemas.jobs import JobView, NewJob, RetryRequest
-from service.state import Service
-from service.webhook_addresses import check_address
-from workers.queue import jobs as rows
-from workers.records.database import Connection
-from workers.records.datasets import get_dataset, photograph_sizes
-from workers.records.quotas import check_new_job
-from workers.records.rows import Dataset, Job
-from workers.upkeep.webhooks.rows import add_endpoint
-from workers.work.kinds import JobKind, kind_named
-from workers.work.kinds.estimates import Estimate
+from octasplat.engine.errors import ConfigError
+from octasplat.service.actions.access import owned_job, refuse_while_draining
+from octasplat.service.actions.asked import accepted_kind, input_problem, resolved
+from octasplat.service.actions.jobs import job_view
+from octasplat.service.actions.named_files import check_named_files
+from octasplat.service.auth import Principal
+from octasplat.service.idempotency import fingerprint, once
+from octasplat.service.limits import check_ceilings, check_priority, estimate_job
+from octasplat.service.problems import Problem, refused_options
+from octasplat.service.queue_facts import check_writable, workers_of
+from octasplat.service.schemas.jobs import JobView, NewJob, RetryRequest
+from octasplat.service.state import Service
+from octasplat.service.webhook_addresses import check_address
+from octasplat.workers.queue import jobs as rows
+from octasplat.workers.records.database import Connection
+from octasplat.workers.records.datasets import get_dataset, photograph_sizes
+from octasplat.workers.records.quotas import check_new_job
+from octasplat.workers.records.rows import Dataset, Job
+from octasplat.workers.upkeep.webhooks.rows import add_endpoint
+from octasplat.workers.work.kinds import JobKind, kind_named
+from octasplat.workers.work.kinds.estimates import Estimate
 
 
 @dataclass(frozen=True)

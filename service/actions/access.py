@@ -2,15 +2,15 @@
 
 import uuid
 
-from service.auth import Principal
-from service.problems import Problem, not_found
-from service.state import Service
-from workers.queue.jobs import get_job
-from workers.records.database import Connection
-from workers.records.datasets import get_dataset
-from workers.records.errors import Conflict
-from workers.records.rows import Dataset, Job
-from workers.upkeep.webhooks.rows import Endpoint, get_endpoint
+from octasplat.service.auth import Principal
+from octasplat.service.problems import Problem, not_found
+from octasplat.service.state import Service
+from octasplat.workers.queue.jobs import get_job
+from octasplat.workers.records.database import Connection
+from octasplat.workers.records.datasets import get_dataset
+from octasplat.workers.records.errors import Conflict
+from octasplat.workers.records.rows import Dataset, Job
+from octasplat.workers.upkeep.webhooks.rows import Endpoint, get_endpoint
 
 _RETRY_SECONDS = 10
 

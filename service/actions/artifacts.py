@@ -2,14 +2,14 @@
 
 import uuid
 
-from service.actions.access import owned_job, read_job, sought
-from service.auth import Principal
-from service.problems import not_found
-from service.state import Service
-from service.threads import Threads, in_thread
-from workers.queue import jobs as rows
-from workers.records.rows import Artifact
-from workers.store.protocol import Blob
+from octasplat.service.actions.access import owned_job, read_job, sought
+from octasplat.service.auth import Principal
+from octasplat.service.problems import not_found
+from octasplat.service.state import Service
+from octasplat.service.threads import Threads, in_thread
+from octasplat.workers.queue import jobs as rows
+from octasplat.workers.records.rows import Artifact
+from octasplat.workers.store.protocol import Blob
 
 
 async def list_artifacts(service: Service, who: Principal, job_id: uuid.UUID) -> list[Artifact]:

@@ -5,9 +5,9 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from engine.errors import ConfigError
-from service.problems import Problem, refused_options
-from workers.work.kinds import JobKind, kind_named
+from octasplat.engine.errors import ConfigError
+from octasplat.service.problems import Problem, refused_options
+from octasplat.workers.work.kinds import JobKind, kind_named
 
 
 def accepted_kind(name: str) -> JobKind:

@@ -1,9 +1,9 @@
 """Who did what."""
 
-from service.actions.parts import Part, cut
-from service.state import Service
-from workers.records import audit as rows
-from workers.records.audit import AuditEntry
+from octasplat.service.actions.parts import Part, cut
+from octasplat.service.state import Service
+from octasplat.workers.records import audit as rows
+from octasplat.workers.records.audit import AuditEntry
 
 
 async def list_entries(service: Service, *, before: int | None, limit: int) -> Part[AuditEntry]:

@@ -10,19 +10,19 @@ from typing import Any
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from service.actions.access import owned_dataset
-from service.actions.parts import Part, cut
-from service.auth import Principal
-from service.idempotency import fingerprint, once
-from service.intake.dataset import DatasetFile as IntakeFile
-from service.intake.dataset import DatasetSummary, check_dataset
-from service.intake.inputs import check_inputs
-from service.schemas.datasets import DatasetChange, NewDataset
-from service.state import Service
-from service.threads import Threads, in_thread
-from workers.records import datasets as rows
-from workers.records.quotas import check_new_dataset
-from workers.records.rows import Dataset, DatasetFile
+from octasplat.service.actions.access import owned_dataset
+from octasplat.service.actions.parts import Part, cut
+from octasplat.service.auth import Principal
+from octasplat.service.idempotency import fingerprint, once
+from octasplat.service.intake.dataset import DatasetFile as IntakeFile
+from octasplat.service.intake.dataset import DatasetSummary, check_dataset
+from octasplat.service.intake.inputs import check_inputs
+from octasplat.service.schemas.datasets import DatasetChange, NewDataset
+from octasplat.service.state import Service
+from octasplat.service.threads import Threads, in_thread
+from octasplat.workers.records import datasets as rows
+from octasplat.workers.records.quotas import check_new_dataset
+from octasplat.workers.records.rows import Dataset, DatasetFile
 
 
 async def create_dataset(

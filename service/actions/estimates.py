@@ -1,16 +1,16 @@
 """What a job would take, before it is asked for."""
 
-from service.actions.asked import accepted_kind, input_problem, resolved
-from service.auth import Principal
-from service.limits import check_ceilings, estimate_job
-from service.queue_facts import workers_of
-from service.schemas.estimates import NewEstimate
-from service.state import Service
-from workers.queue.jobs import get_job
-from workers.records.database import Connection
-from workers.records.datasets import get_dataset, photograph_sizes
-from workers.records.sizes import Sizes
-from workers.work.kinds.estimates import Estimate
+from octasplat.service.actions.asked import accepted_kind, input_problem, resolved
+from octasplat.service.auth import Principal
+from octasplat.service.limits import check_ceilings, estimate_job
+from octasplat.service.queue_facts import workers_of
+from octasplat.service.schemas.estimates import NewEstimate
+from octasplat.service.state import Service
+from octasplat.workers.queue.jobs import get_job
+from octasplat.workers.records.database import Connection
+from octasplat.workers.records.datasets import get_dataset, photograph_sizes
+from octasplat.workers.records.sizes import Sizes
+from octasplat.workers.work.kinds.estimates import Estimate
 
 
 async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estimate | None:

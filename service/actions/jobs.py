@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from engine.errors import ConfigError
-from service.actions.access import owned_job
-from service.actions.parts import Part, cut
-from service.auth import Principal
-from service.limits import limit_notes
-from service.problems import Problem
-from service.queue_facts import waiting_notes, workers_of
-from service.schemas.jobs import JobChange, JobView
-from service.state import Service
-from workers.queue import jobs as rows
-from workers.records.database import Connection
-from workers.records.rows import Job, JobState
-from workers.work.kinds import kind_named
+from octasplat.engine.errors import ConfigError
+from octasplat.service.actions.access import owned_job
+from octasplat.service.actions.parts import Part, cut
+from octasplat.service.auth import Principal
+from octasplat.service.limits import limit_notes
+from octasplat.service.problems import Problem
+from octasplat.service.queue_facts import waiting_notes, workers_of
+from octasplat.service.schemas.jobs import JobChange, JobView
+from octasplat.service.state import Service
+from octasplat.workers.queue import jobs as rows
+from octasplat.workers.records.database import Connection
+from octasplat.workers.records.rows import Job, JobState
+from octasplat.workers.work.kinds import kind_named
 
 BUSY_SECONDS = 2
 """After which a job that moves is worth another look."""

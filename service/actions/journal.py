@@ -4,12 +4,12 @@ import asyncio
 import uuid
 from collections.abc import AsyncGenerator
 
-from service.actions.access import owned_job, read_job
-from service.auth import Principal
-from service.problems import Problem
-from service.state import Service
-from workers.records.journal import events_after, log_after
-from workers.records.rows import JobEvent, LogLine
+from octasplat.service.actions.access import owned_job, read_job
+from octasplat.service.auth import Principal
+from octasplat.service.problems import Problem
+from octasplat.service.state import Service
+from octasplat.workers.records.journal import events_after, log_after
+from octasplat.workers.records.rows import JobEvent, LogLine
 
 _POLL_SECONDS = 2.0
 _PAGE = 500

@@ -4,13 +4,13 @@ import uuid
 
 from pydantic import BaseModel
 
-from service.actions.asked import input_problem
-from service.auth import Principal
-from service.problems import Problem
-from workers.records.database import Connection
-from workers.records.datasets import files_of, get_dataset
-from workers.store.names import shown_name
-from workers.work.kinds import JobKind
+from octasplat.service.actions.asked import input_problem
+from octasplat.service.auth import Principal
+from octasplat.service.problems import Problem
+from octasplat.workers.records.database import Connection
+from octasplat.workers.records.datasets import files_of, get_dataset
+from octasplat.workers.store.names import shown_name
+from octasplat.workers.work.kinds import JobKind
 
 
 async def check_named_files(

@@ -2,23 +2,23 @@
 
 import asyncio
 
-import engine
-from engine.errors import ConfigError
-from engine.files import exporters
-from service.auth import Principal
-from service.limits import ceilings_by_path
-from service.problems import not_found
-from service.schemas.system import FormatView, InfoView, KindView, QueueList, QueueView, WorkerView
-from service.state import Service
-from service.threads import Threads, in_thread
-from workers.isolation.abilities import abilities
-from workers.queue.jobs import queue_depths, running_by_queue
-from workers.queue.numbers import read_numbers
-from workers.records.migrate import missing_steps
-from workers.records.rows import WorkerRow
-from workers.records.workers import live_workers
-from workers.store.errors import StorageError
-from workers.work.kinds import JobKind, job_kinds, kind_named
+from octasplat.engine import __version__
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.files import exporters
+from octasplat.service.auth import Principal
+from octasplat.service.limits import ceilings_by_path
+from octasplat.service.problems import not_found
+from octasplat.service.schemas.system import FormatView, InfoView, KindView, QueueList, QueueView, WorkerView
+from octasplat.service.state import Service
+from octasplat.service.threads import Threads, in_thread
+from octasplat.workers.isolation.abilities import abilities
+from octasplat.workers.queue.jobs import queue_depths, running_by_queue
+from octasplat.workers.queue.numbers import read_numbers
+from octasplat.workers.records.migrate import missing_steps
+from octasplat.workers.records.rows import WorkerRow
+from octasplat.workers.records.workers import live_workers
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.work.kinds import JobKind, job_kinds, kind_named
 
 STORAGE_SECONDS = 3.0
 """A store that takes longer to answer is not ready."""
@@ -44,7 +44,7 @@ def get_kind(service: Service, name: str) -> KindView:
 def describe(service: Service, who: Principal) -> InfoView:
     """Versions, limits, formats, and who asks."""
     return InfoView(
-        version=engine.__version__,
+        version=__version__,
         kinds=[kind.name for kind in job_kinds()],
         formats=[
             FormatView(name=e.name, patterns=list(e.patterns), description=e.description) for e in exporters()

@@ -2,13 +2,13 @@
 
 import uuid
 
-from service.auth import Principal
-from service.problems import Problem, not_found
-from service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenView
-from service.state import Service
-from workers.records import tokens as rows
-from workers.records.rows import Token
-from workers.records.sessions import add_link
+from octasplat.service.auth import Principal
+from octasplat.service.problems import Problem, not_found
+from octasplat.service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenView
+from octasplat.service.state import Service
+from octasplat.workers.records import tokens as rows
+from octasplat.workers.records.rows import Token
+from octasplat.workers.records.sessions import add_link
 
 
 async def list_tokens(service: Service) -> list[Token]:

@@ -5,26 +5,26 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from service.actions.access import open_dataset, owned_dataset, refuse_while_draining, sought
-from service.actions.parts import Part, cut
-from service.auth import Principal
-from service.intake.dataset import check_file_content
-from service.intake.inputs import check_input_content, check_input_name
-from service.intake.names import check_file_name
-from service.intake.receive import (
+from octasplat.service.actions.access import open_dataset, owned_dataset, refuse_while_draining, sought
+from octasplat.service.actions.parts import Part, cut
+from octasplat.service.auth import Principal
+from octasplat.service.intake.dataset import check_file_content
+from octasplat.service.intake.inputs import check_input_content, check_input_name
+from octasplat.service.intake.names import check_file_name
+from octasplat.service.intake.receive import (
     ContentCheck,
     ReceivedArchive,
     ReceivedFile,
     receive_archive,
     receive_file,
 )
-from service.problems import Problem, not_found
-from service.state import Service
-from workers.queue.storing import Note
-from workers.records import datasets as rows
-from workers.records.quotas import QuotaExceeded, bytes_left, check_bytes
-from workers.records.rows import Dataset, DatasetFile
-from workers.store.errors import TooLarge
+from octasplat.service.problems import Problem, not_found
+from octasplat.service.state import Service
+from octasplat.workers.queue.storing import Note
+from octasplat.workers.records import datasets as rows
+from octasplat.workers.records.quotas import QuotaExceeded, bytes_left, check_bytes
+from octasplat.workers.records.rows import Dataset, DatasetFile
+from octasplat.workers.store.errors import TooLarge
 
 Received = TypeVar("Received")
 

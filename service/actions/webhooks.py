@@ -3,16 +3,16 @@
 import uuid
 from dataclasses import dataclass
 
-from service.actions.access import owned_job, owned_webhook
-from service.actions.parts import Part, cut
-from service.auth import Principal
-from service.problems import Problem, not_found
-from service.schemas.webhooks import NewWebhook, WebhookChange
-from service.state import Service
-from service.webhook_addresses import check_address
-from workers.upkeep.webhooks import rows
-from workers.upkeep.webhooks.rows import Delivery, Endpoint
-from workers.upkeep.webhooks.signing import new_secret
+from octasplat.service.actions.access import owned_job, owned_webhook
+from octasplat.service.actions.parts import Part, cut
+from octasplat.service.auth import Principal
+from octasplat.service.problems import Problem, not_found
+from octasplat.service.schemas.webhooks import NewWebhook, WebhookChange
+from octasplat.service.state import Service
+from octasplat.service.webhook_addresses import check_address
+from octasplat.workers.upkeep.webhooks import rows
+from octasplat.workers.upkeep.webhooks.rows import Delivery, Endpoint
+from octasplat.workers.upkeep.webhooks.signing import new_secret
 
 
 @dataclass(frozen=True)

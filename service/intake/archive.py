@@ -11,11 +11,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from service.intake.layout import Part, common_folder, is_clutter, part_of
-from service.intake.names import FileNames
-from service.intake.zip_records import DEFLATED, IS_ENCRYPTED, IS_STRONG, STORED, Record, read_records, refuse
-from workers.store.names import shown_name
-from workers.store.protocol import Blob, BlobWriter
+from octasplat.service.intake.layout import Part, common_folder, is_clutter, part_of
+from octasplat.service.intake.names import FileNames
+from octasplat.service.intake.zip_records import (
+    DEFLATED,
+    IS_ENCRYPTED,
+    IS_STRONG,
+    STORED,
+    Record,
+    read_records,
+    refuse,
+)
+from octasplat.workers.store.names import shown_name
+from octasplat.workers.store.protocol import Blob, BlobWriter
 
 _PIECE_BYTES = 1 << 20
 _NESTED_SUFFIXES = (

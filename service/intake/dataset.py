@@ -4,16 +4,16 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from service.intake.faults import Fault, IntakeRefused
-from service.intake.images import ImageHeader, ImageLimits, read_image_header
-from service.intake.layout import Part, model_files, part_of
-from service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
-from service.intake.model_child import ModelAnswer
-from service.intake.names import FileNames, scene_part
-from service.intake.whole import check_whole
-from workers.store.names import shown_name
-from workers.store.protocol import Storage
-from workers.store.trees import TreeFile
+from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
+from octasplat.service.intake.layout import Part, model_files, part_of
+from octasplat.service.intake.model_check import MIN_VIEWS, ModelLimits, check_model
+from octasplat.service.intake.model_child import ModelAnswer
+from octasplat.service.intake.names import FileNames, scene_part
+from octasplat.service.intake.whole import check_whole
+from octasplat.workers.store.names import shown_name
+from octasplat.workers.store.protocol import Storage
+from octasplat.workers.store.trees import TreeFile
 
 _MAX_FAULTS = 100
 DEFAULT_IMAGE_LIMITS = ImageLimits()

@@ -18,8 +18,8 @@ from PIL.BmpImagePlugin import BmpImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from service.intake.faults import Fault, IntakeRefused
-from workers.store.names import shown_name
+from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.workers.store.names import shown_name
 
 _SUFFIXES = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "TIFF": (".tif", ".tiff"), "WebP": (".webp",),

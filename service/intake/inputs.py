@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
-from service.intake.dataset import DatasetFile
-from service.intake.faults import Fault, IntakeRefused
-from service.intake.images import ImageHeader, ImageLimits, read_image_header
-from service.intake.layout import IMAGE_SUFFIXES, is_clutter
-from service.intake.names import FileNames
-from service.intake.whole import check_whole
-from workers.store.names import shown_name
-from workers.store.protocol import Storage
+from octasplat.service.intake.dataset import DatasetFile
+from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
+from octasplat.service.intake.layout import IMAGE_SUFFIXES, is_clutter
+from octasplat.service.intake.names import FileNames
+from octasplat.service.intake.whole import check_whole
+from octasplat.workers.store.names import shown_name
+from octasplat.workers.store.protocol import Storage
 
 MAX_FILES = 1000
 MAX_TEXT_LINE_BYTES = 1 << 16

@@ -12,12 +12,12 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from engine.isolated_python import python_command
-from service.intake.faults import Fault
-from service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
-from workers.store.protocol import Storage
-from workers.store.trees import TreeFile, fetch_tree
-from workers.work.memory import total_bytes
+from octasplat.engine.isolated_python import python_command
+from octasplat.service.intake.faults import Fault
+from octasplat.service.intake.model_child import MAX_ANSWER_BYTES, ModelAnswer, ModelRequest
+from octasplat.workers.store.protocol import Storage
+from octasplat.workers.store.trees import TreeFile, fetch_tree
+from octasplat.workers.work.memory import total_bytes
 
 MIN_VIEWS = 3
 """Fewer photographs do not make a scene; as in the engine."""
@@ -87,7 +87,7 @@ def _ask(request: ModelRequest, limits: ModelLimits) -> ModelAnswer:
     # Files, not pipes: the child's limit on the length of files then bounds what it can say.
     with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as noise:
         child = subprocess.Popen(  # noqa: S603 - a program of ours
-            python_command("service.intake.model_child"),
+            python_command("octasplat.service.intake.model_child"),
             stdin=subprocess.PIPE,
             stdout=answer,
             stderr=noise,

@@ -1,10 +1,11 @@
 """The child process that parses a COLMAP model from somebody who may mean harm.
 
-    python -P -m service.intake.model_child < request.json > answer.json
+    python -P -m octasplat.service.intake.model_child < request.json > answer.json
 
 It limits its own memory, time and output, and gives up the network, other programs and writing, before it
 imports anything that parses. Only this module's ``main``
-imports pycolmap. The parent is :mod:`service.intake.model_check`; what it sends and receives is defined here.
+imports pycolmap. The parent is :mod:`octasplat.service.intake.model_check`; what it sends and receives is
+defined here.
 """
 
 import contextlib
@@ -18,13 +19,13 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from service.intake.faults import Fault
-from workers.isolation.confining import confine
-from workers.isolation.kernel import PR_SET_PDEATHSIG, prctl
-from workers.store.names import NameRefused, check_name, shown_name
+from octasplat.service.intake.faults import Fault
+from octasplat.workers.isolation.confining import confine
+from octasplat.workers.isolation.kernel import PR_SET_PDEATHSIG, prctl
+from octasplat.workers.store.names import NameRefused, check_name, shown_name
 
 if TYPE_CHECKING:
-    from engine.scene.colmap import ColmapModel
+    from octasplat.engine.scene.colmap import ColmapModel
 
 MAX_ANSWER_BYTES = 4 << 20
 MAX_FAULTS = 100
@@ -82,9 +83,9 @@ def main() -> None:
 
 def check(request: ModelRequest) -> ModelAnswer:
     """Parse the model and list all that is wrong with it."""
-    from engine.errors import DatasetError
-    from engine.scene.binary import check_binary_model
-    from engine.scene.colmap import find_model_folder, read_colmap_model
+    from octasplat.engine.errors import DatasetError
+    from octasplat.engine.scene.binary import check_binary_model
+    from octasplat.engine.scene.colmap import find_model_folder, read_colmap_model
 
     checker = _Checker(request)
     try:

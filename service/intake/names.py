@@ -4,9 +4,9 @@ The doors are a file that is put (:func:`check_file_name`), and many that come o
 (:class:`FileNames`): those of an archive, and those of a dataset that is committed.
 """
 
-from service.intake.faults import Fault, IntakeRefused
-from service.intake.layout import Part, part_of
-from workers.store.names import NameRefused, NameSet, check_name, shown_name
+from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.service.intake.layout import Part, part_of
+from octasplat.workers.store.names import NameRefused, NameSet, check_name, shown_name
 
 
 def check_file_name(name: str) -> Part:

@@ -9,15 +9,15 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
-from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
-from service.intake.dataset import DatasetLimits, check_file_content
-from service.intake.faults import Fault, IntakeRefused
-from service.intake.images import ImageHeader, ImageLimits
-from service.intake.spool import Spool
-from service.threads import Threads, in_thread
-from workers.store.counting import CountingWriter
-from workers.store.os_errors import told
-from workers.store.protocol import Blob, BlobWriter, Storage
+from octasplat.service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
+from octasplat.service.intake.dataset import DatasetLimits, check_file_content
+from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.service.intake.images import ImageHeader, ImageLimits
+from octasplat.service.intake.spool import Spool
+from octasplat.service.threads import Threads, in_thread
+from octasplat.workers.store.counting import CountingWriter
+from octasplat.workers.store.os_errors import told
+from octasplat.workers.store.protocol import Blob, BlobWriter, Storage
 
 PIECE_BYTES = 1 << 20
 _CHECK_EVERY_BYTES = 64 << 20

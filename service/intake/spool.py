@@ -4,8 +4,8 @@ import os
 import threading
 from pathlib import Path
 
-from workers.store.errors import StorageFull
-from workers.store.os_errors import told
+from octasplat.workers.store.errors import StorageFull
+from octasplat.workers.store.os_errors import told
 
 
 class Spool:

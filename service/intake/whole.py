@@ -12,9 +12,9 @@ import struct
 from collections.abc import Callable
 from typing import BinaryIO
 
-from service.intake.faults import Fault, IntakeRefused
-from service.intake.images import read_exactly, read_text
-from workers.store.names import shown_name
+from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.service.intake.images import read_exactly, read_text
+from octasplat.workers.store.names import shown_name
 
 _TAIL_BYTES = 64 << 10
 _PIECE_BYTES = 1 << 20
@@ -29,7 +29,8 @@ def check_whole(file: BinaryIO, name: str, kind: str) -> None:
     """Refuse an image that was cut off.
 
     Args:
-        file: seekable, with a header that :func:`service.intake.images.read_image_header` found sound.
+        file: seekable, with a header that :func:`octasplat.service.intake.images.read_image_header` found
+            sound.
         name: its name in the dataset, for the sentence.
         kind: of the image.
 

@@ -10,8 +10,8 @@ import struct
 from dataclasses import dataclass
 from typing import BinaryIO, NoReturn
 
-from service.intake.faults import Fault, IntakeRefused
-from workers.store.names import shown_name
+from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.workers.store.names import shown_name
 
 STORED, DEFLATED = 0, 8
 IS_ENCRYPTED, HAS_DESCRIPTOR, IS_PATCHED, IS_STRONG, IS_UTF8, IS_MASKED = 1, 8, 32, 64, 2048, 8192

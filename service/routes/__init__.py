@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from service.problems import MEDIA_TYPE, ProblemDocument
+from octasplat.service.problems import MEDIA_TYPE, ProblemDocument
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:

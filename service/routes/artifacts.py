@@ -5,13 +5,13 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
 
-from service.actions import artifacts as actions
-from service.auth import Reader
-from service.downloads import send_blob
-from service.routes import problems
-from service.schemas.artifacts import ArtifactList, ArtifactView
-from service.state import ServiceDep
-from service.threads import Threads, in_thread
+from octasplat.service.actions import artifacts as actions
+from octasplat.service.auth import Reader
+from octasplat.service.downloads import send_blob
+from octasplat.service.routes import problems
+from octasplat.service.schemas.artifacts import ArtifactList, ArtifactView
+from octasplat.service.state import ServiceDep
+from octasplat.service.threads import Threads, in_thread
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
 

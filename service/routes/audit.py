@@ -2,12 +2,12 @@
 
 from fastapi import APIRouter, Request, Response
 
-from service.actions.audit import list_entries
-from service.auth import Admin
-from service.paging import Cursor, Limit, next_cursor, read_number_cursor
-from service.routes import problems
-from service.schemas.audit import AuditPage, AuditView
-from service.state import ServiceDep
+from octasplat.service.actions.audit import list_entries
+from octasplat.service.auth import Admin
+from octasplat.service.paging import Cursor, Limit, next_cursor, read_number_cursor
+from octasplat.service.routes import problems
+from octasplat.service.schemas.audit import AuditPage, AuditView
+from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1/audit", tags=["service"])
 

@@ -7,16 +7,16 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
-from service.actions import datasets as actions
-from service.actions import uploads
-from service.auth import Reader, Writer
-from service.downloads import send_blob
-from service.intake.receive import parse_digest
-from service.paging import Cursor, Limit, next_cursor, read_cursor, read_id_cursor
-from service.problems import Problem
-from service.routes import problems
-from service.routes.parameters import IdempotencyKey
-from service.schemas.datasets import (
+from octasplat.service.actions import datasets as actions
+from octasplat.service.actions import uploads
+from octasplat.service.auth import Reader, Writer
+from octasplat.service.downloads import send_blob
+from octasplat.service.intake.receive import parse_digest
+from octasplat.service.paging import Cursor, Limit, next_cursor, read_cursor, read_id_cursor
+from octasplat.service.problems import Problem
+from octasplat.service.routes import problems
+from octasplat.service.routes.parameters import IdempotencyKey
+from octasplat.service.schemas.datasets import (
     ArchiveView,
     DatasetChange,
     DatasetPage,
@@ -25,9 +25,9 @@ from service.schemas.datasets import (
     FileView,
     NewDataset,
 )
-from service.state import ServiceDep
-from service.threads import Threads, in_thread
-from workers.work.media_types import media_type
+from octasplat.service.state import ServiceDep
+from octasplat.service.threads import Threads, in_thread
+from octasplat.workers.work.media_types import media_type
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 

@@ -2,11 +2,11 @@
 
 from fastapi import APIRouter
 
-from service.actions.estimates import estimate
-from service.auth import Writer
-from service.routes import problems
-from service.schemas.estimates import EstimateView, NewEstimate
-from service.state import ServiceDep
+from octasplat.service.actions.estimates import estimate
+from octasplat.service.auth import Writer
+from octasplat.service.routes import problems
+from octasplat.service.schemas.estimates import EstimateView, NewEstimate
+from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1/estimates", tags=["jobs"])
 

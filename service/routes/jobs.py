@@ -5,18 +5,18 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service.actions import jobs as actions
-from service.actions.accepting import accept_job
-from service.actions.accepting import retry_job as retry_again
-from service.actions.jobs import BUSY_SECONDS, JobFilter, ShownJob, stages_of
-from service.auth import Reader, Writer
-from service.etags import check_precondition, matches
-from service.paging import Cursor, Limit, next_cursor, read_id_cursor
-from service.routes import problems
-from service.routes.parameters import IdempotencyKey
-from service.schemas.jobs import JobChange, JobPage, JobView, NewJob, RetryRequest
-from service.state import ServiceDep
-from workers.records.rows import JobState
+from octasplat.service.actions import jobs as actions
+from octasplat.service.actions.accepting import accept_job
+from octasplat.service.actions.accepting import retry_job as retry_again
+from octasplat.service.actions.jobs import BUSY_SECONDS, JobFilter, ShownJob, stages_of
+from octasplat.service.auth import Reader, Writer
+from octasplat.service.etags import check_precondition, matches
+from octasplat.service.paging import Cursor, Limit, next_cursor, read_id_cursor
+from octasplat.service.routes import problems
+from octasplat.service.routes.parameters import IdempotencyKey
+from octasplat.service.schemas.jobs import JobChange, JobPage, JobView, NewJob, RetryRequest
+from octasplat.service.state import ServiceDep
+from octasplat.workers.records.rows import JobState
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

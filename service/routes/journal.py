@@ -10,12 +10,12 @@ from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import StreamingResponse
 from fastapi.sse import format_sse_event
 
-from service.actions import journal as actions
-from service.auth import Reader
-from service.routes import problems
-from service.schemas.journal import EventPage, EventView, LogLineView, LogPage
-from service.state import ServiceDep
-from workers.records.rows import JobEvent
+from octasplat.service.actions import journal as actions
+from octasplat.service.auth import Reader
+from octasplat.service.routes import problems
+from octasplat.service.schemas.journal import EventPage, EventView, LogLineView, LogPage
+from octasplat.service.state import ServiceDep
+from octasplat.workers.records.rows import JobEvent
 
 router = APIRouter(prefix="/v1/jobs", tags=["progress"])
 

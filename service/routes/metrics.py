@@ -3,10 +3,10 @@
 from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from service.actions.system import render_metrics
-from service.auth import Reader
-from service.routes import problems
-from service.state import ServiceDep
+from octasplat.service.actions.system import render_metrics
+from octasplat.service.auth import Reader
+from octasplat.service.routes import problems
+from octasplat.service.state import ServiceDep
 
 router = APIRouter(tags=["health"])
 

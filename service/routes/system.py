@@ -4,13 +4,13 @@ import uuid
 
 from fastapi import APIRouter, Response
 
-from service.actions import system as actions
-from service.actions import tokens
-from service.auth import Admin, Reader, Writer
-from service.routes import problems
-from service.schemas.system import Health, InfoView, KindList, KindView, QueueList
-from service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenList, TokenView
-from service.state import ServiceDep
+from octasplat.service.actions import system as actions
+from octasplat.service.actions import tokens
+from octasplat.service.auth import Admin, Reader, Writer
+from octasplat.service.routes import problems
+from octasplat.service.schemas.system import Health, InfoView, KindList, KindView, QueueList
+from octasplat.service.schemas.tokens import MadeToken, NewToken, SignInLink, TokenList, TokenView
+from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1", tags=["service"])
 health_router = APIRouter(tags=["health"])

@@ -5,11 +5,11 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service.actions import webhooks as actions
-from service.auth import Reader, Writer
-from service.paging import Cursor, Limit, next_cursor, read_id_cursor
-from service.routes import problems
-from service.schemas.webhooks import (
+from octasplat.service.actions import webhooks as actions
+from octasplat.service.auth import Reader, Writer
+from octasplat.service.paging import Cursor, Limit, next_cursor, read_id_cursor
+from octasplat.service.routes import problems
+from octasplat.service.schemas.webhooks import (
     DeliveryList,
     DeliveryView,
     MadeWebhook,
@@ -18,7 +18,7 @@ from service.schemas.webhooks import (
     WebhookPage,
     WebhookView,
 )
-from service.state import ServiceDep
+from octasplat.service.state import ServiceDep
 
 router = APIRouter(prefix="/v1/webhooks", tags=["webhooks"])
 

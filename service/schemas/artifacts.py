@@ -2,7 +2,7 @@
 
 from pydantic import BaseModel, ConfigDict
 
-from workers.records.rows import Artifact
+from octasplat.workers.records.rows import Artifact
 
 
 class ArtifactView(BaseModel):

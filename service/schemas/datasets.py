@@ -6,8 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, Strict
-from workers.records.rows import Dataset, DatasetFile, DatasetHolds, DatasetState
+from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, Strict
+from octasplat.workers.records.rows import Dataset, DatasetFile, DatasetHolds, DatasetState
 
 
 class NewDataset(Strict):

@@ -5,8 +5,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.schemas.base import Strict
-from workers.work.kinds.estimates import Estimate
+from octasplat.service.schemas.base import Strict
+from octasplat.workers.work.kinds.estimates import Estimate
 
 
 class PhotographSizes(Strict):

@@ -5,7 +5,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from workers.records.rows import JobEvent, LogLine
+from octasplat.workers.records.rows import JobEvent, LogLine
 
 
 class LogLineView(BaseModel):

@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from service.schemas.base import Strict
-from workers.records.rows import Token
+from octasplat.service.schemas.base import Strict
+from octasplat.workers.records.rows import Token
 
 
 class NewToken(Strict):

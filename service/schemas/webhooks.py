@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME
-from workers.upkeep.webhooks.addresses import MAX_URL
-from workers.upkeep.webhooks.rows import ENDS, Delivery, DeliveryState, Endpoint, EventName
-from workers.upkeep.webhooks.signing import check_secret
+from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME
+from octasplat.workers.upkeep.webhooks.addresses import MAX_URL
+from octasplat.workers.upkeep.webhooks.rows import ENDS, Delivery, DeliveryState, Endpoint, EventName
+from octasplat.workers.upkeep.webhooks.signing import check_secret
 
 _SECRET = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSwMfKQ9r8GKYo="  # noqa: S105 - an example
 

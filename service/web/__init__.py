@@ -5,8 +5,8 @@ from fastapi import FastAPI
 
 def mount_pages(app: FastAPI) -> None:
     """Add the pages and their static files to the application."""
-    from service.web import api_page, pages, session
-    from service.web.assets import Assets
+    from octasplat.service.web import api_page, pages, session
+    from octasplat.service.web.assets import Assets
 
     app.include_router(session.router)
     app.include_router(pages.router)

@@ -6,8 +6,8 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from service.web.routing import PageRoute
-from service.web.templating import page
+from octasplat.service.web.routing import PageRoute
+from octasplat.service.web.templating import page
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 

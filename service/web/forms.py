@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Literal
 
-from engine.files import exporters
-from engine.train.config import preset
-from engine.train.preset_names import PRESETS
-from workers.work.kinds import JobKind
+from octasplat.engine.files import exporters
+from octasplat.engine.train.config import preset
+from octasplat.engine.train.preset_names import PRESETS
+from octasplat.workers.work.kinds import JobKind
 
 Control = Literal["choice", "yes_no", "whole", "number", "text", "list", "files"]
 

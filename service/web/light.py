@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.settings import ServiceSettings
-from service.web.results import CONFIG, HELD_OUT, SCENE, Measured
-from workers.records.rows import Artifact, DatasetFile
+from octasplat.service.settings import ServiceSettings
+from octasplat.service.web.results import CONFIG, HELD_OUT, SCENE, Measured
+from octasplat.workers.records.rows import Artifact, DatasetFile
 
 NEEDED = (SCENE, CONFIG, HELD_OUT, "views.json")
 MAX_VIEWS = 60

@@ -8,26 +8,26 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
 
-from service.actions import jobs as actions
-from service.actions.accepting import retry_job
-from service.actions.artifacts import get_artifact, list_artifacts
-from service.actions.datasets import list_datasets
-from service.actions.system import living_workers
-from service.auth import Principal, Reader, Writer
-from service.downloads import send_blob
-from service.intake.layout import model_files
-from service.limits import ceilings_by_path
-from service.paging import read_id_cursor, write_cursor
-from service.queue_facts import unwritable_formats
-from service.schemas.jobs import JobChange, RetryRequest
-from service.state import Service, ServiceDep
-from service.threads import Threads, in_thread
-from service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
-from service.web.forms import WITHOUT_FORM, options_form
-from service.web.light import light_form
-from service.web.reading import job_counts, job_detail, job_lines, photographs_of
-from service.web.relight import relight_form
-from service.web.results import (
+from octasplat.service.actions import jobs as actions
+from octasplat.service.actions.accepting import retry_job
+from octasplat.service.actions.artifacts import get_artifact, list_artifacts
+from octasplat.service.actions.datasets import list_datasets
+from octasplat.service.actions.system import living_workers
+from octasplat.service.auth import Principal, Reader, Writer
+from octasplat.service.downloads import send_blob
+from octasplat.service.intake.layout import model_files
+from octasplat.service.limits import ceilings_by_path
+from octasplat.service.paging import read_id_cursor, write_cursor
+from octasplat.service.queue_facts import unwritable_formats
+from octasplat.service.schemas.jobs import JobChange, RetryRequest
+from octasplat.service.state import Service, ServiceDep
+from octasplat.service.threads import Threads, in_thread
+from octasplat.service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
+from octasplat.service.web.forms import WITHOUT_FORM, options_form
+from octasplat.service.web.light import light_form
+from octasplat.service.web.reading import job_counts, job_detail, job_lines, photographs_of
+from octasplat.service.web.relight import relight_form
+from octasplat.service.web.results import (
     CONFIG,
     HELD_OUT,
     LAYERS,
@@ -39,11 +39,11 @@ from service.web.results import (
     read_json,
     read_names,
 )
-from service.web.routing import PageRoute, go_to, is_part
-from service.web.templating import page
-from workers.records.rows import Artifact, DatasetFile
-from workers.store.errors import StorageError
-from workers.work.kinds import job_kinds, kind_named
+from octasplat.service.web.routing import PageRoute, go_to, is_part
+from octasplat.service.web.templating import page
+from octasplat.workers.records.rows import Artifact, DatasetFile
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.work.kinds import job_kinds, kind_named
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 

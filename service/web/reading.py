@@ -7,19 +7,19 @@ from typing import Any
 
 from psycopg.rows import class_row
 
-from service.actions.access import owned_job
-from service.actions.jobs import JobFilter, job_view, list_jobs, stages_of
-from service.actions.parts import Part
-from service.auth import Principal
-from service.schemas.jobs import JobView
-from service.state import Service
-from service.threads import Threads, in_thread
-from service.web.results import METRICS, mean_psnr, read_json
-from service.web.templating import short_id
-from workers.queue import jobs as rows
-from workers.records.database import Connection, naming
-from workers.records.datasets import files_of, get_dataset
-from workers.records.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
+from octasplat.service.actions.access import owned_job
+from octasplat.service.actions.jobs import JobFilter, job_view, list_jobs, stages_of
+from octasplat.service.actions.parts import Part
+from octasplat.service.auth import Principal
+from octasplat.service.schemas.jobs import JobView
+from octasplat.service.state import Service
+from octasplat.service.threads import Threads, in_thread
+from octasplat.service.web.results import METRICS, mean_psnr, read_json
+from octasplat.service.web.templating import short_id
+from octasplat.workers.queue import jobs as rows
+from octasplat.workers.records.database import Connection, naming
+from octasplat.workers.records.datasets import files_of, get_dataset
+from octasplat.workers.records.rows import Artifact, Dataset, DatasetFile, Job, JobEvent, JobState
 
 ACTIVE: tuple[JobState, ...] = ("queued", "running", "canceling")
 SHOWN: dict[str, tuple[JobState, ...]] = {

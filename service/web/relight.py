@@ -4,14 +4,14 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.actions.datasets import list_files_named
-from service.auth import Principal
-from service.settings import ServiceSettings
-from service.state import Service
-from service.web.light import MAX_VIEWS, PREVIEW_PRIORITY
-from service.web.results import LEARNT_LIGHT
-from workers.records.rows import Artifact
-from workers.work.kinds import kind_named
+from octasplat.service.actions.datasets import list_files_named
+from octasplat.service.auth import Principal
+from octasplat.service.settings import ServiceSettings
+from octasplat.service.state import Service
+from octasplat.service.web.light import MAX_VIEWS, PREVIEW_PRIORITY
+from octasplat.service.web.results import LEARNT_LIGHT
+from octasplat.workers.records.rows import Artifact
+from octasplat.workers.work.kinds import kind_named
 
 MAPS = (".hdr", ".exr")
 MAX_MAPS = 60

@@ -9,9 +9,9 @@ from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import Any, cast
 
-from workers.records.rows import Artifact, DatasetFile
-from workers.store.errors import StorageError
-from workers.store.protocol import Storage
+from octasplat.workers.records.rows import Artifact, DatasetFile
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.store.protocol import Storage
 
 logger = logging.getLogger(__name__)
 

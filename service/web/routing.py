@@ -13,9 +13,9 @@ from fastapi.responses import RedirectResponse
 from fastapi.routing import APIRoute
 from psycopg_pool import PoolTimeout
 
-from engine.errors import OctasplatError
-from service.problems import Problem, not_found, problem_of
-from service.web.templating import page
+from octasplat.engine.errors import OctasplatError
+from octasplat.service.problems import Problem, not_found, problem_of
+from octasplat.service.web.templating import page
 
 logger = logging.getLogger(__name__)
 Handler = Callable[[Request], Coroutine[Any, Any, Response]]

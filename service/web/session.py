@@ -5,7 +5,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service.auth import (
+from octasplat.service.auth import (
     COOKIE,
     SECURE_COOKIE,
     Principal,
@@ -13,12 +13,12 @@ from service.auth import (
     session_secret,
     token_of,
 )
-from service.state import Service, ServiceDep
-from service.web.routing import PageRoute, go_to, local_address
-from service.web.templating import page
-from workers.records.rows import Token
-from workers.records.sessions import begin_session, end_session, use_link
-from workers.records.tokens import get_token
+from octasplat.service.state import Service, ServiceDep
+from octasplat.service.web.routing import PageRoute, go_to, local_address
+from octasplat.service.web.templating import page
+from octasplat.workers.records.rows import Token
+from octasplat.workers.records.sessions import begin_session, end_session, use_link
+from octasplat.workers.records.tokens import get_token
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 

@@ -9,9 +9,9 @@ from typing import Any
 from fastapi import Request
 from fastapi.responses import HTMLResponse
 
-import engine
-from service.auth import Principal, session_secret
-from service.web import wording
+from octasplat.engine import __version__
+from octasplat.service.auth import Principal, session_secret
+from octasplat.service.web import wording
 
 PAGE_HEADERS = {
     "Content-Security-Policy": (
@@ -52,7 +52,7 @@ def page(
             who=who,
             signed_in=session_secret(request) is not None,
             path=request.url.path,
-            version=engine.__version__,
+            version=__version__,
             **values,
         )
     )
@@ -64,7 +64,7 @@ def _environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
     environment = Environment(
-        loader=PackageLoader("service.web"),
+        loader=PackageLoader("octasplat.service.web"),
         autoescape=select_autoescape(["html"]),
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -1,4 +1,6 @@
-"""Makes ``static/vendor`` anew from npm packages at pinned versions: ``python -m service.web.vendor``.
+"""Makes ``static/vendor`` anew from npm packages at pinned versions.
+
+Run as ``python -m octasplat.service.web.vendor``.
 
 Needs node and npm, which nobody else does: what it makes is part of the repository.
 """

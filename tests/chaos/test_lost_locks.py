@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from worker_bench import ROOT, Bench
 
-from workers.queue.jobs import LOCK_SECONDS
+from octasplat.workers.queue.jobs import LOCK_SECONDS
 
 pytestmark = pytest.mark.heavy
 
 HOLDER = """
 import asyncio, sys, time, uuid
-from workers.records.database import open_pool
-from workers.queue.jobs import get_job
+from octasplat.workers.records.database import open_pool
+from octasplat.workers.queue.jobs import get_job
 
 async def hold():
     async with open_pool(sys.argv[1], max_size=1) as pool, pool.connection() as connection:

@@ -12,15 +12,15 @@ from pathlib import Path
 import boto3
 import psycopg
 import pytest
+from benchmarks.chaos import journal_faults
+from benchmarks.chaos_kind import ChainOptions, undisturbed
 from moto.server import ThreadedMotoServer
 from namespaces import GATEWAY, Host, door, hosts, lacking
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from worker_bench import ROOT, Bench, alive, child_pids
 
-from benchmarks.chaos import journal_faults
-from benchmarks.chaos_kind import ChainOptions, undisturbed
-from workers.settings import WorkerSettings
-from workers.store.opening import open_storage
+from octasplat.workers.settings import WorkerSettings
+from octasplat.workers.store.opening import open_storage
 
 pytestmark = pytest.mark.heavy
 
@@ -57,7 +57,7 @@ class Hosts:
             "OCTASPLAT_KIND_MODULES": '["benchmarks.chaos_kind"]',
             "PYTHONPATH": str(ROOT),
         }
-        command = [sys.executable, "-m", "workers", "worker", "--name", f"host{number}"]
+        command = [sys.executable, "-m", "octasplat", "worker", "--name", f"host{number}"]
         with (self.bench.folder / f"host{number}.log").open("ab") as log:
             process = subprocess.Popen(
                 self.found[number].command(*command), env=environment, cwd=ROOT, stderr=log

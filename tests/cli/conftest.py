@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from engine.config import resolve_config
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.gaussians.scene_facts import SceneFacts
-from engine.render.environment_map import write_environment
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.cli.main import cli
+from octasplat.engine.config import resolve_config
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.workers.cli.main import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (
@@ -62,7 +62,12 @@ def start_octasplat() -> Callable[..., subprocess.Popen[str]]:
 
     def start(*arguments: object) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, "-c", "from workers.cli.main import main; main()", *map(str, arguments)],
+            [
+                sys.executable,
+                "-c",
+                "from octasplat.workers.cli.main import main; main()",
+                *map(str, arguments),
+            ],
             cwd=ROOT,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
             stdout=subprocess.PIPE,

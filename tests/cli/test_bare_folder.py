@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from neighbouring_photographs import write_neighbours
 
-from engine.render.images import write_png
+from neighbouring_photographs import write_neighbours
+from octasplat.engine.render.images import write_png
 
 pytestmark = pytest.mark.heavy
 

@@ -4,10 +4,10 @@ import shutil
 
 import numpy as np
 
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.gaussians.model import concatenate
-from engine.run_folder import run_near_zones
-from engine.scene.views_file import read_views
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.gaussians.model import concatenate
+from octasplat.engine.run_folder import run_near_zones
+from octasplat.engine.scene.views_file import read_views
 
 
 def test_a_cloud_before_a_camera_is_taken_away(run, octasplat, tmp_path):

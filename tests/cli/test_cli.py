@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-import engine
-from engine.files import exporters
-from engine.threads import available_threads
+from octasplat.engine import __version__
+from octasplat.engine.files import exporters
+from octasplat.engine.threads import available_threads
 
 COMMANDS = ("reconstruct", "evaluate", "export", "render", "demo")
 HEAVY = ("torch", "numba", "pycolmap", "numpy", "pydantic", "OpenImageIO", "scipy")
@@ -22,7 +22,7 @@ LIGHT = [name for name in COMMANDS if name != "export"]
 def test_help_imports_nothing_heavy(arguments):
     code = f"""
 import sys
-from workers.cli.main import cli
+from octasplat.workers.cli.main import cli
 try:
     cli({arguments!r})
 except SystemExit as end:
@@ -46,7 +46,7 @@ def test_help_of_export_names_every_format(octasplat):
 
 
 def test_version(octasplat):
-    assert octasplat("--version").stdout.split()[-1] == engine.__version__
+    assert octasplat("--version").stdout.split()[-1] == __version__
 
 
 def one_error_line(result, code=1):
@@ -105,7 +105,7 @@ def test_unknown_preset_is_a_usage_error(octasplat, scene, tmp_path):
 
 
 def test_unexpected_errors_are_one_line_too(octasplat, run, monkeypatch):
-    monkeypatch.setattr("engine.evaluate.runs.evaluate", _broken)
+    monkeypatch.setattr("octasplat.engine.evaluate.runs.evaluate", _broken)
     monkeypatch.delenv("OCTASPLAT_DEBUG", raising=False)
     line = one_error_line(octasplat("evaluate", run.output), code=70)
     assert "ZeroDivisionError" in line and "OCTASPLAT_DEBUG=1" in line
@@ -116,14 +116,14 @@ def test_unexpected_errors_are_one_line_too(octasplat, run, monkeypatch):
 
 
 def test_interrupted_commands_end_with_130(octasplat, run, monkeypatch):
-    monkeypatch.setattr("engine.evaluate.runs.evaluate", _interrupted)
+    monkeypatch.setattr("octasplat.engine.evaluate.runs.evaluate", _interrupted)
     one_error_line(octasplat("evaluate", run.output), code=130)
 
 
 def test_threads_are_capped_at_the_cores(octasplat, run, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        "engine.evaluate.runs.evaluate", lambda *_, **options: asked.append(options["threads"])
+        "octasplat.engine.evaluate.runs.evaluate", lambda *_, **options: asked.append(options["threads"])
     )
     assert octasplat("evaluate", run.output, "--threads", "100000").exit_code == 0
     assert octasplat("evaluate", run.output, "--threads", "1").exit_code == 0

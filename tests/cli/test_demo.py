@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import workers.cli.demonstration
+from octasplat.workers.cli import demonstration
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = ("--views", 4, "--width", 32, "--height", 24)
@@ -18,7 +18,7 @@ SIZE = ("--views", 4, "--width", 32, "--height", 24)
 @pytest.fixture
 def tiny_demo(monkeypatch):
     settings = ("iterations=3", "rays=64", "initial_points=100", "probe_rays=256", "patch_side=16")
-    monkeypatch.setattr(workers.cli.demonstration, "DEMO_ASSIGNMENTS", {"fast": settings})
+    monkeypatch.setattr(demonstration, "DEMO_ASSIGNMENTS", {"fast": settings})
 
 
 def test_scene_only(octasplat, tmp_path):
@@ -44,7 +44,7 @@ def test_a_signal_leaves_no_half_of_a_scene(start_octasplat, tmp_path, number, c
 
 STOPPED_AT_ONCE = """
 import os, pathlib, signal, sys
-from workers.cli.demonstration import make_scene
+from octasplat.workers.cli.demonstration import make_scene
 
 made = pathlib.Path.mkdir
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from engine.config import resolve_config
-from engine.events import Event, Warned
-from engine.render.images import read_image
-from workers.work.kinds import kind_named
-from workers.work.programs import reconstruct
-from workers.work.task import Task
+from octasplat.engine.config import resolve_config
+from octasplat.engine.events import Event, Warned
+from octasplat.engine.render.images import read_image
+from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.work.programs import reconstruct
+from octasplat.workers.work.task import Task
 
 SETTINGS = (
     "iterations=60", "rays=256", "max_gaussians=600", "initial_points=300", "probe_rays=256", "patch_side=16",

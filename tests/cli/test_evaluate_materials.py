@@ -9,12 +9,12 @@ import OpenImageIO as oiio
 import pytest
 from pydantic import ValidationError
 
-from engine.render.environment_map import write_environment
-from engine.render.images import read_image
-from workers.records.sizes import Sizes
-from workers.work.kinds import kind_named
-from workers.work.programs import relight
-from workers.work.task import Task
+from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.render.images import read_image
+from octasplat.workers.records.sizes import Sizes
+from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.work.programs import relight
+from octasplat.workers.work.task import Task
 
 SIDE = (48, 64)
 

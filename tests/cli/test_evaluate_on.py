@@ -7,10 +7,10 @@ from pathlib import Path
 import pycolmap
 import pytest
 
-from engine.render.images import read_image
-from workers.work.kinds import kind_named
-from workers.work.programs import evaluate
-from workers.work.task import Task
+from octasplat.engine.render.images import read_image
+from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.work.programs import evaluate
+from octasplat.workers.work.task import Task
 
 
 def part_of(scene: Path, folder: Path, wanted: set[str], *, points: bool = False) -> Path:

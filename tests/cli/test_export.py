@@ -7,11 +7,11 @@ import struct
 import numpy as np
 import pytest
 
-from engine.files import read_scene
-from engine.files.gaussian_ply import read_gaussian_ply
-from engine.files.ply_container import PlyWriteElement, write_ply
-from engine.render.draw_order import AGREEMENT, common_order
-from engine.run_folder import run_viewpoints
+from octasplat.engine.files import read_scene
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
+from octasplat.engine.render.draw_order import AGREEMENT, common_order
+from octasplat.engine.run_folder import run_viewpoints
 
 
 def test_scene_to_glb(run, octasplat, tmp_path):
@@ -45,7 +45,7 @@ def test_options_reach_a_glb(run, octasplat, tmp_path):
 
 
 def test_help_lists_every_format(octasplat):
-    from engine.files import exporters
+    from octasplat.engine.files import exporters
 
     text = octasplat("export", "--help").stdout
     for exporter in exporters():

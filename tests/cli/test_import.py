@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from engine.files import read_scene
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.files.ply_container import PlyWriteElement, write_ply
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.files import read_scene
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
+from octasplat.engine.gaussians.model import FlatGaussians
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from engine.evaluate.scene_facts import OPACITY_EDGES
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.render.images import read_image
+from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.render.images import read_image
 
 
 def test_facts_on_a_file_are_those_of_its_gaussians(run, octasplat, tmp_path):

@@ -6,8 +6,8 @@ import shutil
 import numpy as np
 import pytest
 
-from engine.render.environment_map import read_background
-from engine.render.images import read_image
+from octasplat.engine.render.environment_map import read_background
+from octasplat.engine.render.images import read_image
 
 LEARNT = ("--set", "background=learnt", "--set", "background_height=32")
 

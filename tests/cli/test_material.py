@@ -9,14 +9,14 @@ import pytest
 from PIL import Image
 from pydantic import ValidationError
 
-from engine.colour import linear_to_srgb
-from engine.files import export_scene, read_mesh
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.render.environment_map import write_environment
-from engine.render.images import read_image
-from workers.work.kinds import kind_named
-from workers.work.programs import material
-from workers.work.task import Task
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.files import export_scene, read_mesh
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.render.images import read_image
+from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.work.programs import material
+from octasplat.workers.work.task import Task
 
 VIEW = "view_000"
 

@@ -7,9 +7,9 @@ import time
 import numpy as np
 import pytest
 
-from engine.files.gaussian_ply import read_gaussian_ply
-from engine.gaussians.materials import has_materials
-from engine.render.environment_map import read_environment
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.gaussians.materials import has_materials
+from octasplat.engine.render.environment_map import read_environment
 
 MATERIALS = (
     "--materials", "--set", "materials.environment_height=16", "--set", "materials.ambient_rays=4",

@@ -98,7 +98,7 @@ def test_a_program_of_its_own_says_the_same_and_nothing_else(copy, run):
         resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
 
     done = subprocess.run(
-        [sys.executable, "-c", "from workers.cli.main import main; main()",
+        [sys.executable, "-c", "from octasplat.workers.cli.main import main; main()",
          "reconstruct", str(run.scene), "-o", str(output), "--resume", "--threads", "1", "--quiet"],
         cwd=ROOT, preexec_fn=limit, capture_output=True, text=True, check=False,
     )  # fmt: skip

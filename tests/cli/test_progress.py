@@ -7,8 +7,8 @@ import time
 import pytest
 from rich.console import Console
 
-from engine.errors import Cancelled
-from engine.events import (
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import (
     HeldOutMeasured,
     StageFinished,
     StageProgress,
@@ -16,10 +16,10 @@ from engine.events import (
     TrainingProgress,
     Warned,
 )
-from engine.stages import stopping
-from workers.cli.progress import Bars, show_progress
-from workers.telling.lines import PlainLines
-from workers.telling.wording import clock, duration, rate
+from octasplat.engine.stages import stopping
+from octasplat.workers.cli.progress import Bars, show_progress
+from octasplat.workers.telling.lines import PlainLines
+from octasplat.workers.telling.wording import clock, duration, rate
 
 TRAINING = TrainingProgress(
     iteration=310, total_iterations=1500, loss=0.1, psnr=24.13, gaussians=32000, rays_per_second=310_400,

@@ -147,7 +147,7 @@ def test_a_signal_while_evaluating_stops_too(run, octasplat, monkeypatch):
     def interrupt(*_arguments):
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("engine.evaluate.held_out.write_png", interrupt)
+    monkeypatch.setattr("octasplat.engine.evaluate.held_out.write_png", interrupt)
     result = octasplat("reconstruct", run.scene, "-o", run.output, "--resume", "--threads", 1)
     assert result.exit_code == 130
     assert "evaluating" in result.stderr
@@ -159,7 +159,7 @@ def test_a_signal_while_evaluating_stops_too(run, octasplat, monkeypatch):
 def test_a_terminal_gets_a_bar(scene, tiny, tmp_path):
     master, slave = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-c", "from workers.cli.main import main; main()",
+        [sys.executable, "-c", "from octasplat.workers.cli.main import main; main()",
          "reconstruct", str(scene), "-o", str(tmp_path / "run"), *tiny],
         stdout=slave, stderr=slave, cwd=Path(__file__).parents[2],
         env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100"},

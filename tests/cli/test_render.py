@@ -9,10 +9,10 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from engine.colour import linear_to_srgb
-from engine.files import read_facts
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.render.images import read_channels, read_image
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.files import read_facts
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.render.images import read_channels, read_image
 
 SIZE = ("--width", 32, "--height", 24)
 

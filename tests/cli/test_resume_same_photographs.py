@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from engine.render.images import read_image, write_png
+from octasplat.engine.render.images import read_image, write_png
 
 
 def content(folder: Path) -> dict[str, tuple[int, bytes]]:

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.files.gaussian_ply import write_gaussian_ply
-from engine.files.gltf import GlbFile
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.model import FlatGaussians
-from engine.render.environment_map import write_environment
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.files.gltf import GlbFile
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.environment_map import write_environment
 
 SMALL = ("--resolution", 32, "--depth-side", 24, "--texture", 64, "--max-triangles", 400, "--threads", 1)
 

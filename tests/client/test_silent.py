@@ -10,9 +10,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_it_loads_neither_the_command_line_nor_anything_heavy() -> None:
     code = (
-        "import sys, workers.client.submission, workers.client.watch\n"
+        "import sys, octasplat.workers.client.submission, octasplat.workers.client.watch\n"
         "heavy = {'torch', 'numba'} & sys.modules.keys()\n"
-        "print([name for name in sys.modules if name.startswith('workers.cli.')], sorted(heavy))"
+        "print([name for name in sys.modules if name.startswith('octasplat.workers.cli.')], sorted(heavy))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[] []"

@@ -7,8 +7,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from workers.client import api
-from workers.client.watch import watch_job
+from octasplat.workers.client import api
+from octasplat.workers.client.watch import watch_job
 
 
 class Front(BaseHTTPRequestHandler):

@@ -16,11 +16,11 @@ from namespaces import door
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from test_docker_files import compose
 
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.client.api import Api
-from workers.client.download import download_results
-from workers.client.submission import Submission, submit
-from workers.client.watch import watch_job
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.download import download_results
+from octasplat.workers.client.submission import Submission, submit
+from octasplat.workers.client.watch import watch_job
 
 pytestmark = [
     pytest.mark.heavy,

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from test_docker_files import ROOT, instructions
 
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.client.api import Api
-from workers.client.upload import upload_scene
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.upload import upload_scene
 
 pytestmark = pytest.mark.heavy
 
@@ -58,7 +58,7 @@ def test_front_end_and_maintenance_run_without_torch(image: Path, conninfo: str,
         "OCTASPLAT_FLOOR_BYTES": "0",
         "OCTASPLAT_PORT": "0",
     }
-    front = [python, "-m", "service"]
+    front = [python, "-m", "octasplat", "api"]
     worker = [image / "bin" / "octasplat", "worker", "--queues", "", "--name", "maintenance"]
     log = tmp_path / "log"
     with log.open("w") as errors:

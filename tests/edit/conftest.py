@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from engine.gaussians.model import FlatGaussians
-from workers.cli.main import cli
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.workers.cli.main import cli
 
 BLENDER = "OCTASPLAT_BPY_PYTHON"
 

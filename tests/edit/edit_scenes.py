@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from engine.edit.local_maps import legs_world
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.rows import row_arrays
+from octasplat.engine.edit.local_maps import legs_world
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import row_arrays
 
 Map = Callable[[np.ndarray], np.ndarray]
 

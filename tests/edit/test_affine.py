@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from edit_scenes import assert_same, covariance_errors, covariances, random_turn
 
-from engine.edit import affine
-from engine.edit.selection import inside_box, inside_sphere, merge, with_sh_degree
-from engine.errors import ConfigError
-from engine.gaussians.harmonics import sh_basis
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.edit import affine
+from octasplat.engine.edit.selection import inside_box, inside_sphere, merge, with_sh_degree
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., FlatGaussians]
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from engine.edit.cleaning import CleanOptions, clean, linked_groups
-from engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.edit.cleaning import CleanOptions, clean, linked_groups
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 
 Make = Callable[..., FlatGaussians]
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from edit_scenes import assert_same, cube
 
-from engine.edit.affine import transform
-from engine.files import export_scene, read_facts, read_mesh
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.edit.affine import transform
+from octasplat.engine.files import export_scene, read_facts, read_mesh
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import SceneFacts
 
 Make = Callable[..., FlatGaussians]
 

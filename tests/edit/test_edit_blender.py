@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from edit_scenes import assert_same, covariance_errors, moved_covariances, twist
 
-from engine.edit.recovery import EditOptions, recover_edit
-from engine.errors import SceneFileError
-from engine.files import export_scene, read_mesh
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.edit.recovery import EditOptions, recover_edit
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import export_scene, read_mesh
+from octasplat.engine.gaussians.model import FlatGaussians
 
 pytestmark = pytest.mark.tools
 Make = Callable[..., FlatGaussians]

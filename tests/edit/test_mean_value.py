@@ -4,7 +4,7 @@ import mean_value_twin as twin
 import numpy as np
 from edit_scenes import cube
 
-from engine.edit.proxy import MeanValueBinding, Proxy
+from octasplat.engine.edit.proxy import MeanValueBinding, Proxy
 
 
 def dented_ball(cells: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,11 +16,11 @@ from edit_scenes import (
     twist,
 )
 
-from engine.edit.deform import deform, deform_to, deformation_corners
-from engine.edit.proxy import MeanValueBinding, Proxy, bind
-from engine.errors import SceneFileError
-from engine.gaussians.harmonics import sh_basis
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.edit.deform import deform, deform_to, deformation_corners
+from octasplat.engine.edit.proxy import MeanValueBinding, Proxy, bind
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., FlatGaussians]
 SHEAR = np.array([[1.2, 0.3, 0.0], [0.0, 0.8, 0.1], [0.2, 0.0, 1.0]])
@@ -145,7 +145,7 @@ def test_coordinates_at_corners_on_faces_and_when_not_kept(monkeypatch) -> None:
     np.testing.assert_allclose(kept[0, 0], shifted[3], atol=1e-9)
     np.testing.assert_allclose(kept[1, 0], shifted[triangles[0]].mean(axis=0), atol=1e-9)
     np.testing.assert_allclose(kept[2, 0], shifted[triangles[0][:2]].mean(axis=0), atol=1e-6)
-    monkeypatch.setattr("engine.edit.proxy.STORED_BYTES", 0)
+    monkeypatch.setattr("octasplat.engine.edit.proxy.STORED_BYTES", 0)
     np.testing.assert_allclose(
         MeanValueBinding(Proxy(vertices, triangles), corners, 0.5).deform(shifted), kept, atol=1e-12
     )
@@ -263,7 +263,7 @@ def test_what_is_not_kept_between_frames_is_the_same(make_scene: Make, monkeypat
     corners = deformation_corners(make_scene(300, spread=1.5))
     moved = twist(0.5)[0](cube(3)[0])
     kept = bind(Proxy(*cube(3)), corners, method, 0.3).deform(moved)
-    monkeypatch.setattr("engine.edit.proxy.STORED_BYTES", 0)
+    monkeypatch.setattr("octasplat.engine.edit.proxy.STORED_BYTES", 0)
     again = bind(Proxy(*cube(3)), corners, method, 0.3)
     np.testing.assert_array_equal(again.deform(moved), kept)
     np.testing.assert_array_equal(again.deform(moved), kept)

@@ -15,12 +15,12 @@ from edit_scenes import (
     twist,
 )
 
-from engine.edit.recovery import EditOptions, EditReport, recover_edit
-from engine.errors import SceneFileError
-from engine.files import ExportOptions, Mesh, export_scene, read_mesh
-from engine.gaussians.harmonics import sh_basis
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import SIDES
+from octasplat.engine.edit.recovery import EditOptions, EditReport, recover_edit
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import ExportOptions, Mesh, export_scene, read_mesh
+from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import SIDES
 
 Make = Callable[..., FlatGaussians]
 PLY = Path("edited.ply")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from engine.edit.where import where
-from engine.errors import ConfigError
+from octasplat.engine.edit.where import where
+from octasplat.engine.errors import ConfigError
 
 
 @pytest.fixture

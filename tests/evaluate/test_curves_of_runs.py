@@ -3,9 +3,8 @@ import re
 
 import numpy as np
 import pytest
-from PIL import Image
-
 from benchmarks.curves import main, read_run
+from PIL import Image
 
 
 @pytest.fixture

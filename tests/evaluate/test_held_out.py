@@ -5,13 +5,13 @@ import shutil
 
 import numpy as np
 
-from engine.evaluate.held_out import evaluate_held_out
-from engine.gaussians.model import FlatGaussians
-from engine.render.images import read_image, write_png
-from engine.scene import Dataset
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.shading.plain import PLAIN
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.evaluate.held_out import evaluate_held_out
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.images import read_image, write_png
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.trace.protocol import TraceSettings
 
 
 def test_photographs_that_differ_in_the_suffix_alone_both_get_a_render(tmp_path):

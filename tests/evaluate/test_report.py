@@ -5,11 +5,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from engine.errors import OutputError
-from engine.evaluate.curves import duration, training_charts
-from engine.evaluate.gallery import ViewImages, WorstAndBest, magma
-from engine.evaluate.report import write_report
-from engine.render.images import read_image
+from octasplat.engine.errors import OutputError
+from octasplat.engine.evaluate.curves import duration, training_charts
+from octasplat.engine.evaluate.gallery import ViewImages, WorstAndBest, magma
+from octasplat.engine.evaluate.report import write_report
+from octasplat.engine.render.images import read_image
 
 
 class Page(HTMLParser):

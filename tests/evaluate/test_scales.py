@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from engine.evaluate.scales import blocks, smaller
-from engine.evaluate.views import depth_spread
-from engine.gaussians.model import FlatGaussians
-from engine.rays import ImageRays
-from engine.render.cameras import RenderCamera
-from engine.render.oversampling import pixel_rad, rays_across, render_averaged
-from engine.render.renderer import render_rays
-from engine.shading.plain import PLAIN
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.evaluate.scales import blocks, smaller
+from octasplat.engine.evaluate.views import depth_spread
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.oversampling import pixel_rad, rays_across, render_averaged
+from octasplat.engine.render.renderer import render_rays
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 BLACK = np.zeros(3, np.float32)
 

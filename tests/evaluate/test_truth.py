@@ -9,16 +9,21 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from engine.colour import linear_to_srgb
-from engine.errors import ConfigError, DatasetError
-from engine.evaluate.against_truth import TruthMeasures, relit_measures
-from engine.evaluate.truth import find_truth, read_truth
-from engine.evaluate.truth_metrics import best_scales, display, environment_errors, normal_errors_degrees
-from engine.light.environment import EnvironmentMap, environment_frame
-from engine.light.relighting import RelitImage
-from engine.rays import ImageRays
-from engine.render.cameras import RenderCamera
-from engine.render.renderer import RenderedImage
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.evaluate.against_truth import TruthMeasures, relit_measures
+from octasplat.engine.evaluate.truth import find_truth, read_truth
+from octasplat.engine.evaluate.truth_metrics import (
+    best_scales,
+    display,
+    environment_errors,
+    normal_errors_degrees,
+)
+from octasplat.engine.light.environment import EnvironmentMap, environment_frame
+from octasplat.engine.light.relighting import RelitImage
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.renderer import RenderedImage
 
 SIDE = 8
 UP = np.array([0.0, 0.0, 1.0])

@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from engine.errors import DatasetError
-from engine.evaluate import metrics
-from engine.evaluate.views import RenderedView, bootstrap_interval, measure_view, summarise
-from engine.psnr import colour_corrected, psnr
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.evaluate import metrics
+from octasplat.engine.evaluate.views import RenderedView, bootstrap_interval, measure_view, summarise
+from octasplat.engine.psnr import colour_corrected, psnr
 
 
 def view(name="a.jpg", error=0.1, size=(30, 40), seed=0, **changes):

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = sorted(path for folder in ("benchmarks", "examples") for path in (ROOT / folder).rglob("*.py"))
-OURS = {"engine", "service", "workers"}
+OURS = {"octasplat"}
 
 
 def taken(path: Path) -> list[tuple[str, str]]:

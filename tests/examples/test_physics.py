@@ -8,12 +8,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.model import FlatGaussians
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.paths import look_at
-from engine.surface.mesh import TriangleMesh
-from engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.paths import look_at
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "physics"
 

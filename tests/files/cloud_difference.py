@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.flattening import GaussianCloud
 
 
 @dataclass(frozen=True)

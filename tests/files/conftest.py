@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.model import FlatGaussians
 
 SH_C0 = 0.28209479177387814
 

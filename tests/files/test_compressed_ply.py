@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from cloud_difference import difference
 
-from engine.errors import SceneFileError
-from engine.files import export_scene, exporter_for, importer_for, read_scene
-from engine.files.ply_container import PlyWriteElement, write_ply
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import export_scene, exporter_for, importer_for, read_scene
+from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., GaussianCloud]
 CHUNK = 256

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from engine.errors import SceneFileError
-from engine.files import Exporter, ExportOptions, export_scene, exporter_for, exporters, register
-from engine.files.gaussian_ply import read_gaussian_ply
-from engine.files.ply_container import read_ply_header
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import Exporter, ExportOptions, export_scene, exporter_for, exporters, register
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.files.ply_container import read_ply_header
+from octasplat.engine.gaussians.model import FlatGaussians
 
 Make = Callable[..., FlatGaussians]
 ALL = ("scene.ply", "mesh.ply", "scene.obj", "scene.glb")

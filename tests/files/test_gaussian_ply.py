@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.errors import SceneFileError
-from engine.files import read_facts
-from engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from engine.files.ply_container import read_ply
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import read_facts
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.files.ply_container import read_ply
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import SceneFacts
 
 Make = Callable[..., FlatGaussians]
 TYPES = {"<f4": "float", "<f8": "double", "<i2": "short", "<u1": "uchar"}

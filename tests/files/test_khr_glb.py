@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from engine.colour import srgb_to_linear
-from engine.errors import SceneFileError
-from engine.files import ExportOptions, export_scene, importer_for, read_mesh, read_scene
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.harmonics import sh_basis
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import octagon_corners_world, octagon_radii
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import ExportOptions, export_scene, importer_for, read_mesh, read_scene
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
 
 Make = Callable[..., FlatGaussians]
 KHR = "KHR_gaussian_splatting"

@@ -7,12 +7,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-import engine.files.mesh_obj as obj_module
-from engine.errors import SceneFileError
-from engine.files import ExportOptions, export_scene, octagon_soup, read_scene
-from engine.files.ply_container import read_ply
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import (
+import octasplat.engine.files.mesh_obj as obj_module
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import ExportOptions, export_scene, octagon_soup, read_scene
+from octasplat.engine.files.ply_container import read_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import (
     CHI2_2_99,
     CHI2_3_99,
     frames_from_octagons,

@@ -7,16 +7,16 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from engine.colour import srgb_to_linear
-from engine.errors import ConfigError, SceneFileError
-from engine.files import ExportOptions, export_scene, gltf
-from engine.files.octagon_glb_layout import OPAQUE_CUTOFF
-from engine.files.spatial import kd_chunks
-from engine.files.textures import radial_alpha
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.materials import MATERIAL_WIDTHS
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import octagon_corners_world, octagon_radii
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.files import ExportOptions, export_scene, gltf
+from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF
+from octasplat.engine.files.spatial import kd_chunks
+from octasplat.engine.files.textures import radial_alpha
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
 
 Make = Callable[..., FlatGaussians]
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}

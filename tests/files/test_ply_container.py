@@ -3,8 +3,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.errors import SceneFileError
-from engine.files.ply_container import PlyWriteElement, list_field, read_ply, read_ply_header, write_ply
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files.ply_container import (
+    PlyWriteElement,
+    list_field,
+    read_ply,
+    read_ply_header,
+    write_ply,
+)
 
 POINTS = "ply\nformat {layout} 1.0\nelement vertex 2\nproperty float x\nproperty short n\n"
 FACES = "element face 2\nproperty uchar flag\nproperty list uchar int vertex_indices\nend_header\n"

@@ -3,12 +3,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.errors import SceneFileError
-from engine.events import Event, StageFinished, StageStarted
-from engine.files import Importer, importer_for, importers, read_scene, register
-from engine.files.gaussian_ply import write_gaussian_ply
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.events import Event, StageFinished, StageStarted
+from octasplat.engine.files import Importer, importer_for, importers, read_scene, register
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.model import FlatGaussians
 
 
 @pytest.fixture

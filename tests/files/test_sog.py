@@ -11,10 +11,10 @@ import OpenImageIO as oiio
 import pytest
 from cloud_difference import difference
 
-from engine.errors import SceneFileError
-from engine.files import importer_for, read_scene
-from engine.files.gaussian_ply import read_ply_cloud
-from engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import importer_for, read_scene
+from octasplat.engine.files.gaussian_ply import read_ply_cloud
+from octasplat.engine.gaussians.flattening import GaussianCloud
 
 Make = Callable[..., GaussianCloud]
 COUNT, WIDTH = 200, 16

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.errors import SceneFileError
-from engine.files import importer_for, read_scene
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import importer_for, read_scene
 
 
 def row(scale: tuple[float, float, float] = (0.5, 0.25, 1e-5)) -> bytes:

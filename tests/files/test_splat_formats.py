@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.errors import SceneFileError
-from engine.files import ExportOptions, export_scene, exporter_for, read_scene
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import ExportOptions, export_scene, exporter_for, read_scene
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.model import FlatGaussians
 
 Make = Callable[[int, int], FlatGaussians]
 FORMATS = ("scene.ply", "scene.splat", "scene.spz", "scene.splats.glb")

@@ -9,11 +9,11 @@ import pytest
 import zstandard
 from cloud_difference import difference
 
-from engine.errors import SceneFileError
-from engine.files import importer_for, read_scene
-from engine.files.gaussian_ply import read_ply_cloud
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.harmonics import sh_basis
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import importer_for, read_scene
+from octasplat.engine.files.gaussian_ply import read_ply_cloud
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.harmonics import sh_basis
 
 Make = Callable[..., GaussianCloud]
 BITS = 12

@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.errors import SceneFileError
-from engine.files import export_scene
-from engine.gaussians.harmonics import sh_basis
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import export_scene
+from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.gaussians.model import FlatGaussians
 
 usd = pytest.importorskip(
     "pxr.Usd", reason="usd-core is not installed (pip install -c constraints.txt -e '.[usd]')"

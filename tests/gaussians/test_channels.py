@@ -3,8 +3,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from engine.errors import ConfigError
-from engine.gaussians.channels import (
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.channels import (
     Channels,
     column_names,
     common_widths,
@@ -12,7 +12,7 @@ from engine.gaussians.channels import (
     stacked,
     unstacked,
 )
-from engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 
 Make = Callable[..., FlatGaussians]
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from engine.gaussians.frames import frames_from_normals, quaternions, rotation_matrices
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions, rotation_matrices
 
 
 def about(axis: list[float], degrees: float) -> np.ndarray:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from engine.gaussians.harmonics import rotate_sh, sh_basis, sh_rotations
-from engine.trace.cpu.kernels_sh import write_basis
+from octasplat.engine.gaussians.harmonics import rotate_sh, sh_basis, sh_rotations
+from octasplat.engine.trace.cpu.kernels_sh import write_basis
 
 
 def directions(count: int, seed: int = 0) -> np.ndarray:

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.errors import ConfigError
-from engine.gaussians.materials import (
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.materials import (
     f0_linear,
     has_materials,
     reflective_share,
     require_materials,
     split_materials,
 )
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.model import FlatGaussians
 
 
 def plain(count: int) -> FlatGaussians:

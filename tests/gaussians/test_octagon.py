@@ -3,9 +3,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from engine.gaussians.frames import quaternions, rotation_matrices
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.gaussians.octagon import (
+from octasplat.engine.gaussians.frames import quaternions, rotation_matrices
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.gaussians.octagon import (
     CHI2_2_99,
     CHI2_3_99,
     frames_from_octagons,

@@ -5,8 +5,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from engine.gaussians.channels import Channels
-from engine.gaussians.rows import from_row_arrays, join_rows, map_rows, put_rows, row_arrays, select_rows
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.rows import (
+    from_row_arrays,
+    join_rows,
+    map_rows,
+    put_rows,
+    row_arrays,
+    select_rows,
+)
 
 
 @dataclass

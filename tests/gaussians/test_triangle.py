@@ -2,9 +2,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.triangle import frames_from_triangles, triangles_world
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.triangle import frames_from_triangles, triangles_world
 
 Make = Callable[..., FlatGaussians]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 
 from PIL import Image
 
-from service.intake.dataset import DatasetFile
-from workers.store.local import LocalStorage
+from octasplat.service.intake.dataset import DatasetFile
+from octasplat.workers.store.local import LocalStorage
 
 PINHOLE = 1
 

@@ -19,10 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from zip_builder import Member, build, deflated
 
-from service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
-from service.intake.faults import IntakeRefused
-from workers.store.local import LocalStorage
-from workers.store.protocol import Blob
+from octasplat.service.intake.archive import ArchiveFile, ArchiveLimits, list_archive, unpack_archive
+from octasplat.service.intake.faults import IntakeRefused
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.store.protocol import Blob
 
 PHOTO = b"\xff\xd8\xff\xe0 not much of a photograph " * 40
 MODEL = struct.pack("<Q", 0x088B1F) + bytes(300)  # a count that looks like gzip

@@ -12,13 +12,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from model_builder import Cam, Img, Model, Pnt, photograph, photographs, stored, turned
 
-from service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset
-from service.intake.faults import Fault, IntakeRefused
-from service.intake.layout import Part
-from service.intake.model_check import ModelLimits, check_model, child_environment
-from service.intake.names import check_file_name
-from workers.store.local import LocalStorage
-from workers.store.trees import TreeFile
+from octasplat.service.intake.dataset import DatasetFile, DatasetLimits, DatasetSummary, check_dataset
+from octasplat.service.intake.faults import Fault, IntakeRefused
+from octasplat.service.intake.layout import Part
+from octasplat.service.intake.model_check import ModelLimits, check_model, child_environment
+from octasplat.service.intake.names import check_file_name
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.store.trees import TreeFile
 
 NAN, INF = float("nan"), float("inf")
 
@@ -231,9 +231,10 @@ def test_the_child_knows_no_secrets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_nothing_heavy_is_imported() -> None:
     code = (
-        "import sys, pkgutil, importlib, service.intake as p\n"
-        "for m in pkgutil.iter_modules(p.__path__): importlib.import_module('service.intake.' + m.name)\n"
-        "import workers.store\n"
+        "import sys, pkgutil, importlib, octasplat.service.intake as p\n"
+        "for m in pkgutil.iter_modules(p.__path__):\n"
+        "    importlib.import_module(p.__name__ + '.' + m.name)\n"
+        "import octasplat.workers.store\n"
         "heavy = {'pycolmap', 'torch', 'numba', 'OpenImageIO', 'boto3', 'scipy'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )

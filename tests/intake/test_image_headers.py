@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from service.intake.faults import IntakeRefused
-from service.intake.images import ImageHeader, ImageLimits, read_image_header
+from octasplat.service.intake.faults import IntakeRefused
+from octasplat.service.intake.images import ImageHeader, ImageLimits, read_image_header
 
 
 def header(data: bytes, name: str = "images/a.jpg", **limits: int) -> ImageHeader:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from model_builder import Model, photograph, photographs
 from zip_builder import Member, build
 
-from service.intake.faults import IntakeRefused
-from service.intake.receive import (
+from octasplat.service.intake.faults import IntakeRefused
+from octasplat.service.intake.receive import (
     UploadLimits,
     format_digest,
     parse_digest,
@@ -23,9 +23,9 @@ from service.intake.receive import (
     receive_archive,
     receive_file,
 )
-from service.intake.spool import Spool
-from workers.store import DigestMismatch, StorageFull, TooLarge
-from workers.store.local import LocalStorage
+from octasplat.service.intake.spool import Spool
+from octasplat.workers.store import DigestMismatch, StorageFull, TooLarge
+from octasplat.workers.store.local import LocalStorage
 
 
 async def body(data: bytes, piece: int = 1000) -> AsyncIterator[bytes]:
@@ -172,9 +172,9 @@ def test_no_room(tmp_path: Path) -> None:
 MEMORY = """
 import asyncio, resource, sys
 from pathlib import Path
-from service.intake.spool import Spool
-from service.intake.receive import receive
-from workers.store.local import LocalStorage
+from octasplat.service.intake.spool import Spool
+from octasplat.service.intake.receive import receive
+from octasplat.workers.store.local import LocalStorage
 
 async def body(megabytes):
     piece = bytes(65536)

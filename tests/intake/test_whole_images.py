@@ -9,9 +9,9 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from service.intake.faults import IntakeRefused
-from service.intake.images import read_image_header
-from service.intake.whole import check_whole
+from octasplat.service.intake.faults import IntakeRefused
+from octasplat.service.intake.images import read_image_header
+from octasplat.service.intake.whole import check_whole
 
 PIXELS = np.random.default_rng(1).integers(0, 255, (96, 128, 3), np.uint8)
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.gaussians.frames import quaternions
-from engine.gaussians.model import SH_C0, FlatGaussians, concatenate
-from engine.light.film import Film
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.stage import Stage
-from engine.light.staging import stage_meshes
-from engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians, concatenate
+from octasplat.engine.light.film import Film
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.stage import Stage
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
 
 UP = (0.0, -1.0, 0.0)
 

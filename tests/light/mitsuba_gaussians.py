@@ -12,8 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.trace.protocol import TraceSettings
 
 VARIANT = "llvm_ad_rgb"
 THIN = 1e-5

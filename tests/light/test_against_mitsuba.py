@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from light_scenes import camera, film_of
 
-from engine.light.environment import environment_frame
-from engine.light.stage import (
+from octasplat.engine.light.environment import environment_frame
+from octasplat.engine.light.stage import (
     Dielectric,
     Diffuse,
     DirectionalLight,
@@ -27,8 +27,8 @@ from engine.light.stage import (
     Stage,
     StageMesh,
 )
-from engine.light.staging import stage_meshes
-from engine.render.images import write_exr, write_png
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.render.images import write_exr, write_png
 
 mi = pytest.importorskip("mitsuba")
 pytestmark = pytest.mark.heavy

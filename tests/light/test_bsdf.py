@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from engine.light.bsdf import OpaqueMaterial, RoughGlass, albedo_table, fresnel, frosted_table
-from engine.shading.kernels_microfacets import table_value
+from octasplat.engine.light.bsdf import OpaqueMaterial, RoughGlass, albedo_table, fresnel, frosted_table
+from octasplat.engine.shading.kernels_microfacets import table_value
 
 
 def directions(cosines: np.ndarray, angles: np.ndarray) -> np.ndarray:

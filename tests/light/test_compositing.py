@@ -7,10 +7,10 @@ import pytest
 from click.testing import CliRunner
 from light_scenes import camera, film_of, psnr, table_with_a_box
 
-from engine.files.gaussian_ply import write_gaussian_ply
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.layers import stage_layers
-from engine.light.stage import (
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.layers import stage_layers
+from octasplat.engine.light.stage import (
     Diffuse,
     Glass,
     Integrator,
@@ -20,10 +20,10 @@ from engine.light.stage import (
     Stage,
     StageMesh,
 )
-from engine.light.staging import stage_meshes
-from engine.render.images import read_channels
-from engine.trace.protocol import TraceSettings
-from workers.cli.main import cli
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.render.images import read_channels
+from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.workers.cli.main import cli
 
 VIEW = camera((0.9, -1.0, -1.2), (0, -0.1, 0), (48, 36), 45)
 LAMP = RectangleLight(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from light_scenes import camera, psnr
 
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.layers import stage_layers
-from engine.light.stage import (
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.layers import stage_layers
+from octasplat.engine.light.stage import (
     Diffuse,
     DirectionalLight,
     Environment,
@@ -22,12 +22,12 @@ from engine.light.stage import (
     StageGaussians,
     StageMesh,
 )
-from engine.light.staging import stage_meshes
-from engine.render.cameras import RenderCamera
-from engine.render.images import write_exr
-from engine.render.renderer import render_rays
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.images import write_exr
+from octasplat.engine.render.renderer import render_rays
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 PLAIN = Integrator(samples=1, max_depth=6, roulette_depth=64, anti_aliasing=False)
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from light_scenes import camera, psnr
 
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.gaussians.octagon import CHI2_3_99
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.layers import stage_layers
-from engine.light.stage import Integrator, Mirror, Stage, StageGaussians, StageMesh
-from engine.light.staging import stage_meshes
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.gaussians.octagon import CHI2_3_99
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.layers import stage_layers
+from octasplat.engine.light.stage import Integrator, Mirror, Stage, StageGaussians, StageMesh
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.trace.protocol import TraceSettings
 
 pytest.importorskip("mitsuba")
 pytestmark = [

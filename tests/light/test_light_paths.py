@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from light_scenes import camera, film_of, psnr
 
-from engine.errors import ConfigError
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.stage import (
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.stage import (
     Dielectric,
     Diffuse,
     DirectionalLight,
@@ -22,8 +22,8 @@ from engine.light.stage import (
     Stage,
     StageMesh,
 )
-from engine.light.staging import refuse_inside_glass, stage_meshes
-from engine.render.images import write_exr
+from octasplat.engine.light.staging import refuse_inside_glass, stage_meshes
+from octasplat.engine.render.images import write_exr
 
 AHEAD = camera((0, 0, -4), (0, 0, 0), (24, 16), 30)
 WHITE = (1.0, 1.0, 1.0)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from engine.errors import ConfigError
-from engine.light.environment import EnvironmentMap, environment_frame
-from engine.light.lights import light_arrays, look_up_environment, sample_lights
-from engine.light.stage import DirectionalLight, PointLight, RectangleLight, SpotLight
-from engine.render.environment_map import read_environment, write_environment
-from engine.render.images import write_exr
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.light.environment import EnvironmentMap, environment_frame
+from octasplat.engine.light.lights import light_arrays, look_up_environment, sample_lights
+from octasplat.engine.light.stage import DirectionalLight, PointLight, RectangleLight, SpotLight
+from octasplat.engine.render.environment_map import read_environment, write_environment
+from octasplat.engine.render.images import write_exr
 
 UP = np.array([0.0, 0.0, 1.0])
 

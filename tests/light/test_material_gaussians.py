@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from light_scenes import camera, psnr, shiny_ball
 
-from engine.colour import linear_to_srgb
-from engine.gaussians.model import FlatGaussians
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.layers import stage_layers
-from engine.light.stage import (
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.layers import stage_layers
+from octasplat.engine.light.stage import (
     Environment,
     Integrator,
     MetallicRoughness,
@@ -19,9 +19,9 @@ from engine.light.stage import (
     StageGaussians,
     StageMesh,
 )
-from engine.light.staging import stage_meshes
-from engine.render.environment_map import write_environment
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.trace.protocol import TraceSettings
 
 FOLDER = Path(__file__).parent
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from light_scenes import camera, film_of
 
-from engine.colour import linear_to_srgb
-from engine.errors import OctasplatError
-from engine.files import gltf
-from engine.light.meshes import Shape, simple_shape
-from engine.light.stage import (
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.errors import OctasplatError
+from octasplat.engine.files import gltf
+from octasplat.engine.light.meshes import Shape, simple_shape
+from octasplat.engine.light.stage import (
     Diffuse,
     DirectionalLight,
     Glass,
@@ -24,8 +24,8 @@ from engine.light.stage import (
     Stage,
     StageMesh,
 )
-from engine.light.staging import stage_meshes
-from engine.render.images import write_png
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.render.images import write_png
 
 Y_UP = (0.0, 1.0, 0.0)
 LIGHTS = (PointLight(position=(3, 2, 4), intensity=40), PointLight(position=(-3, -1, 2), intensity=10))

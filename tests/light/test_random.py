@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import qmc
 
-from engine.light.kernels_random import fill_uniform, reversed_bits, sobol_digits
+from octasplat.engine.light.kernels_random import fill_uniform, reversed_bits, sobol_digits
 
 
 def numbers(pixel: int, samples: int, pair: int = 0, seed: int = 1) -> np.ndarray:

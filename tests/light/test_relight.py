@@ -7,11 +7,11 @@ import pytest
 from click.testing import CliRunner, Result
 from light_scenes import psnr, shiny_ball
 
-from engine.colour import linear_to_srgb
-from engine.files.gaussian_ply import write_gaussian_ply
-from engine.render.environment_map import write_environment
-from engine.render.images import read_channels, read_image
-from workers.cli.main import cli
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.render.images import read_channels, read_image
+from octasplat.workers.cli.main import cli
 
 SMALL = ("--turntable", "--frames", 2, "--width", 32, "--height", 24, "--threads", 2, "--samples", 16)
 

@@ -12,8 +12,8 @@ import pytest
 from click.testing import CliRunner, Result
 from light_scenes import table_with_a_box
 
-from engine.files.gaussian_ply import write_gaussian_ply
-from workers.cli.main import cli
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.workers.cli.main import cli
 
 STAGE = """
 [[meshes]]
@@ -70,7 +70,7 @@ def stopped_by(
     number: signal.Signals, folder: Path, output: str, record: Path
 ) -> subprocess.CompletedProcess[str]:
     """A real process that gets a signal as soon as two images are done."""
-    command = [sys.executable, "-m", "workers", *arguments(folder, output)]
+    command = [sys.executable, "-m", "octasplat", *arguments(folder, output)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     while process.poll() is None and not (record.exists() and len(record.read_text().splitlines()) > 2):
         time.sleep(0.005)

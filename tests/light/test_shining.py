@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from light_scenes import camera, film_of, table_with_a_box
 
-from engine.errors import ConfigError
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.layers import stage_layers
-from engine.light.stage import (
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.layers import stage_layers
+from octasplat.engine.light.stage import (
     Diffuse,
     DirectionalLight,
     Integrator,
@@ -18,9 +18,9 @@ from engine.light.stage import (
     StageGaussians,
     StageMesh,
 )
-from engine.light.staging import stage_meshes
-from engine.render.images import write_png
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.render.images import write_png
+from octasplat.engine.trace.protocol import TraceSettings
 
 NUMBERS = Integrator(samples=1024, max_depth=1, anti_aliasing=False)
 WHITE = (1.0, 1.0, 1.0)

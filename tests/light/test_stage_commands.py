@@ -7,11 +7,11 @@ import pytest
 from click.testing import CliRunner, Result
 from light_scenes import table_with_a_box
 
-from engine.files.gaussian_ply import write_gaussian_ply
-from engine.gaussians.model import FlatGaussians
-from engine.light.stage_file import read_stage
-from engine.render.images import read_channels, read_image
-from workers.cli.main import cli
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.stage_file import read_stage
+from octasplat.engine.render.images import read_channels, read_image
+from octasplat.workers.cli.main import cli
 
 
 def octasplat(*arguments: object) -> Result:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from engine.errors import ConfigError
-from engine.files import read_mesh
-from engine.light.stage import Glass, MetallicRoughness, PointLight, RectangleLight, Stage
-from engine.light.stage_file import StageFacts, parse_stage, read_stage, write_first_stage
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.files import read_mesh
+from octasplat.engine.light.stage import Glass, MetallicRoughness, PointLight, RectangleLight, Stage
+from octasplat.engine.light.stage_file import StageFacts, parse_stage, read_stage, write_first_stage
 
 BALL = '[[meshes]]\nshape = "sphere"\n'
 
@@ -129,7 +129,7 @@ def test_the_first_stage_can_be_read_and_so_can_all_that_it_suggests(tmp_path: P
 
 
 def test_reading_stages_needs_neither_torch_nor_numba() -> None:
-    code = "import engine.light.stage_file, sys; assert not {'torch', 'numba'} & set(sys.modules)"
+    code = "import octasplat.engine.light.stage_file, sys; assert not {'torch', 'numba'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

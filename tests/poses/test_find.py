@@ -11,13 +11,13 @@ import psutil
 import pycolmap
 import pytest
 from jaxtyping import Float64
-from neighbouring_photographs import write_neighbours
 
-from engine.errors import Cancelled, DatasetError, PosesCrashed
-from engine.events import Event, StageFinished, StageProgress, StageStarted
-from engine.poses import find_poses
-from engine.poses.find import PosesConfig
-from engine.render.images import write_png
+from neighbouring_photographs import write_neighbours
+from octasplat.engine.errors import Cancelled, DatasetError, PosesCrashed
+from octasplat.engine.events import Event, StageFinished, StageProgress, StageStarted
+from octasplat.engine.poses import find_poses
+from octasplat.engine.poses.find import PosesConfig
+from octasplat.engine.render.images import write_png
 
 pytestmark = pytest.mark.heavy
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from engine.poses.folds import PairVotes, false_pairs
+from octasplat.engine.poses.folds import PairVotes, false_pairs
 
 
 def votes(rows: list[tuple[int, int, int, int]]) -> PairVotes:

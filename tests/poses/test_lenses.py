@@ -7,13 +7,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from engine.config import resolve_config
-from engine.errors import Cancelled, DatasetError
-from engine.events import Event, StageFinished, StageStarted, Warned
-from engine.pipeline import reconstruct
-from engine.poses import adjust_lenses, lens_is_in_doubt
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.scene.load import load_scene
+from octasplat.engine.config import resolve_config
+from octasplat.engine.errors import Cancelled, DatasetError
+from octasplat.engine.events import Event, StageFinished, StageStarted, Warned
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.poses import adjust_lenses, lens_is_in_doubt
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.scene.load import load_scene
 
 VIEWS = 20
 NOISE_PX = 0.3

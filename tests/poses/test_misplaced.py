@@ -8,12 +8,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from engine.config import resolve_config
-from engine.errors import Cancelled, DatasetError
-from engine.events import Event, StageFinished, StageStarted, Warned
-from engine.pipeline import reconstruct
-from engine.poses import Given, PosesConfig, place_doubtful
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.config import resolve_config
+from octasplat.engine.errors import Cancelled, DatasetError
+from octasplat.engine.events import Event, StageFinished, StageStarted, Warned
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.poses import Given, PosesConfig, place_doubtful
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 pytestmark = pytest.mark.heavy
 

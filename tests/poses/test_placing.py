@@ -5,8 +5,8 @@ import pytest
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from engine.poses.config import DEFAULT_CONFIG
-from engine.poses.placing import Matches, placed_anew, refined, sampson_distances
+from octasplat.engine.poses.config import DEFAULT_CONFIG
+from octasplat.engine.poses.placing import Matches, placed_anew, refined, sampson_distances
 
 PIXEL = 1e-3
 Pose = tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]

@@ -13,13 +13,13 @@ import psycopg
 import pytest
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from workers.postgres import embedded
-from workers.postgres.binaries import PostgresBinaries, find_binaries
-from workers.postgres.embedded import EmbeddedPostgres, sync_file_system
-from workers.postgres.server_user import server_user
-from workers.records.errors import DatabaseError
-from workers.serve.machine import Plan, connections_needed
-from workers.settings import WorkerSettings
+from octasplat.workers.postgres import embedded
+from octasplat.workers.postgres.binaries import PostgresBinaries, find_binaries
+from octasplat.workers.postgres.embedded import EmbeddedPostgres, sync_file_system
+from octasplat.workers.postgres.server_user import server_user
+from octasplat.workers.records.errors import DatabaseError
+from octasplat.workers.serve.machine import Plan, connections_needed
+from octasplat.workers.settings import WorkerSettings
 
 
 @pytest.fixture
@@ -88,7 +88,8 @@ def test_killed_server_leaves_a_stale_pid_file(server: EmbeddedPostgres) -> None
 
 
 def test_server_outlives_its_parent_and_is_taken_over(server: EmbeddedPostgres) -> None:
-    code = f"from pathlib import Path; from workers.postgres.embedded import EmbeddedPostgres as E; " \
+    code = "from pathlib import Path; " \
+           "from octasplat.workers.postgres.embedded import EmbeddedPostgres as E; " \
            f"E(Path({str(server.data)!r})).start()"  # fmt: skip
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
     before = pid_of(server)
@@ -97,7 +98,8 @@ def test_server_outlives_its_parent_and_is_taken_over(server: EmbeddedPostgres) 
 
 
 def test_two_starts_at_once_make_one_database(server: EmbeddedPostgres) -> None:
-    code = f"from pathlib import Path; from workers.postgres.embedded import EmbeddedPostgres as E; " \
+    code = "from pathlib import Path; " \
+           "from octasplat.workers.postgres.embedded import EmbeddedPostgres as E; " \
            f"print(E(Path({str(server.data)!r})).start())"  # fmt: skip
     both = [
         subprocess.Popen(
@@ -174,7 +176,7 @@ def test_binaries_out_of_the_servers_reach_are_copied(
             shutil.copytree(folder, private / folder.relative_to(install.parents[1]), symlinks=True)
     private.chmod(0o700)
     moved = PostgresBinaries(private / install.relative_to(install.parents[1]) / "bin", find_binaries().major)
-    monkeypatch.setattr("workers.postgres.embedded.find_binaries", lambda _major=None: moved)
+    monkeypatch.setattr("octasplat.workers.postgres.embedded.find_binaries", lambda _major=None: moved)
     server = EmbeddedPostgres(short_root / "copied")
     try:
         assert answer(server.start(), "SELECT 1") == "1"

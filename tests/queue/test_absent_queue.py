@@ -2,13 +2,13 @@
 
 import asyncio
 
-from workers.queue.attempts import claim
-from workers.queue.jobs import NewJob, create_job, get_job
-from workers.queue.limits import end_abandoned
-from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.records.database import open_pool
-from workers.records.ids import new_id
-from workers.records.workers import see_worker
+from octasplat.workers.queue.attempts import claim
+from octasplat.workers.queue.jobs import NewJob, create_job, get_job
+from octasplat.workers.queue.limits import end_abandoned
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.records.database import open_pool
+from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.workers import see_worker
 
 SLIPS = ProcrastinateSlips(stale_seconds=5)
 

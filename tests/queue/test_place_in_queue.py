@@ -3,12 +3,12 @@
 import asyncio
 import uuid
 
-from workers.queue.attempts import claim
-from workers.queue.jobs import NewJob, cancel_job, create_job, get_job, queue_position, retry_job
-from workers.queue.procrastinate_slips import ProcrastinateSlips, returned_number
-from workers.queue.rescue import rescue_lost_jobs
-from workers.records.database import Pool, open_pool
-from workers.records.rows import Job
+from octasplat.workers.queue.attempts import claim
+from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job, get_job, queue_position, retry_job
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips, returned_number
+from octasplat.workers.queue.rescue import rescue_lost_jobs
+from octasplat.workers.records.database import Pool, open_pool
+from octasplat.workers.records.rows import Job
 
 SLIPS = ProcrastinateSlips(stale_seconds=5)
 

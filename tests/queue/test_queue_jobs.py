@@ -8,8 +8,8 @@ from typing import Any
 import psycopg
 import pytest
 
-from workers.queue.attempts import Attempt, Fenced, Result, claim
-from workers.queue.jobs import (
+from octasplat.workers.queue.attempts import Attempt, Fenced, Result, claim
+from octasplat.workers.queue.jobs import (
     NewJob,
     artifacts_of,
     cancel_job,
@@ -20,13 +20,13 @@ from workers.queue.jobs import (
     queue_position,
     retry_job,
 )
-from workers.queue.port import Slips
-from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.queue.rescue import rescue_lost_jobs
-from workers.records.database import Connection, Pool, open_pool
-from workers.records.errors import Conflict, Missing
-from workers.records.ids import new_id
-from workers.records.rows import Job
+from octasplat.workers.queue.port import Slips
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.queue.rescue import rescue_lost_jobs
+from octasplat.workers.records.database import Connection, Pool, open_pool
+from octasplat.workers.records.errors import Conflict, Missing
+from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.rows import Job
 
 NEW = NewJob(owner="me", kind="toy", options={}, queue="cpu")
 SLIPS = ProcrastinateSlips(stale_seconds=5)

@@ -5,7 +5,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from engine.scene import Dataset, load_scene
+from octasplat.engine.scene import Dataset, load_scene
 
 SCENES = os.environ.get("OCTASPLAT_SCENES")
 

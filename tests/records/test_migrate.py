@@ -9,11 +9,11 @@ from pathlib import Path
 
 import psycopg
 import pytest
-from postgres_for_tests import copied_database
 
-from workers.postgres.embedded import EmbeddedPostgres
-from workers.records.errors import DatabaseError
-from workers.records.migrate import all_steps, migrate, missing_steps, queue_steps, wait_for_tables
+from octasplat.workers.postgres.embedded import EmbeddedPostgres
+from octasplat.workers.records.errors import DatabaseError
+from octasplat.workers.records.migrate import all_steps, migrate, missing_steps, queue_steps, wait_for_tables
+from postgres_for_tests import copied_database
 
 ROOT = Path(__file__).parents[2]
 
@@ -94,7 +94,7 @@ def test_workers_and_commands_that_read_leave_the_tables_alone(empty: str, tmp_p
     environment = {**os.environ, "DATABASE_URL": empty, "OCTASPLAT_DATA": str(tmp_path)}
 
     def octasplat(*arguments: str) -> "subprocess.CompletedProcess[str]":
-        command = [sys.executable, "-m", "workers", *arguments]
+        command = [sys.executable, "-m", "octasplat", *arguments]
         return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
 
     listed = octasplat("token", "list")

@@ -10,10 +10,10 @@ from click.testing import CliRunner
 from psycopg.rows import dict_row
 from psycopg.types.json import Jsonb
 
-from workers.cli.commands.quota import quota as quota_command
-from workers.records.database import Connection, open_pool
-from workers.records.datasets import create_dataset, put_file
-from workers.records.quotas import (
+from octasplat.workers.cli.commands.quota import quota as quota_command
+from octasplat.workers.records.database import Connection, open_pool
+from octasplat.workers.records.datasets import create_dataset, put_file
+from octasplat.workers.records.quotas import (
     Quota,
     QuotaExceeded,
     Usage,

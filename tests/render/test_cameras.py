@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from engine.render.cameras import RenderCamera, focal_from_fov, fov_from_focal
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov, fov_from_focal
 
 
 def camera(**changes):

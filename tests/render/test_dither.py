@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from engine.render.renderer import dithered
+from octasplat.engine.render.renderer import dithered
 
 
 def test_samples_of_a_pixel_leave_no_large_gap_in_either_number() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from engine.render.draw_order import common_order
+from octasplat.engine.render.draw_order import common_order
 
 
 def test_points_on_a_line_are_ordered_from_far_to_near():

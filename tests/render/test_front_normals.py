@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.model import FlatGaussians
-from engine.render.cameras import RenderCamera
-from engine.render.renderer import background_colour, front_normals, render_rays
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.renderer import background_colour, front_normals, render_rays
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 SIDE = 33
 

@@ -2,9 +2,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from engine.colour import linear_to_srgb, srgb_to_linear, to_bytes
-from engine.errors import DatasetError, OutputError
-from engine.render import images
+from octasplat.engine.colour import linear_to_srgb, srgb_to_linear, to_bytes
+from octasplat.engine.errors import DatasetError, OutputError
+from octasplat.engine.render import images
 
 
 @pytest.fixture

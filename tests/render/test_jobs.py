@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from engine.gaussians.model import FlatGaussians
-from engine.render.jobs import (
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.jobs import (
     camera_shots,
     gaussian_turntable,
     scene_fov_y_degrees,
@@ -14,8 +14,8 @@ from engine.render.jobs import (
     turntable_cameras,
     view_shots,
 )
-from engine.scene import Dataset, load_scene
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.scene import Dataset, load_scene
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 
 @pytest.fixture(scope="module", params=["PINHOLE", "OPENCV_FISHEYE"])

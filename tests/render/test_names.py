@@ -1,6 +1,6 @@
 """Photographs whose names differ in the suffix alone must not share a render."""
 
-from engine.render.names import render_names
+from octasplat.engine.render.names import render_names
 
 
 def test_the_suffix_goes_where_it_tells_nothing() -> None:

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from engine.gaussians.harmonics import sh_basis
-from engine.gaussians.model import FlatGaussians
-from engine.render.cameras import RenderCamera
-from engine.render.one_colour import colours_for_cameras, colours_toward, with_colours
-from engine.render.paths import turntable
-from engine.render.renderer import render_rays
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.harmonics import sh_basis
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.one_colour import colours_for_cameras, colours_toward, with_colours
+from octasplat.engine.render.paths import turntable
+from octasplat.engine.render.renderer import render_rays
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 
 def cloud(count: int) -> FlatGaussians:

@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from engine.errors import ConfigError
-from engine.render.cameras import RenderCamera
-from engine.render.path_file import CameraPath, path_from_poses, read_camera_path, write_camera_path
-from engine.render.paths import turntable
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.path_file import CameraPath, path_from_poses, read_camera_path, write_camera_path
+from octasplat.engine.render.paths import turntable
 
 
 @pytest.fixture

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from engine.errors import ConfigError
-from engine.render.cameras import RenderCamera
-from engine.render.paths import PosePath, fit_turntable, interpolate, look_at, turntable
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.paths import PosePath, fit_turntable, interpolate, look_at, turntable
 
 CENTRE, UP = np.array([1.0, -2.0, 0.5]), np.array([0.2, -3.0, 0.4])
 

@@ -4,8 +4,8 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from engine.errors import OutputError
-from engine.render.video import VideoWriter
+from octasplat.engine.errors import OutputError
+from octasplat.engine.render.video import VideoWriter
 
 COLOURS = np.array(
     [[0.8, 0.2, 0.1], [0.1, 0.7, 0.2], [0.15, 0.2, 0.9], [0.5, 0.5, 0.5], [1, 1, 1]], np.float32

@@ -8,9 +8,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-import engine
-from engine.errors import DatasetError, OutputError
-from engine.scene import Dataset
+import octasplat
+from octasplat.engine.errors import DatasetError, OutputError
+from octasplat.engine.scene import Dataset
 
 
 def stamps(folder: Path) -> dict[str, int]:
@@ -145,7 +145,7 @@ def test_photographs_do_not_fill_memory(tmp_path, make_scene):
         import sys
         from pathlib import Path
         import numpy as np
-        from engine.scene import Dataset
+        from octasplat.engine.scene import Dataset
 
         def private_mb():
             lines = Path("/proc/self/status").read_text().splitlines()
@@ -162,7 +162,7 @@ def test_photographs_do_not_fill_memory(tmp_path, make_scene):
     """)
     run = subprocess.run(
         [sys.executable, "-c", script, str(root), str(tmp_path / "cache")],
-        capture_output=True, text=True, check=True, cwd=Path(engine.__file__).parents[1],
+        capture_output=True, text=True, check=True, cwd=Path(octasplat.__file__).parents[2],
     )  # fmt: skip
     assert (tmp_path / "cache/rgb.bin").stat().st_size == 12 * 3000 * 3000 * 3
     assert float(run.stdout) < 150

@@ -2,7 +2,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from engine.scene import Camera
+from octasplat.engine.scene import Camera
 
 CAMERAS = {
     "SIMPLE_PINHOLE": [500, 310, 250],

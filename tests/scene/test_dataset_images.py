@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from engine.colour import linear_to_srgb
-from engine.errors import DatasetError
-from engine.scene.images import read_image_info, read_mask, read_photo
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.scene.images import read_image_info, read_mask, read_photo
 
 
 def read(path, width=None, height=None):

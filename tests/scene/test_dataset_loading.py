@@ -5,8 +5,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from engine.errors import ConfigError, DatasetError
-from engine.scene import load_scene
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.scene import load_scene
 
 MODEL_FILES = ["cameras", "images", "points3D"]
 

@@ -4,8 +4,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from engine.errors import DatasetError
-from engine.scene import Dataset
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.scene import Dataset
 
 
 def all_pixels(data: Dataset, view: int):

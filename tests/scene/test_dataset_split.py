@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from engine.errors import ConfigError, DatasetError
-from engine.scene import SparsePoints, scene_extent, split_views, write_held_out
+from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.scene import SparsePoints, scene_extent, split_views, write_held_out
 
 NAMES = [f"{i:02d}.jpg" for i in range(18)]
 

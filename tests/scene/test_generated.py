@@ -8,10 +8,10 @@ import OpenImageIO as oiio
 import pycolmap
 import pytest
 
-from engine.errors import ConfigError, DatasetError, OutputError
-from engine.scene.generated import CAMERA_MODELS, GeneratedSceneConfig, write_generated_scene
-from engine.scene.generated.arrangement import FLOOR_Z, ROOM_APOTHEM, TABLE_RADIUS, still_life
-from engine.scene.generated.textures import cell_noise, linear, noise, octagons, text
+from octasplat.engine.errors import ConfigError, DatasetError, OutputError
+from octasplat.engine.scene.generated import CAMERA_MODELS, GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.scene.generated.arrangement import FLOOR_Z, ROOM_APOTHEM, TABLE_RADIUS, still_life
+from octasplat.engine.scene.generated.textures import cell_noise, linear, noise, octagons, text
 
 SMALL = GeneratedSceneConfig(views=6, width_px=48, height_px=36, samples_per_side=2, points=150)
 

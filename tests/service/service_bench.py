@@ -9,12 +9,12 @@ from typing import Any
 import httpx
 from pydantic import SecretStr
 
-from service.app import create_app
-from service.settings import ServiceSettings
-from service.state import Service
-from workers.queue.attempts import Attempt, claim
-from workers.records.tokens import add_token, new_secret
-from workers.store.trees import Manifest
+from octasplat.service.app import create_app
+from octasplat.service.settings import ServiceSettings
+from octasplat.service.state import Service
+from octasplat.workers.queue.attempts import Attempt, claim
+from octasplat.workers.records.tokens import add_token, new_secret
+from octasplat.workers.store.trees import Manifest
 
 
 @asynccontextmanager

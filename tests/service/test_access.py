@@ -10,8 +10,8 @@ import pytest
 from pydantic import SecretStr
 from service_bench import committed_dataset, running, with_token
 
-from engine.errors import ConfigError
-from service.state import Service
+from octasplat.engine.errors import ConfigError
+from octasplat.service.state import Service
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 

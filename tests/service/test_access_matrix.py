@@ -14,10 +14,10 @@ from api_inventory import Operation, operations, undescribed
 from PIL import Image
 from service_bench import claimed, committed_dataset, running, stored, with_token
 
-from service.app import create_app
-from service.settings import ServiceSettings
-from service.state import Service
-from workers.queue.attempts import Result
+from octasplat.service.app import create_app
+from octasplat.service.settings import ServiceSettings
+from octasplat.service.state import Service
+from octasplat.workers.queue.attempts import Result
 
 OPEN = {"/healthz", "/readyz"}
 """Whoever watches over the service needs no token for these."""

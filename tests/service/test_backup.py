@@ -10,12 +10,12 @@ from typing import Any
 
 import httpx
 import pytest
-from postgres_for_tests import EmbeddedPostgres, copied_database
 from service_bench import claimed, committed_dataset, running, stored, with_token
 from worker_bench import Bench
 
-from service.state import Service
-from workers.queue.attempts import Result
+from octasplat.service.state import Service
+from octasplat.workers.queue.attempts import Result
+from postgres_for_tests import EmbeddedPostgres, copied_database
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))
 from model_builder import photograph
@@ -31,7 +31,7 @@ def octasplat(conninfo: str, data: Path, *arguments: object) -> "subprocess.Comp
         "OCTASPLAT_STORAGE": str(data / "store"),
         "OCTASPLAT_FLOOR_BYTES": "0",
     }
-    command = [sys.executable, "-m", "workers", *map(str, arguments)]
+    command = [sys.executable, "-m", "octasplat", *map(str, arguments)]
     return subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=False)
 
 

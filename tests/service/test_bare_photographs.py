@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from neighbouring_photographs import write_neighbours
-
 from benchmarks.chaos_machine import ROOT, Machine
-from engine.render.images import write_png
-from workers.client.api import Api
+
+from neighbouring_photographs import write_neighbours
+from octasplat.engine.render.images import write_png
+from octasplat.workers.client.api import Api
 
 pytestmark = pytest.mark.heavy
 
@@ -31,7 +31,7 @@ def octasplat(machine: Machine) -> Octasplat:
     environment = {**os.environ, "OCTASPLAT_DATA": str(machine.data)}
 
     def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
-        command = [sys.executable, "-m", "workers", *map(str, arguments)]
+        command = [sys.executable, "-m", "octasplat", *map(str, arguments)]
         return subprocess.run(
             command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False
         )

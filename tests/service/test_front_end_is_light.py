@@ -5,13 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 HEAVY = ("torch", "numba", "llvmlite", "pycolmap", "embreex", "scipy", "OpenImageIO", "matplotlib")
 CODE = f"""
 import json, sys
-import service.app, service.__main__
-service.app.create_app()
+import octasplat.service.app, octasplat.service.serving
+octasplat.service.app.create_app()
 print(json.dumps([name for name in {HEAVY!r} if name in sys.modules]))
 """
 
@@ -46,7 +46,7 @@ CHECK = (
     BLOCK
     + """
 from pathlib import Path
-from service.intake.model_child import ModelRequest, check
+from octasplat.service.intake.model_child import ModelRequest, check
 root = Path(sys.argv[1])
 files = {path.name: path.relative_to(root).as_posix() for path in root.glob("sparse/0/*")}
 sizes = {path.name: (48, 36) for path in (root / "images").iterdir()}
@@ -59,9 +59,9 @@ assert not answer.faults and answer.views == 4, answer
 ACCEPT = (
     BLOCK
     + """
-from engine.files import exporters
-from service.web.forms import options_form
-from workers.work.kinds import job_kinds, kind_named
+from octasplat.engine.files import exporters
+from octasplat.service.web.forms import options_form
+from octasplat.workers.work.kinds import job_kinds, kind_named
 assert exporters()
 for kind in job_kinds():
     options_form(kind)

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from engine.isolated_python import python_command
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.client.api import Api
-from workers.client.upload import upload_scene
-from workers.client.watch import watch_job
+from octasplat.engine.isolated_python import python_command
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.upload import upload_scene
+from octasplat.workers.client.watch import watch_job
 
 TOYS = Path(__file__).parents[1] / "work"
-START = "import sys; sys.path.append({toys!r}); from workers.cli.main import main; main()"
+START = "import sys; sys.path.append({toys!r}); from octasplat.workers.cli.main import main; main()"
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_serve_runs_nothing_of_the_current_folder(served: Api, project: Path, tm
 
 
 def test_programs_are_found_wherever_they_start(project: Path, tmp_path: Path) -> None:
-    command = python_command("workers", "--version", further_modules=("no_such_module", "toy_kind"))
+    command = python_command("octasplat", "--version", further_modules=("no_such_module", "toy_kind"))
     environment = {**os.environ, "PYTHONPATH": str(project)}
     done = subprocess.run(command, cwd=project, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "") and "octasplat, version" in done.stdout

@@ -11,8 +11,8 @@ import httpx
 import pytest
 from service_bench import claimed, committed_dataset, running, stored
 
-from service.state import Service
-from workers.queue.attempts import Result
+from octasplat.service.state import Service
+from octasplat.workers.queue.attempts import Result
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 

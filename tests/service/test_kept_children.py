@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from workers.serve.children import KeptChild, kill_late
+from octasplat.workers.serve.children import KeptChild, kill_late
 
 
 def test_what_cannot_be_started_is_told_and_tried_again(

@@ -10,10 +10,10 @@ import httpx
 import pytest
 from service_bench import claimed, committed_dataset, running, with_token
 
-from service.state import Service
-from workers.queue.attempts import Result
-from workers.records.datasets import put_file
-from workers.records.workers import see_worker
+from octasplat.service.state import Service
+from octasplat.workers.queue.attempts import Result
+from octasplat.workers.records.datasets import put_file
+from octasplat.workers.records.workers import see_worker
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 PHOTOGRAPHS = [{"width_px": 269, "height_px": 480, "count": 50}]

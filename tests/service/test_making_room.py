@@ -10,17 +10,18 @@ from pathlib import Path
 import httpx
 import pytest
 from service_bench import running
+
 from small_disk import small_disk
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))
 from model_builder import photograph
 from zip_builder import Member, build
 
-from service.state import Service
-from workers.queue import storing
-from workers.store.errors import StorageUnavailable
-from workers.upkeep import collecting
-from workers.upkeep.collecting import collect_at_once
+from octasplat.service.state import Service
+from octasplat.workers.queue import storing
+from octasplat.workers.store.errors import StorageUnavailable
+from octasplat.workers.upkeep import collecting
+from octasplat.workers.upkeep.collecting import collect_at_once
 
 MIB = 1 << 20
 PATIENCE_SECONDS = 180.0

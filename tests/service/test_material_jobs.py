@@ -7,8 +7,8 @@ import pytest
 from service_bench import committed_dataset, running
 from test_stage_jobs import HDR, finished, sent
 
-from engine.errors import ConfigError
-from workers.client.submission import Derivation, with_environments
+from octasplat.engine.errors import ConfigError
+from octasplat.workers.client.submission import Derivation, with_environments
 
 SHINY = {"environment.hdr": HDR, "scene.ply": b"ply"}
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from workers.store.local import LocalStorage
+from octasplat.workers.store.local import LocalStorage
 
 pytestmark = pytest.mark.heavy
 
@@ -59,7 +59,7 @@ def front_end(conninfo: str, tmp_path: Path) -> Iterator[FrontEnd]:
     log = tmp_path / "service.log"
     with log.open("wb") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "service"],
+            [sys.executable, "-m", "octasplat", "api"],
             env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=errors, text=True,
         )  # fmt: skip
     assert process.stdout is not None

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import httpx
 
-from workers.client.api import Api, find_token
+from octasplat.workers.client.api import Api, find_token
 
 ROOT = Path(__file__).parents[2]
 
 
 def start(data: Path) -> "subprocess.Popen[bytes]":
     environment = {**os.environ, "OCTASPLAT_FLOOR_BYTES": "0"}
-    command = [sys.executable, "-m", "workers", "serve", "--port", "0", "--queues", "", "--data", str(data)]
+    command = [sys.executable, "-m", "octasplat", "serve", "--port", "0", "--queues", "", "--data", str(data)]
     process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
     while not (data / "serve.json").exists():
@@ -26,7 +26,7 @@ def start(data: Path) -> "subprocess.Popen[bytes]":
 
 def octasplat(data: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
     environment = {**os.environ, "OCTASPLAT_DATA": str(data)}
-    command = [sys.executable, "-m", "workers", *arguments]
+    command = [sys.executable, "-m", "octasplat", *arguments]
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
 
 

@@ -15,13 +15,13 @@ import pytest
 from service_bench import claimed, committed_dataset, running
 from test_reconstruction import ROOT, TRAIN, Machine, start
 
-from engine.files import exporters
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from service.state import Service
-from workers.client.submission import Submission, submit
-from workers.client.watch import watch_job
-from workers.queue.attempts import Result
-from workers.records.workers import see_worker
+from octasplat.engine.files import exporters
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.service.state import Service
+from octasplat.workers.client.submission import Submission, submit
+from octasplat.workers.client.watch import watch_job
+from octasplat.workers.queue.attempts import Result
+from octasplat.workers.records.workers import see_worker
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 FORMATS = [exporter.name for exporter in exporters()]
@@ -158,7 +158,7 @@ def test_a_file_that_fails_leaves_the_rest_and_a_retry_does_not_train_again(
         first = {a["name"]: a["sha256"] for a in api.get(f"{address}/artifacts")["artifacts"]}
         assert {"scene.ply", "metrics.json", "report.html", "mesh.glb", "mesh.ply"} <= set(first)
         assert "a.sog" not in first and any(name.startswith("renders/") for name in first)
-        command = [sys.executable, "-m", "workers", "retry", job["id"], "--exports", "mesh.obj,mesh.glb"]
+        command = [sys.executable, "-m", "octasplat", "retry", job["id"], "--exports", "mesh.obj,mesh.glb"]
         environment = {**os.environ, "OCTASPLAT_DATA": str(machine.data)}
         said = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
         assert said.returncode == 0, said.stderr

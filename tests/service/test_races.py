@@ -13,10 +13,10 @@ from service_bench import claimed, committed_dataset, running, stored
 sys.path.append(str(Path(__file__).parents[1] / "intake"))
 from model_builder import photograph
 
-from service.actions import datasets as actions
-from service.intake.dataset import DatasetSummary
-from service.state import Service
-from workers.queue.attempts import Result
+from octasplat.service.actions import datasets as actions
+from octasplat.service.intake.dataset import DatasetSummary
+from octasplat.service.state import Service
+from octasplat.workers.queue.attempts import Result
 
 ROUNDS = 12
 

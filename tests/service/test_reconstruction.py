@@ -15,15 +15,15 @@ import psutil
 import pytest
 from click.testing import CliRunner
 
-from engine.pipeline import reconstruct
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.cli.main import cli
-from workers.client.api import Api, ServiceError
-from workers.client.download import download_results
-from workers.client.submission import Submission, submit
-from workers.client.upload import upload_scene
-from workers.client.watch import watch_job
-from workers.work.kinds.options import resolve_reconstruction
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.workers.cli.main import cli
+from octasplat.workers.client.api import Api, ServiceError
+from octasplat.workers.client.download import download_results
+from octasplat.workers.client.submission import Submission, submit
+from octasplat.workers.client.upload import upload_scene
+from octasplat.workers.client.watch import watch_job
+from octasplat.workers.work.kinds.options import resolve_reconstruction
 
 pytestmark = pytest.mark.heavy
 
@@ -76,7 +76,7 @@ def start(data: Path) -> Machine:
     }
     (data / "serve.json").unlink(missing_ok=True)
     log = data.parent / f"{data.name}.log"
-    command = [sys.executable, "-m", "workers", "serve", "--data", str(data), "--port", "0"]
+    command = [sys.executable, "-m", "octasplat", "serve", "--data", str(data), "--port", "0"]
     with log.open("ab") as output:
         process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=output)
     machine = Machine(data, process)
@@ -127,7 +127,7 @@ def check_what_is_shown(api: Api, machine: Machine, job: dict[str, Any]) -> None
     }
 
     def command(*arguments: str) -> str:
-        run = [sys.executable, "-m", "workers", *arguments]
+        run = [sys.executable, "-m", "octasplat", *arguments]
         return subprocess.run(
             run, cwd=ROOT, env=environment, capture_output=True, text=True, check=True
         ).stdout
@@ -163,7 +163,7 @@ def test_everything_is_killed_and_the_result_is_the_same(
             return found
 
         until(lambda job: job["checkpoint"] is not None and job["checkpoint"]["step"] >= 25)
-        for victim in machine.children("workers.work.child"):
+        for victim in machine.children("octasplat.workers.work.child"):
             victim.kill()
         until(lambda job: job["attempt"] >= 2 or job["state"] == "succeeded")
         for victim in machine.children("--queues cpu"):
@@ -264,7 +264,7 @@ def test_killed_database_comes_back(machine: Machine, scene: Path) -> None:
 
 
 def test_second_service_on_the_same_data_is_refused(machine: Machine) -> None:
-    command = [sys.executable, "-m", "workers", "serve", "--data", str(machine.data), "--port", "0"]
+    command = [sys.executable, "-m", "octasplat", "serve", "--data", str(machine.data), "--port", "0"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1 and "Another octasplat serve" in done.stderr
     assert "Traceback" not in done.stderr

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import httpx
 from service_bench import running
+
 from small_disk import fill, small_disk
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))

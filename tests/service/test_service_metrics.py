@@ -12,10 +12,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from service_bench import claimed, committed_dataset, running, with_token
 
-from service.state import Service
-from workers.queue.rescue import rescue_lost_jobs
-from workers.records.ids import new_id
-from workers.records.workers import see_worker
+from octasplat.service.state import Service
+from octasplat.workers.queue.rescue import rescue_lost_jobs
+from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.workers import see_worker
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 PNG = bytes.fromhex(

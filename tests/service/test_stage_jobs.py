@@ -19,14 +19,14 @@ from click.testing import CliRunner
 from service_bench import claimed, committed_dataset, running, stored
 from test_reconstruction import ROOT
 
-from engine.files.gaussian_ply import read_gaussian_ply
-from engine.pipeline import reconstruct
-from engine.render.images import write_png
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from service.state import Service
-from workers.cli.main import cli
-from workers.queue.attempts import Result
-from workers.work.kinds.options import resolve_reconstruction
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.render.images import write_png
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.service.state import Service
+from octasplat.workers.cli.main import cli
+from octasplat.workers.queue.attempts import Result
+from octasplat.workers.work.kinds.options import resolve_reconstruction
 
 TRIANGLE = b"v 0 0 0\nv .3 0 0\nv 0 -.3 0\nf 1 2 3\n"
 HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n" + bytes([128, 128, 128, 128] * 4)
@@ -212,7 +212,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_killed_film_goes_on_at_another_worker_with_the_bytes_of_the_command(
     conninfo: str, tmp_path: Path, run: Path
 ) -> None:
-    from workers.client.submission import Derivation, with_stage
+    from octasplat.workers.client.submission import Derivation, with_stage
 
     stage = run / "stages" / "stage.toml"
     size = ("--frames", "6", "--width", "32", "--height", "24", "--threads", "1")
@@ -233,7 +233,7 @@ def test_a_killed_film_goes_on_at_another_worker_with_the_bytes_of_the_command(
         environment = {f"OCTASPLAT_{key}": str(value) for key, value in given.items()}
         workers.append(
             subprocess.Popen(
-                [sys.executable, "-m", "workers", "worker", "--queues", "cpu", "--name", name],
+                [sys.executable, "-m", "octasplat", "worker", "--queues", "cpu", "--name", name],
                 cwd=ROOT, env={**os.environ, **environment, "DATABASE_URL": conninfo, "OMP_NUM_THREADS": "1"},
             )
         )  # fmt: skip

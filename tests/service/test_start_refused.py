@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 def start(**environment: str) -> "subprocess.CompletedProcess[str]":
     given = {name: value for name, value in os.environ.items() if not name.startswith("OCTASPLAT_")}
     return subprocess.run(
-        [sys.executable, "-m", "service"],
+        [sys.executable, "-m", "octasplat", "api"],
         env={**given, "OCTASPLAT_PORT": "0", **environment},
         cwd=ROOT,
         capture_output=True,

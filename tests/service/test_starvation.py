@@ -9,8 +9,8 @@ import httpx
 import pytest
 from service_bench import running
 
-from service.actions import datasets as actions
-from service.intake.dataset import DatasetSummary
+from octasplat.service.actions import datasets as actions
+from octasplat.service.intake.dataset import DatasetSummary
 
 PATIENCE_SECONDS = 60.0
 

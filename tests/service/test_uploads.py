@@ -25,9 +25,9 @@ sys.path.append(str(Path(__file__).parents[1] / "intake"))  # the builders of ar
 from model_builder import Model, photograph, photographs
 from zip_builder import Member, build
 
-from service.app import create_app
-from service.settings import ServiceSettings
-from workers.store.local import LocalStorage
+from octasplat.service.app import create_app
+from octasplat.service.settings import ServiceSettings
+from octasplat.workers.store.local import LocalStorage
 
 ROOT = Path(__file__).parents[2]
 
@@ -314,8 +314,8 @@ def test_a_disk_below_its_floor(talk: Talk) -> None:
 
 SERVER = """
 import sys, uvicorn
-from service.app import create_app
-from service.settings import ServiceSettings
+from octasplat.service.app import create_app
+from octasplat.service.settings import ServiceSettings
 uvicorn.run(create_app(ServiceSettings(port=0)), uds=sys.argv[1], log_level="warning")
 """
 

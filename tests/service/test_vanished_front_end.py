@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from service_bench import running
 
-from workers.queue import storing
-from workers.upkeep import collecting
+from octasplat.workers.queue import storing
+from octasplat.workers.upkeep import collecting
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 60.0
@@ -34,7 +34,7 @@ def test_a_front_end_that_vanishes_mid_upload(
         "OCTASPLAT_FLOOR_BYTES": "0",
         "OCTASPLAT_PORT": "0",
     }
-    command = [sys.executable, "-m", "service"]
+    command = [sys.executable, "-m", "octasplat", "api"]
     process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

@@ -15,12 +15,12 @@ from hook_receiver import Receiver, receiving
 from service_bench import claimed, committed_dataset, running, with_token
 from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 
-from service.state import Service
-from workers.records.database import open_pool
-from workers.upkeep.webhooks import addresses
-from workers.upkeep.webhooks.addresses import AddressRefused, check_url
-from workers.upkeep.webhooks.outbox import WAITS_SECONDS, take_due
-from workers.upkeep.webhooks.sending import OF_ONE_OWNER, Sender, guarded_client, send_due
+from octasplat.service.state import Service
+from octasplat.workers.records.database import open_pool
+from octasplat.workers.upkeep.webhooks import addresses
+from octasplat.workers.upkeep.webhooks.addresses import AddressRefused, check_url
+from octasplat.workers.upkeep.webhooks.outbox import WAITS_SECONDS, take_due
+from octasplat.workers.upkeep.webhooks.sending import OF_ONE_OWNER, Sender, guarded_client, send_due
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
 HERE = ("127.0.0.1",)

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from engine.shading.environment_levels import LightLevels
-from engine.shading.split_sum import split_sum_table
+from octasplat.engine.shading.environment_levels import LightLevels
+from octasplat.engine.shading.split_sum import split_sum_table
 
 
 def bilinear(texels: torch.Tensor, offset: int, height: int, direction: torch.Tensor) -> torch.Tensor:

@@ -6,27 +6,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.errors import Cancelled
-from engine.events import Event, HeldOutMeasured
-from engine.gaussians.channels import stacked
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.rays import RayBatch
-from engine.shading.ambient import ambient_visibility, bounced_light
-from engine.shading.buffer import Leaving
-from engine.shading.deferred import Deferred
-from engine.shading.material_settings import MaterialSettings
-from engine.shading.protocol import Sight
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceSettings
-from engine.trace.sums import add_gradients
-from engine.train.batches import BatchSource
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from engine.train.initialise import with_first_materials
-from engine.train.iteration import differentiate
-from engine.train.shading import make_deferred
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import Event, HeldOutMeasured
+from octasplat.engine.gaussians.channels import stacked
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.ambient import ambient_visibility, bounced_light
+from octasplat.engine.shading.buffer import Leaving
+from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.engine.trace.sums import add_gradients
+from octasplat.engine.train.batches import BatchSource
+from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.initialise import with_first_materials
+from octasplat.engine.train.iteration import differentiate
+from octasplat.engine.train.shading import make_deferred
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 sys.path.append(str(Path(__file__).parents[1] / "train"))
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from engine.config import resolve_config
-from engine.errors import ConfigError
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.shading.flattening import Flattening
-from engine.shading.plain import PLAIN
-from engine.shading.protocol import Sight
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceResult
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.config import resolve_config
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.flattening import Flattening
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceResult
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 sys.path.append(str(Path(__file__).parents[1] / "train"))
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from engine.rays import RayBatch
-from engine.shading.geometry_terms import EDGE, smoothness_term
-from engine.shading.protocol import Sight
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceResult, TraceSettings
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.geometry_terms import EDGE, smoothness_term
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceResult, TraceSettings
 
 SIDE, METAL = 3, 10.0
 WEIGHTS = (0.02, 0.03, 0.04, 0.2, 0.3)

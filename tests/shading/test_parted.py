@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.rays import RayBatch
-from engine.shading.deferred import Deferred
-from engine.shading.material_settings import MaterialSettings
-from engine.shading.parted import part
-from engine.shading.protocol import Sight
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.parted import part
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 sys.path.append(str(Path(__file__).parent))
 

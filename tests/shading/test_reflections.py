@@ -6,18 +6,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.colour import srgb_to_linear
-from engine.gaussians.model import concatenate
-from engine.rays import ImageRays, RayBatch
-from engine.render.oversampling import pixel_means
-from engine.render.renderer import background_colour, render_rays
-from engine.shading.deferred import Deferred
-from engine.shading.lobe import Widening, facets_of, numbers_of, pair_mean, pair_slope, roughness_slope
-from engine.shading.material_settings import MaterialSettings
-from engine.shading.protocol import Sight
-from engine.shading.reflections import Seen
-from engine.shading.split_sum import Surface
-from engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.gaussians.model import concatenate
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.render.oversampling import pixel_means
+from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.shading.deferred import Deferred
+from octasplat.engine.shading.lobe import (
+    Widening,
+    facets_of,
+    numbers_of,
+    pair_mean,
+    pair_slope,
+    roughness_slope,
+)
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.reflections import Seen
+from octasplat.engine.shading.split_sum import Surface
+from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 sys.path.append(str(Path(__file__).parent))
 

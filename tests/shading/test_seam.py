@@ -12,20 +12,26 @@ import numpy as np
 import pytest
 from jaxtyping import Float32
 
-from engine.errors import Cancelled
-from engine.events import Event, HeldOutMeasured
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.shading.exposure import Exposures
-from engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import GaussianGradients, TraceGradients, Tracer, TraceResult, TraceSettings
-from engine.train.batches import Batch, BatchSource
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from engine.train.config import McmcConfig
-from engine.train.iteration import differentiate
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import Event, HeldOutMeasured
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.exposure import Exposures
+from octasplat.engine.shading.protocol import Developed, Reversed, ShadingModel, Sight
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import (
+    GaussianGradients,
+    TraceGradients,
+    Tracer,
+    TraceResult,
+    TraceSettings,
+)
+from octasplat.engine.train.batches import Batch, BatchSource
+from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.config import McmcConfig
+from octasplat.engine.train.iteration import differentiate
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 sys.path.append(str(Path(__file__).parents[1] / "train"))
 

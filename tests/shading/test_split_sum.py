@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from engine.errors import ConfigError
-from engine.shading.environment_frame import environment_frame
-from engine.shading.environment_levels import ROUGHNESSES, LightLevels, Prefilter, prefilter, resampled
-from engine.shading.split_sum import Surface, shade, shade_reverse, split_sum_table
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.shading.environment_levels import (
+    ROUGHNESSES,
+    LightLevels,
+    Prefilter,
+    prefilter,
+    resampled,
+)
+from octasplat.engine.shading.split_sum import Surface, shade, shade_reverse, split_sum_table
 
 sys.path.append(str(Path(__file__).parent))
 

@@ -2,11 +2,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from bucket_for_tests import s3_address, s3_bucket
 
-from workers.store import Storage
-from workers.store.local import LocalStorage
-from workers.store.s3 import S3Storage
+from bucket_for_tests import s3_address, s3_bucket
+from octasplat.workers.store import Storage
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.store.s3 import S3Storage
 
 __all__ = ["s3_address", "s3_bucket"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from workers.store import (
+from octasplat.workers.store import (
     Blob,
     BlobMissing,
     DigestMismatch,
@@ -23,8 +23,8 @@ from workers.store import (
     read_manifest,
     store_tree,
 )
-from workers.store.names import NameRefused
-from workers.store.s3 import S3Storage
+from octasplat.workers.store.names import NameRefused
+from octasplat.workers.store.s3 import S3Storage
 
 MIB = 1 << 20
 
@@ -282,7 +282,7 @@ def test_trees_lead_nowhere_else(storage: Storage, tmp_path: Path) -> None:
 
 MEMORY = """
 import resource, sys
-from workers.store import open_storage
+from octasplat.workers.store import open_storage
 
 storage = open_storage(sys.argv[1], floor_bytes=0)
 

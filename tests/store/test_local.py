@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from small_disk import small_disk
 
-from engine.errors import ConfigError
-from workers.store import StorageFull, StorageUnavailable, open_storage
-from workers.store.local import LocalStorage
-from workers.store.s3 import S3Storage
+from octasplat.engine.errors import ConfigError
+from octasplat.workers.store import StorageFull, StorageUnavailable, open_storage
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.store.s3 import S3Storage
+from small_disk import small_disk
 
 
 def put(storage: LocalStorage, data: bytes) -> str:
@@ -113,7 +113,7 @@ def test_a_damaged_blob_is_noticed_and_mended(local_storage: LocalStorage, tmp_p
 WRITER = """
 import sys
 from pathlib import Path
-from workers.store.local import LocalStorage
+from octasplat.workers.store.local import LocalStorage
 storage = LocalStorage(Path(sys.argv[1]), floor_bytes=0)
 number = 0
 while True:

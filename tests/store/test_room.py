@@ -3,8 +3,8 @@
 import os
 from pathlib import Path
 
-from workers.store.local import LocalStorage
-from workers.store.room import Room
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.store.room import Room
 
 
 def test_room(local_storage: LocalStorage, tmp_path: Path) -> None:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.surface.mesh import TriangleMesh
 
 
 @pytest.fixture(scope="session")

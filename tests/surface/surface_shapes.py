@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.paths import look_at
-from engine.surface.kernels_volume import VOXELS
-from engine.surface.region import BLOCK, Region
-from engine.surface.volume import Volume
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.paths import look_at
+from octasplat.engine.surface.kernels_volume import VOXELS
+from octasplat.engine.surface.region import BLOCK, Region
+from octasplat.engine.surface.volume import Volume
 
 
 def volume_of(distance: Callable[[np.ndarray], np.ndarray], blocks: int, voxel: float = 1.0) -> Volume:

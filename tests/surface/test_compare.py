@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine.surface.compare import (
+from octasplat.engine.surface.compare import (
     distances_to_surface,
     point_triangle_distances,
     sample_surface,
     score,
 )
-from engine.surface.mesh import TriangleMesh
-from engine.surface.occlusion import Occluder
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.occlusion import Occluder
 
 
 def test_distance_to_each_part_of_a_triangle():

@@ -9,15 +9,15 @@ import pytest
 import trimesh
 from surface_shapes import cameras_on_sphere
 
-from engine.errors import Cancelled, ConfigError, SceneFileError
-from engine.events import StageFinished
-from engine.files import write_surface
-from engine.render.images import read_image
-from engine.surface.cameras import cameras_around
-from engine.surface.extract import ExtractedSurface, extract_surface
-from engine.surface.mesh import TriangleMesh, edge_report
-from engine.surface.options import SurfaceOptions
-from engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.errors import Cancelled, ConfigError, SceneFileError
+from octasplat.engine.events import StageFinished
+from octasplat.engine.files import write_surface
+from octasplat.engine.render.images import read_image
+from octasplat.engine.surface.cameras import cameras_around
+from octasplat.engine.surface.extract import ExtractedSurface, extract_surface
+from octasplat.engine.surface.mesh import TriangleMesh, edge_report
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
 

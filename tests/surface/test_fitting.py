@@ -5,16 +5,16 @@ from functools import partial
 import numpy as np
 from surface_shapes import cameras_on_sphere, sphere, volume_of
 
-from engine.colour import to_bytes
-from engine.rays import RayBatch
-from engine.surface.backdrop import with_backdrop
-from engine.surface.fitting import Picture, TexturePalette, VertexPalette, fitted
-from engine.surface.marching import surface_of
-from engine.surface.mesh import TriangleMesh, edge_report
-from engine.surface.settling import settled
-from engine.surface.texture import lay_out
-from engine.surface.volume import solid_where_unseen
-from engine.trace.meshes import TriangleScene
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.surface.backdrop import with_backdrop
+from octasplat.engine.surface.fitting import Picture, TexturePalette, VertexPalette, fitted
+from octasplat.engine.surface.marching import surface_of
+from octasplat.engine.surface.mesh import TriangleMesh, edge_report
+from octasplat.engine.surface.settling import settled
+from octasplat.engine.surface.texture import lay_out
+from octasplat.engine.surface.volume import solid_where_unseen
+from octasplat.engine.trace.meshes import TriangleScene
 
 
 def painted(points_world: np.ndarray) -> np.ndarray:

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from surface_shapes import cameras_on_sphere, sphere_depth
 
-from engine.errors import ConfigError
-from engine.surface.depth import DepthMaps
-from engine.surface.marching import surface_of
-from engine.surface.mesh import edge_report
-from engine.surface.options import SurfaceOptions
-from engine.surface.region import choose_region, focus
-from engine.surface.volume import fuse
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.surface.depth import DepthMaps
+from octasplat.engine.surface.marching import surface_of
+from octasplat.engine.surface.mesh import edge_report
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.region import choose_region, focus
+from octasplat.engine.surface.volume import fuse
 
 RADIUS = 1.0
 

@@ -5,26 +5,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.config import resolve_config
-from engine.files.gaussian_ply import read_gaussian_ply
-from engine.pipeline import reconstruct
-from engine.render.cameras import RenderCamera
-from engine.render.images import read_channels
-from engine.run_folder import SCENE
-from engine.scene import SceneModel, load_scene
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.scene.generated.arrangement import TABLE_RADIUS, still_life
-from engine.surface.cameras import photograph_cameras
-from engine.surface.compare import SurfaceScore, distances_to_surface, sample_surface, score
-from engine.surface.depth import DepthMaps
-from engine.surface.extract import extract_surface
-from engine.surface.marching import surface_of
-from engine.surface.mesh import TriangleMesh, edge_report
-from engine.surface.occlusion import Occluder
-from engine.surface.options import SurfaceOptions
-from engine.surface.region import choose_region
-from engine.surface.volume import fuse
-from engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.config import resolve_config
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.images import read_channels
+from octasplat.engine.run_folder import SCENE
+from octasplat.engine.scene import SceneModel, load_scene
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.scene.generated.arrangement import TABLE_RADIUS, still_life
+from octasplat.engine.surface.cameras import photograph_cameras
+from octasplat.engine.surface.compare import SurfaceScore, distances_to_surface, sample_surface, score
+from octasplat.engine.surface.depth import DepthMaps
+from octasplat.engine.surface.extract import extract_surface
+from octasplat.engine.surface.marching import surface_of
+from octasplat.engine.surface.mesh import TriangleMesh, edge_report
+from octasplat.engine.surface.occlusion import Occluder
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.region import choose_region
+from octasplat.engine.surface.volume import fuse
+from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 MIN_VIEWS = 3
 """Only what so many cameras see can be asked for."""

@@ -8,10 +8,10 @@ import skimage.measure
 from scipy.spatial import cKDTree
 from surface_shapes import sphere, volume_of, voxel_centres
 
-from engine.errors import ConfigError
-from engine.surface.marching import surface_of
-from engine.surface.marching_table import EDGES, FACES, loops, triangles
-from engine.surface.mesh import edge_report
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.surface.marching import surface_of
+from octasplat.engine.surface.marching_table import EDGES, FACES, loops, triangles
+from octasplat.engine.surface.mesh import edge_report
 
 
 @pytest.mark.parametrize("case", range(256))

@@ -8,10 +8,10 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 from surface_shapes import sphere, volume_of
 
-from engine.surface.clean import decimate, face_components, keep_large_components
-from engine.surface.holes import fill_holes, rims
-from engine.surface.marching import surface_of
-from engine.surface.mesh import TriangleMesh, edge_report
+from octasplat.engine.surface.clean import decimate, face_components, keep_large_components
+from octasplat.engine.surface.holes import fill_holes, rims
+from octasplat.engine.surface.marching import surface_of
+from octasplat.engine.surface.mesh import TriangleMesh, edge_report
 
 
 def joined(*meshes: TriangleMesh) -> TriangleMesh:

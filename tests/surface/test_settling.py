@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from engine.surface.kernels_settling import gather, gather_squares, linearise, show
-from engine.surface.mesh import edges_of
+from octasplat.engine.surface.kernels_settling import gather, gather_squares, linearise, show
+from octasplat.engine.surface.mesh import edges_of
 
 RNG = np.random.default_rng(0)
 

@@ -7,17 +7,17 @@ import pytest
 import trimesh
 from surface_shapes import cameras_on_sphere
 
-from engine.colour import linear_to_srgb
-from engine.files import read_mesh, write_surface
-from engine.files.gltf import GlbFile
-from engine.shading.environment_frame import environment_frame
-from engine.surface.extract import extract_surface
-from engine.surface.materials import material_features, with_materials
-from engine.surface.mesh import TriangleMesh
-from engine.surface.options import SurfaceOptions
-from engine.surface.tangents import vertex_tangents
-from engine.surface.texture import TextureLayout
-from engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.files import read_mesh, write_surface
+from octasplat.engine.files.gltf import GlbFile
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.surface.extract import extract_surface
+from octasplat.engine.surface.materials import material_features, with_materials
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.tangents import vertex_tangents
+from octasplat.engine.surface.texture import TextureLayout
+from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 SIDE = 256
 UP = (0.0, 0.0, 1.0)

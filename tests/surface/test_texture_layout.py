@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from engine.surface.clean import face_components
-from engine.surface.mesh import TriangleMesh
-from engine.surface.texture import lay_out
+from octasplat.engine.surface.clean import face_components
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.texture import lay_out
 
 SIDE = 512
 

@@ -10,8 +10,8 @@ from browser import open_page
 from jaxtyping import Float32, Float64
 from npm_packages import npm_folder
 
-from engine.render.cameras import RenderCamera
-from engine.render.images import read_image
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.images import read_image
 
 THREE = ("three", "0.187.0")
 PAGE = """<!doctype html>

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from engine.gaussians.frames import frames_from_normals, quaternions, rotation_matrices
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.render.cameras import RenderCamera
-from engine.render.images import read_image
-from engine.render.path_file import CameraPath, write_camera_path
-from engine.render.renderer import background_colour, render_rays
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions, rotation_matrices
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.images import read_image
+from octasplat.engine.render.path_file import CameraPath, write_camera_path
+from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 WIDTH_PX, HEIGHT_PX = 256, 192
 

@@ -9,12 +9,12 @@ import pytest
 from blender_python import EXPORT_PATH_SCRIPT, IMPORT_SCRIPT, SCRIPTS, run_blender
 from shell_scene import our_view, psnr_db, shell_cameras, shell_scene, write_shell_cameras
 
-from engine.files import ExportOptions, export_scene
-from engine.files.ply_container import read_ply
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import octagon_corners_world, octagon_radii
-from engine.render.images import read_image, write_exr
-from engine.render.path_file import read_camera_path
+from octasplat.engine.files import ExportOptions, export_scene
+from octasplat.engine.files.ply_container import read_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
+from octasplat.engine.render.images import read_image, write_exr
+from octasplat.engine.render.path_file import read_camera_path
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

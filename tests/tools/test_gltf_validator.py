@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from engine.files import ExportOptions, export_scene
-from engine.gaussians.materials import MATERIAL_WIDTHS
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.files import ExportOptions, export_scene
+from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
+from octasplat.engine.gaussians.model import FlatGaussians
 
 pytestmark = pytest.mark.tools
 

@@ -9,23 +9,23 @@ import pytest
 from blender_python import SCRIPTS, run_blender
 from lit_surface import in_cycles, in_threejs, view_of
 
-from engine.files import write_surface
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.model import FlatGaussians
-from engine.light.environment import EnvironmentMap
-from engine.light.relighting import PathRelighter
-from engine.light.stage import Integrator
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.environment_map import write_environment
-from engine.render.paths import look_at
-from engine.shading.environment_frame import environment_frame
-from engine.surface.cameras import cameras_around
-from engine.surface.extract import extract_surface
-from engine.surface.materials import material_features
-from engine.surface.mesh import TriangleMesh
-from engine.surface.options import SurfaceOptions
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.files import write_surface
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.environment import EnvironmentMap
+from octasplat.engine.light.relighting import PathRelighter
+from octasplat.engine.light.stage import Integrator
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.render.paths import look_at
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.surface.cameras import cameras_around
+from octasplat.engine.surface.extract import extract_surface
+from octasplat.engine.surface.materials import material_features
+from octasplat.engine.surface.mesh import TriangleMesh
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

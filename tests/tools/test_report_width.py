@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from browser import open_page
 
-from engine.evaluate.gallery import ViewImages
-from engine.evaluate.report import write_report
+from octasplat.engine.evaluate.gallery import ViewImages
+from octasplat.engine.evaluate.report import write_report
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -9,9 +9,9 @@ from browser import Page, open_page, psnr
 from npm_packages import npm_folder
 from shell_scene import our_view, shell_scene
 
-from engine.colour import to_bytes
-from engine.files import export_scene
-from engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.files import export_scene
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

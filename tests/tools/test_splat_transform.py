@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from npm_packages import npm_folder
 
-from engine.files import ExportOptions, export_scene, importer_for, read_scene
-from engine.files.gaussian_ply import read_ply_cloud
-from engine.gaussians.flattening import GaussianCloud
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.files import ExportOptions, export_scene, importer_for, read_scene
+from octasplat.engine.files.gaussian_ply import read_ply_cloud
+from octasplat.engine.gaussians.flattening import GaussianCloud
+from octasplat.engine.gaussians.model import FlatGaussians
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "files"))
 from cloud_difference import difference

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from engine.files import write_surface
-from engine.surface.mesh import TriangleMesh
+from octasplat.engine.files import write_surface
+from octasplat.engine.surface.mesh import TriangleMesh
 
 pytestmark = pytest.mark.tools
 

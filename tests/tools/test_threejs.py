@@ -8,10 +8,10 @@ from browser import psnr
 from shell_scene import our_view, shell_cameras, shell_scene, write_shell_cameras
 from threejs_example import draw_glb
 
-from engine.colour import to_bytes
-from engine.files import ExportOptions, export_scene
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.model import FlatGaussians
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.files import ExportOptions, export_scene
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.model import FlatGaussians
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

@@ -7,7 +7,7 @@ import numpy as np
 from browser import Page, open_page
 from npm_packages import npm_folder
 
-from engine.render.path_file import read_camera_path
+from octasplat.engine.render.path_file import read_camera_path
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "threejs"
 

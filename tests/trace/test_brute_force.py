@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from trace_scenes import f32, in_plane, make_cloud, make_tracer, rays_inwards, unit
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.rays import RayBatch
-from engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.recording import CpuRecording
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from trace_scenes import f32, facing_z, make_tracer
 
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import octagon_corners_world, octagon_radii
-from engine.rays import AT_INFINITY, RayBatch
-from engine.trace.protocol import TraceGradients, TraceResult
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import octagon_corners_world, octagon_radii
+from octasplat.engine.rays import AT_INFINITY, RayBatch
+from octasplat.engine.trace.protocol import TraceGradients, TraceResult
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

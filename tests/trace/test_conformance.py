@@ -18,11 +18,11 @@ from trace_scenes import (
     unit,
 )
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.make import make_tracer
-from engine.trace.protocol import Gradients, Recording, Tracer, TraceSettings
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import Gradients, Recording, Tracer, TraceSettings
 
 TRACERS = ("cpu", "cpu, packets", "cpu, single rays", "reference")
 

@@ -19,9 +19,9 @@ from trace_scenes import (
     same_bits,
 )
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.rays import RayBatch
-from engine.trace.protocol import GaussianGradients, TraceResult
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
 
 RAYS = 700
 Scene = tuple[FlatGaussians, np.ndarray, RayBatch]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from trace_scenes import facing_z, make_cloud, make_tracer, random_gradients, rays_inwards
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.rays import RayBatch
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.rays import RayBatch
 
 
 def assert_sees_nothing(cloud: FlatGaussians, rays: RayBatch) -> None:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from trace_scenes import f32, facing_z, make_tracer, unit
 
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.rays import RayBatch
-from engine.trace.facing import LEAST_COSINE, faced
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.facing import LEAST_COSINE, faced
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

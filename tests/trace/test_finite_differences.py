@@ -16,8 +16,8 @@ from trace_scenes import (
     scattered,
 )
 
-from engine.trace.protocol import TraceGradients
-from engine.trace.reference import ReferenceParameters, trace_reference
+from octasplat.engine.trace.protocol import TraceGradients
+from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

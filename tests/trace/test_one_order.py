@@ -23,12 +23,12 @@ from trace_scenes import (
     unit,
 )
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.trace.cpu.recording import CpuRecording
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceGradients, TraceResult
-from engine.trace.reference import ReferenceParameters, trace_reference
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceGradients, TraceResult
+from octasplat.engine.trace.reference import ReferenceParameters, trace_reference
 
 SEEN = ("rgb_srgb", "transmittance", "depth_sum", "depth_median", "normal_world")
 

@@ -23,8 +23,8 @@ import sys, tempfile
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from flat_world import FlatWorld, small_config
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
 world = FlatWorld()
 config = small_config(iterations=60, sh_every=30, loss={"ssim": 0.2})
 with tempfile.TemporaryDirectory() as folder:

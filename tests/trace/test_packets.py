@@ -18,12 +18,12 @@ from trace_scenes import (
     unit,
 )
 
-from engine.gaussians.model import concatenate
-from engine.rays import RayBatch
-from engine.trace.cpu.packets import MAX_RAYS, find_packets
-from engine.trace.cpu.recording import CpuRecording
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceResult
+from octasplat.engine.gaussians.model import concatenate
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.packets import MAX_RAYS, find_packets
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceResult
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from trace_scenes import f32, unit
 
-from engine.rays import ImageRays, RayBatch, joined
+from octasplat.engine.rays import ImageRays, RayBatch, joined
 
 
 def test_nothing_is_copied_and_single_limits_stay_single(rng: np.random.Generator) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from trace_scenes import assert_like_twin, f32, hit_lists, make_cloud, rays_inwards, same_bits, unit
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 STEPS, MOVE, GROWTH = 25, 0.14, 0.04
 """What training does at most between two builds: moves of so much of a Gaussian's size, growth by so much."""

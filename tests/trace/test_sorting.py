@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from engine.trace.cpu.kernels_sort import sort_by_gaussian, stable_order
+from octasplat.engine.trace.cpu.kernels_sort import sort_by_gaussian, stable_order
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])

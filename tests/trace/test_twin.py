@@ -20,11 +20,11 @@ from trace_scenes import (
     unit,
 )
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.rays import AT_INFINITY, RayBatch
-from engine.trace.cpu.kernels_hit import K
-from engine.trace.cpu.recording import CpuRecording
-from engine.trace.protocol import TraceGradients
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.rays import AT_INFINITY, RayBatch
+from octasplat.engine.trace.cpu.kernels_hit import K
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.protocol import TraceGradients
 
 pytestmark = pytest.mark.usefixtures("both_ways")
 

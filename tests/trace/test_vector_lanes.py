@@ -10,10 +10,10 @@ import pytest
 from numba import njit, types
 from numba.extending import intrinsic
 
-from engine.trace.cpu import kernels_eight, kernels_eight_backward, kernels_lanes, kernels_sixteen
-from engine.trace.cpu.kernels_footprint import footprints
-from engine.trace.cpu.kernels_lanes import DOUBLE8, INT8, MASK8, Gapless, load
-from engine.trace.cpu.kernels_simd import boxes_in_pyramid, ellipses_in_pyramid
+from octasplat.engine.trace.cpu import kernels_eight, kernels_eight_backward, kernels_lanes, kernels_sixteen
+from octasplat.engine.trace.cpu.kernels_footprint import footprints
+from octasplat.engine.trace.cpu.kernels_lanes import DOUBLE8, INT8, MASK8, Gapless, load
+from octasplat.engine.trace.cpu.kernels_simd import boxes_in_pyramid, ellipses_in_pyramid
 
 ADDRESS, DOUBLE, SINGLE, WORD = types.uintp, types.float64, types.float32, types.int64
 MEET = (ADDRESS, *(SINGLE,) * 5, WORD, WORD, *(ADDRESS,) * 6)

@@ -5,11 +5,11 @@ from dataclasses import fields
 import numpy as np
 import torch
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
-from engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult, TraceSettings
+from octasplat.engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
 
 PACKETS = ["auto"]
 """Whether tracers made here send rays in packets; tests that run both ways change it."""

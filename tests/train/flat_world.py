@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.scene import View
-from engine.train.config import McmcConfig, TrainConfig
-from engine.train.initialise import from_points
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.scene import View
+from octasplat.engine.train.config import McmcConfig, TrainConfig
+from octasplat.engine.train.initialise import from_points
 
 EXTENT = 1.0
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 from flat_world import random_gaussians
 
-from engine.gaussians.rows import row_arrays
-from engine.train.averaging import AVERAGE_EVERY, RunningMean
-from engine.train.checkpoint import load_checkpoint, save_checkpoint
-from engine.train.config import TrainConfig
-from engine.train.schedule import Schedule
-from engine.train.state import fresh_state
+from octasplat.engine.gaussians.rows import row_arrays
+from octasplat.engine.train.averaging import AVERAGE_EVERY, RunningMean
+from octasplat.engine.train.checkpoint import load_checkpoint, save_checkpoint
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.schedule import Schedule
+from octasplat.engine.train.state import fresh_state
 
 
 def test_mean_of_the_states_that_were_added() -> None:

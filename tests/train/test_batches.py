@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from engine.errors import ConfigError
-from engine.train.batches import BatchSource
-from engine.train.pixel_sampler import PixelSampler
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.train.batches import BatchSource
+from octasplat.engine.train.pixel_sampler import PixelSampler
 
 SIZES = np.array([[8, 6], [20, 10], [16, 16], [5, 3]], np.int64)
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld
 
-from engine.errors import CheckpointError
-from engine.gaussians.rows import row_arrays
-from engine.train.checkpoint import (
+from octasplat.engine.errors import CheckpointError
+from octasplat.engine.gaussians.rows import row_arrays
+from octasplat.engine.train.checkpoint import (
     latest_checkpoint,
     load_best,
     load_checkpoint,
     save_best,
     save_checkpoint,
 )
-from engine.train.optimiser import Adam
-from engine.train.state import TrainState
+from octasplat.engine.train.optimiser import Adam
+from octasplat.engine.train.state import TrainState
 
 
 def make_state(iteration: int = 30, count: int = 12) -> TrainState:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from engine.train.config import (
+from octasplat.engine.train.config import (
     LossWeights,
     TrainConfig,
     in_one_order,
@@ -17,11 +17,11 @@ from engine.train.config import (
     window_side_px,
     with_materials,
 )
-from engine.train.preset_names import PRESETS
-from engine.train.schedule import Schedule
-from engine.train.shown import shown_share
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.train.preset_names import PRESETS
+from octasplat.engine.train.schedule import Schedule
+from octasplat.engine.train.shown import shown_share
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 
 @pytest.mark.parametrize(

@@ -9,14 +9,14 @@ import pycolmap
 import pytest
 from scipy.spatial import cKDTree
 
-from engine.render.images import write_png
-from engine.scene import Dataset
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.scene.generated.arrangement import still_life
-from engine.train.dense_points import dense_points
-from engine.train.exposure_changes import evening_gains
-from engine.train.first_background import first_background
-from engine.train.lifted_points import LiftedPoints
+from octasplat.engine.render.images import write_png
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.scene.generated.arrangement import still_life
+from octasplat.engine.train.dense_points import dense_points
+from octasplat.engine.train.exposure_changes import evening_gains
+from octasplat.engine.train.first_background import first_background
+from octasplat.engine.train.lifted_points import LiftedPoints
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from engine.gaussians.model import FlatGaussians
-from engine.trace.protocol import GaussianGradients
-from engine.train.config import McmcConfig, PaperConfig
-from engine.train.densify import Densifier, Mcmc, Paper, make_densifier
-from engine.train.densify.mcmc import shared_opacity, shared_scale
-from engine.train.optimiser import Adam
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.trace.protocol import GaussianGradients
+from octasplat.engine.train.config import McmcConfig, PaperConfig
+from octasplat.engine.train.densify import Densifier, Mcmc, Paper, make_densifier
+from octasplat.engine.train.densify.mcmc import shared_opacity, shared_scale
+from octasplat.engine.train.optimiser import Adam
 
 
 def make(opacities: object, scale: float = 0.1) -> FlatGaussians:

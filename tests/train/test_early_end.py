@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from engine.errors import Cancelled
-from engine.events import CheckpointWritten, Event, TrainingProgress, Warned
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.rows import row_arrays
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from engine.train.config import TrainConfig
-from engine.train.early_end import gains_no_more, last_iteration
-from engine.train.schedule import Schedule
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import CheckpointWritten, Event, TrainingProgress, Warned
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import row_arrays
+from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.early_end import gains_no_more, last_iteration
+from octasplat.engine.train.schedule import Schedule
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 RISING = [(k, 20 + k / 100) for k in range(0, 1001, 100)]
 

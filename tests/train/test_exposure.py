@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from engine.errors import Cancelled
-from engine.events import Event, HeldOutMeasured
-from engine.rays import RayBatch
-from engine.scene.model import Observations
-from engine.shading.exposure import Exposures
-from engine.shading.exposure_guess import times_of
-from engine.shading.protocol import Sight
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import GaussianGradients, TraceResult
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from engine.train.config import TrainConfig
-from engine.train.exposure_changes import exposure_changes, log_brightness, with_exposure_decided
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import Event, HeldOutMeasured
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.scene.model import Observations
+from octasplat.engine.shading.exposure import Exposures
+from octasplat.engine.shading.exposure_guess import times_of
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import GaussianGradients, TraceResult
+from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.exposure_changes import exposure_changes, log_brightness, with_exposure_decided
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 NO_GRADIENTS = GaussianGradients(
     ids=np.zeros(0, np.int32),

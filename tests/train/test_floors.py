@@ -6,9 +6,9 @@ import numpy as np
 from flat_world import FlatWorld, small_config
 from scipy.spatial.distance import cdist
 
-from engine.train.floors import ScaleFloor
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.train.floors import ScaleFloor
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 
 def test_no_scale_ends_below_the_floor(tmp_path: Path) -> None:

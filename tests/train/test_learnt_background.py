@@ -7,23 +7,23 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, paint, small_config
 
-from engine.errors import Cancelled, ConfigError
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.render.environment_map import read_background, write_background
-from engine.scene import Camera
-from engine.scene.model import SparsePoints
-from engine.shading.exposure import Exposures
-from engine.shading.learnt_background import LearntBackground
-from engine.shading.protocol import Sight
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceResult
-from engine.train.batches import BatchSource
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from engine.train.first_background import first_background
-from engine.train.shading import background_of
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.errors import Cancelled, ConfigError
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.render.environment_map import read_background, write_background
+from octasplat.engine.scene import Camera
+from octasplat.engine.scene.model import SparsePoints
+from octasplat.engine.shading.exposure import Exposures
+from octasplat.engine.shading.learnt_background import LearntBackground
+from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceResult
+from octasplat.engine.train.batches import BatchSource
+from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.first_background import first_background
+from octasplat.engine.train.shading import background_of
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 
 def sky(directions: np.ndarray) -> np.ndarray:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from engine.config import resolve_config
-from engine.errors import Cancelled
-from engine.events import CheckpointWritten, Event, Warned
-from engine.pipeline import reconstruct
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.config import resolve_config
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import CheckpointWritten, Event, Warned
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 SPOILED = ["view_010.png", "view_025.png"]
 SETTINGS = (

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.scene.cameras import Camera
-from engine.scene.model import PosedView, SparsePoints, Viewpoints
-from engine.scene.near import NearZones, nearest_distances
-from engine.scene.seen import SeenSpace
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.model import PosedView, SparsePoints, Viewpoints
+from octasplat.engine.scene.near import NearZones, nearest_distances
+from octasplat.engine.scene.seen import SeenSpace
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 WIDE = Camera("OPENCV", (50.0, 50.0, 40.0, 40.0, -0.2, 0.0, 0.0, 0.0), 80, 80)
 PINHOLE = Camera("PINHOLE", (40.0, 40.0, 20.0, 20.0), 40, 40)

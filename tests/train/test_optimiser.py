@@ -8,13 +8,13 @@ import pytest
 import torch
 from flat_world import random_gaussians
 
-from engine.gaussians.frames import rotation_matrices
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.shading.material_settings import MaterialSettings
-from engine.trace.protocol import GaussianGradients
-from engine.train.config import LearningRates, LossWeights
-from engine.train.initialise import with_first_materials
-from engine.train.optimiser import Adam
+from octasplat.engine.gaussians.frames import rotation_matrices
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.trace.protocol import GaussianGradients
+from octasplat.engine.train.config import LearningRates, LossWeights
+from octasplat.engine.train.initialise import with_first_materials
+from octasplat.engine.train.optimiser import Adam
 
 NAMES = ("means_world", "quats_wxyz", "log_scales", "opacity_logits", "sh")
 NO_LOSS = LossWeights(opacity=0.0, scale=0.0)

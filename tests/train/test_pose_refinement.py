@@ -9,21 +9,21 @@ import pytest
 from flat_world import FlatWorld, small_config
 from scipy.spatial.transform import Rotation
 
-from engine.config import resolve_config
-from engine.errors import Cancelled, ConfigError
-from engine.events import Event, HeldOutMeasured, Warned, ignore
-from engine.gaussians.rows import row_arrays
-from engine.rays import RayBatch
-from engine.scene import Camera, View
-from engine.scene.seen import points_in_cam
-from engine.train.alignment import Motion, Rendered, aligned, photograph_of
-from engine.train.batches import grid_pixels
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint
-from engine.train.corrected_views import corrected, without_common
-from engine.train.pixel_sampler import view_sizes_px
-from engine.train.pose_refinement import RefinedPose
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.config import resolve_config
+from octasplat.engine.errors import Cancelled, ConfigError
+from octasplat.engine.events import Event, HeldOutMeasured, Warned, ignore
+from octasplat.engine.gaussians.rows import row_arrays
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.scene import Camera, View
+from octasplat.engine.scene.seen import points_in_cam
+from octasplat.engine.train.alignment import Motion, Rendered, aligned, photograph_of
+from octasplat.engine.train.batches import grid_pixels
+from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.corrected_views import corrected, without_common
+from octasplat.engine.train.pixel_sampler import view_sizes_px
+from octasplat.engine.train.pose_refinement import RefinedPose
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 SIDE_PX, FOCAL_PX, DISTANCE = 48, 52.0, 2.0
 WRONG_PX = 0.6

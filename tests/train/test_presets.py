@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from engine.config import resolve_config
-from engine.errors import ConfigError
-from engine.events import Event, HeldOutMeasured, TrainingProgress
-from engine.pipeline import reconstruct
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.shading.plain import PLAIN
-from engine.trace.cpu.tracer import CpuTracer
-from engine.train.batches import BatchSource
-from engine.train.config import LossWeights, TrainConfig, preset
-from engine.train.densify import make_densifier
-from engine.train.iteration import Machinery, differentiate, iterate
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.config import resolve_config
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.events import Event, HeldOutMeasured, TrainingProgress
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.train.batches import BatchSource
+from octasplat.engine.train.config import LossWeights, TrainConfig, preset
+from octasplat.engine.train.densify import make_densifier
+from octasplat.engine.train.iteration import Machinery, differentiate, iterate
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 
 def held_out_psnr(folder: Path, config: TrainConfig) -> tuple[list[float], Trainer]:

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from engine.gaussians.frames import frames_from_normals, quaternions
-from engine.gaussians.model import FlatGaussians
-from engine.shading.material_settings import MaterialSettings
-from engine.train.densify.propagating import propagate_normals
-from engine.train.initialise import with_first_materials
+from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.train.densify.propagating import propagate_normals
+from octasplat.engine.train.initialise import with_first_materials
 
 
 def scene(points: np.ndarray, normals: np.ndarray) -> FlatGaussians:

@@ -3,8 +3,8 @@
 import numpy as np
 from flat_world import FlatWorld
 
-from engine.trace.make import make_tracer
-from engine.train.sides import turn_outwards
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.train.sides import turn_outwards
 
 
 def test_what_is_seen_from_behind_is_turned_over() -> None:

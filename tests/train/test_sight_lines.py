@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.scene.cameras import Camera
-from engine.scene.model import Observations, SparsePoints
-from engine.trace.make import make_tracer
-from engine.train.batches import BatchSource
-from engine.train.config import LossWeights, TrainConfig
-from engine.train.sight_lines import SightLines, blocked_term
-from engine.train.state import fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.scene.cameras import Camera
+from octasplat.engine.scene.model import Observations, SparsePoints
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.train.batches import BatchSource
+from octasplat.engine.train.config import LossWeights, TrainConfig
+from octasplat.engine.train.sight_lines import SightLines, blocked_term
+from octasplat.engine.train.state import fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 
 class SeenWorld(FlatWorld):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from engine.events import Event, HeldOutMeasured, TrainingProgress
-from engine.gaussians.model import FlatGaussians
-from engine.scene import Dataset
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.train.fingerprint import run_fingerprint
-from engine.train.initialise import initial_gaussians
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.events import Event, HeldOutMeasured, TrainingProgress
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.train.fingerprint import run_fingerprint
+from octasplat.engine.train.initialise import initial_gaussians
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 
 def start() -> FlatGaussians:

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from engine.errors import Cancelled, TrainingFailure
-from engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.rows import row_arrays
-from engine.train.checkpoint import latest_checkpoint, load_checkpoint, save_best
-from engine.train.config import McmcConfig, PaperConfig, TrainConfig
-from engine.train.state import TrainState, fresh_state
-from engine.train.trainer import Trainer
+from octasplat.engine.errors import Cancelled, TrainingFailure
+from octasplat.engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import row_arrays
+from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint, save_best
+from octasplat.engine.train.config import McmcConfig, PaperConfig, TrainConfig
+from octasplat.engine.train.state import TrainState, fresh_state
+from octasplat.engine.train.trainer import Trainer
 
 
 def train(

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from engine.config import resolve_config
-from engine.errors import Cancelled
-from engine.events import CheckpointWritten, Event
-from engine.pipeline import reconstruct
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.train.within import Plan, choose_plan
+from octasplat.engine.config import resolve_config
+from octasplat.engine.errors import Cancelled
+from octasplat.engine.events import CheckpointWritten, Event
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.train.within import Plan, choose_plan
 
 
 def test_more_time_buys_gaussians_and_iterations_and_is_used_up() -> None:

@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 from psycopg.types.json import Jsonb
 
-from workers.cli.commands.fsck import fsck
-from workers.records.database import open_pool
-from workers.records.datasets import create_dataset, put_file
-from workers.store.local import LocalStorage
+from octasplat.workers.cli.commands.fsck import fsck
+from octasplat.workers.records.database import open_pool
+from octasplat.workers.records.datasets import create_dataset, put_file
+from octasplat.workers.store.local import LocalStorage
 
 
 def put(storage: LocalStorage, data: bytes, age_seconds: float = 0) -> str:

@@ -11,16 +11,16 @@ from typing import Any
 import pytest
 from psycopg.types.json import Jsonb
 
-from workers.queue.attempts import Attempt, Result, claim
-from workers.queue.jobs import NewJob, artifacts_of, change_job, create_job, get_job, retry_job
-from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.records.database import Connection, Pool, open_pool
-from workers.records.datasets import change_dataset, create_dataset, get_dataset, put_file
-from workers.records.rows import Job
-from workers.store.local import LocalStorage
-from workers.store.trees import Manifest, TreeFile, publish_manifest
-from workers.upkeep.collecting import collect
-from workers.upkeep.retention import Forgotten, Retention, forget_expired, set_expiries
+from octasplat.workers.queue.attempts import Attempt, Result, claim
+from octasplat.workers.queue.jobs import NewJob, artifacts_of, change_job, create_job, get_job, retry_job
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.records.database import Connection, Pool, open_pool
+from octasplat.workers.records.datasets import change_dataset, create_dataset, get_dataset, put_file
+from octasplat.workers.records.rows import Job
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.store.trees import Manifest, TreeFile, publish_manifest
+from octasplat.workers.upkeep.collecting import collect
+from octasplat.workers.upkeep.retention import Forgotten, Retention, forget_expired, set_expiries
 
 DAY, LONG_AGO = 86_400.0, 10 * 86_400.0
 KEEP = Retention(jobs_hours=100, jobs_hours_by_kind={"render": 1, "export": 0}, datasets_hours=50)

@@ -19,11 +19,11 @@ sys.path.append(str(Path(__file__).parents[1]))
 sys.path.append(str(Path(__file__).parents[1] / "tools"))
 from browser import PLAYWRIGHT, chromium
 from npm_packages import npm_folder
-from postgres_for_tests import copied_database, postgres, short_root, template
 from replay import Replay
 from web_bench import ROOT, Browse, Service, StartService
 
-from workers.postgres.embedded import EmbeddedPostgres
+from octasplat.workers.postgres.embedded import EmbeddedPostgres
+from postgres_for_tests import copied_database, postgres, short_root, template
 
 __all__ = ["postgres", "short_root", "template"]
 
@@ -51,7 +51,7 @@ def start_service(database: str, tmp_path_factory: pytest.TempPathFactory) -> It
             "DATABASE_URL": database,
             **{f"OCTASPLAT_{key}": value for key, value in given.items()},
         }
-        process = subprocess.Popen([sys.executable, "-m", "service"], env=environment, cwd=ROOT)
+        process = subprocess.Popen([sys.executable, "-m", "octasplat", "api"], env=environment, cwd=ROOT)
         processes.append(process)
         url = f"http://127.0.0.1:{port}"
         deadline = time.monotonic() + 240

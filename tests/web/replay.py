@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from workers.queue.attempts import Attempt, Result, claim
-from workers.queue.jobs import get_job
-from workers.records.database import open_pool
-from workers.store.local import LocalStorage
-from workers.telling.events import journal_progress
-from workers.work.media_types import media_type
+from octasplat.workers.queue.attempts import Attempt, Result, claim
+from octasplat.workers.queue.jobs import get_job
+from octasplat.workers.records.database import open_pool
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.telling.events import journal_progress
+from octasplat.workers.work.media_types import media_type
 
 LEFT_OUT = ("checkpoints", "cache")
 

@@ -3,9 +3,9 @@
 import json
 from itertools import chain
 
-from engine.train.preset_names import PRESETS
-from service.web.forms import Field, OptionsForm, options_form
-from workers.work.kinds import job_kinds, kind_named
+from octasplat.engine.train.preset_names import PRESETS
+from octasplat.service.web.forms import Field, OptionsForm, options_form
+from octasplat.workers.work.kinds import job_kinds, kind_named
 
 
 def fields_of(form: OptionsForm) -> dict[str, Field]:

@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner
 from web_bench import Browse, Service
 
-from engine.render.environment_map import write_environment
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from workers.cli.main import cli
+from octasplat.engine.render.environment_map import write_environment
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.workers.cli.main import cli
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 

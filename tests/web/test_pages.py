@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from web_bench import ROOT, Browse, Service, StartService
 
-from engine.light.stage_file import parse_stage
-from engine.render.path_file import read_camera_path
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.train.config import preset
+from octasplat.engine.light.stage_file import parse_stage
+from octasplat.engine.render.path_file import read_camera_path
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.train.config import preset
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 
@@ -78,7 +78,7 @@ def work(flow: Flow, database: str) -> Iterator[None]:
         **{f"OCTASPLAT_{key}": value for key, value in given.items()},
     }
     process = subprocess.Popen(
-        [sys.executable, "-m", "workers", "worker", "--queues", "cpu", "--name", "w"],
+        [sys.executable, "-m", "octasplat", "worker", "--queues", "cpu", "--name", "w"],
         cwd=ROOT,
         env=environment,
     )

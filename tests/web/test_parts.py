@@ -14,17 +14,17 @@ import httpx
 import pytest
 from web_bench import ROOT
 
-from service.app import create_app
-from service.settings import ServiceSettings
-from service.web import wording
-from service.web.results import downloads, measured
-from service.web.routing import local_address
-from workers.queue.jobs import NewJob, create_job
-from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.records.database import open_pool
-from workers.records.journal import add_event
-from workers.records.rows import Artifact, DatasetFile
-from workers.records.tokens import add_token
+from octasplat.service.app import create_app
+from octasplat.service.settings import ServiceSettings
+from octasplat.service.web import wording
+from octasplat.service.web.results import downloads, measured
+from octasplat.service.web.routing import local_address
+from octasplat.workers.queue.jobs import NewJob, create_job
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.records.database import open_pool
+from octasplat.workers.records.journal import add_event
+from octasplat.workers.records.rows import Artifact, DatasetFile
+from octasplat.workers.records.tokens import add_token
 
 HOSTILE = '"><img src=x onerror=alert(1)>'
 
@@ -196,7 +196,7 @@ def test_everybody_sees_their_own(talk: Callable[..., None], database: str) -> N
 
 
 def test_pages_cost_the_start_next_to_nothing() -> None:
-    code = "import service.app, sys; print(*sys.modules)"
+    code = "import octasplat.service.app, sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
     assert not loaded & {"torch", "numba", "pycolmap", "jinja2", "scipy", "embreex"}

@@ -14,22 +14,22 @@ from browser import Page, open_page, psnr
 from light_scenes import shiny_ball
 from shell_scene import our_view, shell_scene
 
-import service.web
-from engine.colour import to_bytes
-from engine.files.gaussian_ply import write_gaussian_ply
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
-from engine.light.environment import EnvironmentMap, environment_frame
-from engine.light.split_sum_relighting import SplitSumRelighter
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.environment_map import read_environment, write_environment
-from engine.render.renderer import background_colour, render_rays
-from engine.trace.cpu.tracer import CpuTracer
-from engine.trace.protocol import TraceSettings
+import octasplat.service.web as service_web
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.octagon import CHI2_2_99, CHI2_3_99
+from octasplat.engine.light.environment import EnvironmentMap, environment_frame
+from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.environment_map import read_environment, write_environment
+from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.trace.cpu.tracer import CpuTracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 
-STATIC = Path(service.web.__file__).parent / "static"
+STATIC = Path(service_web.__file__).parent / "static"
 SIDE_PX, FOV_DEGREES = 256, 40.0
 PAGE = """<!doctype html>
 <html><head><style>body { margin: 0; background: #000 } canvas { display: block }</style></head><body>

@@ -7,9 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engine.gaussians.frames import quaternions
-from engine.render.paths import look_at
-from service.web.cameras import MAX_VIEWS, CamerasUnreadable, PhotographPose, read_poses, viewer_cameras
+from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.render.paths import look_at
+from octasplat.service.web.cameras import (
+    MAX_VIEWS,
+    CamerasUnreadable,
+    PhotographPose,
+    read_poses,
+    viewer_cameras,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 CENTRES = [(3.0, 0.0, 1.0), (0.0, 3.0, 2.0), (-3.0, 0.5, 1.5), (0.5, -3.0, 0.7)]

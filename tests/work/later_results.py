@@ -2,7 +2,7 @@
 
 import toy_kind
 
-from engine import versions
+from octasplat.engine import versions
 
 versions.RESULTS = 2
 

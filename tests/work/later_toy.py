@@ -5,9 +5,9 @@ from dataclasses import replace
 import toy_kind
 from toy_kind import ToyOptions
 
-from workers.work.kinds import register
-from workers.work.kinds.table import _KINDS, validated
-from workers.work.task import Task
+from octasplat.workers.work.kinds import register
+from octasplat.workers.work.kinds.table import _KINDS, validated
+from octasplat.workers.work.task import Task
 
 
 class LaterOptions(ToyOptions):

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from workers.work.kinds import JobKind, register
-from workers.work.kinds.table import validated
-from workers.work.task import Task
+from octasplat.workers.work.kinds import JobKind, register
+from octasplat.workers.work.kinds.table import validated
+from octasplat.workers.work.task import Task
 
 
 class SpyOptions(BaseModel):

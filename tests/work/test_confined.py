@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from worker_bench import ROOT, Bench, wait_for_end
 
-from workers.client.api import Api
-from workers.isolation.abilities import abilities
+from octasplat.workers.client.api import Api
+from octasplat.workers.isolation.abilities import abilities
 
 pytestmark = pytest.mark.skipif(
     None in abilities().values(), reason="the kernel takes no part in isolating processes here"
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(
 READER = """
 import json, os, socket, subprocess, sys
 from pathlib import Path
-from workers.isolation.confining import confine
+from octasplat.workers.isolation.confining import confine
 confine(hidden=[Path(sys.argv[1])], read=[Path(sys.argv[1]) / "open"], may_start_processes=False,
         elsewhere_reads_only=True)
 import numpy
@@ -39,10 +39,10 @@ for name, attempt in tries.items():
 print(json.dumps(found))
 """
 WITHOUT_LANDLOCK = """
-from workers.isolation import filters
+from octasplat.workers.isolation import filters
 filters._DENIED = {"landlock_create_ruleset": (444, 444)}
 filters.filter_calls(may_start_processes=True)
-from workers.cli.main import main
+from octasplat.workers.cli.main import main
 main()
 """
 

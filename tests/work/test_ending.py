@@ -4,12 +4,12 @@ import asyncio
 
 import pytest
 
-import workers.ending
-from workers.ending import end
+from octasplat.workers import ending
+from octasplat.workers.ending import end
 
 
 def test_a_lost_cancellation_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers.ending, "AGAIN_SECONDS", 0.05)
+    monkeypatch.setattr(ending, "AGAIN_SECONDS", 0.05)
     lost = 0
 
     async def deaf() -> None:

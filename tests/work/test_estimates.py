@@ -2,10 +2,10 @@
 
 import pytest
 
-from engine.config import resolve_config
-from workers.records.sizes import Sizes
-from workers.work.kinds.estimates import Estimate, estimate_reconstruction
-from workers.work.kinds.options import ReconstructOptions
+from octasplat.engine.config import resolve_config
+from octasplat.workers.records.sizes import Sizes
+from octasplat.workers.work.kinds.estimates import Estimate, estimate_reconstruction
+from octasplat.workers.work.kinds.options import ReconstructOptions
 
 
 def estimated(preset: str, sizes: Sizes, *, materials: bool = False) -> Estimate:

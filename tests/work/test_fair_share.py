@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from worker_bench import Bench
 
-from workers.queue.jobs import queue_position
+from octasplat.workers.queue.jobs import queue_position
 
 
 @pytest.fixture

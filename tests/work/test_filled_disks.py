@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from small_disk import small_disk
 from worker_bench import Bench
 
-from workers.records.quotas import Quota, set_quota
+from octasplat.workers.records.quotas import Quota, set_quota
+from small_disk import small_disk
 
 MIB = 1 << 20
 

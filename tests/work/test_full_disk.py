@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from small_disk import fill, small_disk
 from worker_bench import PATIENCE_SECONDS, Bench
 
-from workers.store.local import LocalStorage
+from octasplat.workers.store.local import LocalStorage
+from small_disk import fill, small_disk
 
 MIB = 1 << 20
 

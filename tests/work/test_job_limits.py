@@ -9,7 +9,7 @@ import psutil
 import pytest
 from worker_bench import PATIENCE_SECONDS, Bench
 
-from workers.records.workers import live_workers
+from octasplat.workers.records.workers import live_workers
 
 
 @pytest.fixture

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from engine.config import ReconstructionConfig
-from engine.events import Event
-from engine.pipeline import Watcher, reconstruct
-from engine.rays import ImageRays, RayBatch
-from engine.scene import Dataset
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.shading.plain import PLAIN
-from engine.shading.protocol import ShadingModel
-from engine.trace.protocol import Tracer
-from workers.work import preview
-from workers.work.kinds.options import resolve_reconstruction
-from workers.work.preview import Previews, PreviewWritten
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.events import Event
+from octasplat.engine.pipeline import Watcher, reconstruct
+from octasplat.engine.rays import ImageRays, RayBatch
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.workers.work import preview
+from octasplat.workers.work.kinds.options import resolve_reconstruction
+from octasplat.workers.work.preview import Previews, PreviewWritten
 
 
 class Clock:

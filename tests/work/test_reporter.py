@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from workers.work import reporter
-from workers.work.reporter import Reporter
+from octasplat.workers.work import reporter
+from octasplat.workers.work.reporter import Reporter
 
 
 class SlowJournal:

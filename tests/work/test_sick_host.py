@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from worker_bench import PATIENCE_SECONDS, Bench
 
-from workers.records.workers import live_workers
+from octasplat.workers.records.workers import live_workers
 
 
 @pytest.fixture

@@ -12,16 +12,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from postgres_for_tests import copied_database
 from worker_bench import PATIENCE_SECONDS, ROOT, Bench
 
-from workers.postgres.embedded import EmbeddedPostgres
-from workers.queue.jobs import NewJob, cancel_job, create_job
-from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.records.database import Connection
-from workers.records.migrate import migrate
+from octasplat.workers.postgres.embedded import EmbeddedPostgres
+from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.records.database import Connection
+from octasplat.workers.records.migrate import migrate
+from postgres_for_tests import copied_database
 
-PREVIOUS = "8a6786e625c3"
+PREVIOUS = "5c70bad0"
 """The commit of the release before this one; it is installed from the repository."""
 STALE_SECONDS = 6.0
 """After which others take a dead worker's jobs, and by half of which a busy machine does not hold one up."""

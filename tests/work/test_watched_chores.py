@@ -14,13 +14,13 @@ import psycopg
 import pytest
 from worker_bench import PATIENCE_SECONDS, ROOT, Bench
 
-from workers.records.database import IDLE_SECONDS, STATEMENT_SECONDS, open_pool
-from workers.records.datasets import create_dataset, put_file
-from workers.records.workers import live_workers
+from octasplat.workers.records.database import IDLE_SECONDS, STATEMENT_SECONDS, open_pool
+from octasplat.workers.records.datasets import create_dataset, put_file
+from octasplat.workers.records.workers import live_workers
 
 FROZEN = """
 import asyncio, os, signal, sys, uuid
-import workers.records.database as database
+import octasplat.workers.records.database as database
 database.IDLE_SECONDS = 1
 database.TRANSACTION_SECONDS = 2
 

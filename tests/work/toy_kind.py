@@ -7,11 +7,11 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from engine.errors import Cancelled, DatasetError
-from engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted, Warned
-from workers.work.kinds import JobKind, register
-from workers.work.kinds.table import validated
-from workers.work.task import Task
+from octasplat.engine.errors import Cancelled, DatasetError
+from octasplat.engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted, Warned
+from octasplat.workers.work.kinds import JobKind, register
+from octasplat.workers.work.kinds.table import validated
+from octasplat.workers.work.task import Task
 
 if Path(os.environ.get("XDG_CACHE_HOME", "/nowhere"), "broken").exists():
     raise ImportError("a library is broken on this machine")

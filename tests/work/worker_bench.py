@@ -16,11 +16,11 @@ from typing import Any
 import psycopg
 from psycopg.rows import class_row
 
-from workers.queue.jobs import NewJob, artifacts_of, cancel_job, create_job, retry_job
-from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.records.database import Connection, naming, open_pool
-from workers.records.rows import Artifact, Job, JobEvent
-from workers.store.opening import open_storage
+from octasplat.workers.queue.jobs import NewJob, artifacts_of, cancel_job, create_job, retry_job
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.records.database import Connection, naming, open_pool
+from octasplat.workers.records.rows import Artifact, Job, JobEvent
+from octasplat.workers.store.opening import open_storage
 
 ROOT = Path(__file__).parents[2]
 FAST = {
@@ -72,12 +72,13 @@ class Bench:
             **os.environ,
             **{f"OCTASPLAT_{key}": value for key, value in given.items()},
             "DATABASE_URL": self.conninfo,
-            "PYTHONPATH": f"{root}{os.pathsep}{root / 'tests' / 'work'}",
+            "PYTHONPATH": os.pathsep.join(map(str, (root / "src", root, root / "tests" / "work"))),
             "OMP_NUM_THREADS": "1",
             "NUMBA_NUM_THREADS": "2",
             "A_SECRET_TOKEN": "must not reach the child",
         }
-        command = [sys.executable, "-m", "workers", "worker", "--queues", queues, "--name", name]
+        package = "octasplat" if (root / "src").exists() else "workers"  # until 0.1
+        command = [sys.executable, "-m", package, "worker", "--queues", queues, "--name", name]
         with (self.folder / f"{name}.log").open("ab") as log:
             process = subprocess.Popen(command, env=environment, cwd=root, stderr=log)
         self.processes.append(process)

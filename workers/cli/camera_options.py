@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from engine.render.names import names_by_number
-from workers.cli.options import F
+from octasplat.engine.render.names import names_by_number
+from octasplat.workers.cli.options import F
 
 AXES = ("x", "-x", "y", "-y", "z", "-z")
 

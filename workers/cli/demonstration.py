@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from engine.config import ReconstructionConfig, read_config, resolve_config
-from engine.errors import ConfigError
-from engine.run_folder import CONFIG
-from engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from engine.stages import counted_stage
-from workers.cli.progress import show_progress
-from workers.cli.reconstruction import run_reconstruction
-from workers.cli.signals import orderly_termination
+from octasplat.engine.config import ReconstructionConfig, read_config, resolve_config
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.run_folder import CONFIG
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.stages import counted_stage
+from octasplat.workers.cli.progress import show_progress
+from octasplat.workers.cli.reconstruction import run_reconstruction
+from octasplat.workers.cli.signals import orderly_termination
 
 DEMO_ASSIGNMENTS: dict[str, tuple[str, ...]] = {"fast": ("iterations=2000",)}
 """Training settings by preset, chosen so that the demo takes less than three minutes on two cores."""
@@ -46,7 +46,7 @@ def reconstruct_scene(scene: Path, output: Path, preset: str, *, threads: int, q
 
     Raises:
         Stopped: by a signal, after a checkpoint.
-        OctasplatError: as :func:`engine.pipeline.reconstruct` does.
+        OctasplatError: as :func:`octasplat.engine.pipeline.reconstruct` does.
     """
     config = resolve_config(preset, assignments=DEMO_ASSIGNMENTS.get(preset, ()))
     resume = (output / CONFIG).exists()

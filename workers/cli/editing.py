@@ -11,14 +11,14 @@ import click
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from engine.edit.deform import DeformReport, deform_to, deformation_corners
-from engine.edit.recovery import EditOptions, EditReport, recover_edit
-from engine.errors import ConfigError, SceneFileError
-from engine.files import ExportOptions, Mesh, export_scene, exporter_for, read_facts, read_mesh
-from engine.gaussians.model import FlatGaussians
-from engine.gaussians.scene_facts import SceneFacts
-from engine.writing import write_json
-from workers.cli.scene_files import open_scene, warn_of_losses
+from octasplat.engine.edit.deform import DeformReport, deform_to, deformation_corners
+from octasplat.engine.edit.recovery import EditOptions, EditReport, recover_edit
+from octasplat.engine.errors import ConfigError, SceneFileError
+from octasplat.engine.files import ExportOptions, Mesh, export_scene, exporter_for, read_facts, read_mesh
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.writing import write_json
+from octasplat.workers.cli.scene_files import open_scene, warn_of_losses
 
 Say = Callable[[str], None]
 
@@ -219,7 +219,7 @@ def run_deform(
     Raises:
         OctasplatError: something cannot be read or written, or the proxies are not the same mesh.
     """
-    from engine.edit.proxy import bind
+    from octasplat.engine.edit.proxy import bind
 
     paths = mesh_paths(deformed)
     targets = targets_for(output, paths, [source, proxy_path, *paths])
@@ -273,7 +273,7 @@ def deform_lines(path: Path, report: DeformReport) -> list[str]:
 
 
 def _as_proxy(path: Path, mesh: Mesh, axes: str, mirrored: bool | None) -> Any:
-    from engine.edit.proxy import Proxy
+    from octasplat.engine.edit.proxy import Proxy
 
     try:
         return Proxy(_turned(mesh, axes), mesh.triangles, mirrored)
@@ -282,7 +282,7 @@ def _as_proxy(path: Path, mesh: Mesh, axes: str, mirrored: bool | None) -> Any:
 
 
 def _turned(mesh: Mesh, axes: str) -> Any:
-    from engine.edit.axes import TURNS
+    from octasplat.engine.edit.axes import TURNS
 
     return mesh.vertices @ {str(name): turn for name, turn in TURNS.items()}[axes].T
 

@@ -10,35 +10,35 @@ from typing import Any, NoReturn
 
 import click
 
-import engine
-from engine.errors import OctasplatError
-from workers.cli.commands.backup import backup, restore
-from workers.cli.commands.clean import clean
-from workers.cli.commands.client import COMMANDS as CLIENT_COMMANDS
-from workers.cli.commands.crop import crop
-from workers.cli.commands.deform import deform
-from workers.cli.commands.demo import demo
-from workers.cli.commands.edit import edit
-from workers.cli.commands.evaluate import evaluate
-from workers.cli.commands.export import export
-from workers.cli.commands.fsck import fsck
-from workers.cli.commands.import_ import import_
-from workers.cli.commands.info import info
-from workers.cli.commands.material import material
-from workers.cli.commands.merge import merge
-from workers.cli.commands.migrate import migrate
-from workers.cli.commands.open import open_page
-from workers.cli.commands.quota import quota
-from workers.cli.commands.reconstruct import reconstruct
-from workers.cli.commands.relight import relight
-from workers.cli.commands.render import render
-from workers.cli.commands.serve import serve
-from workers.cli.commands.stage import stage
-from workers.cli.commands.surface import surface
-from workers.cli.commands.token import token
-from workers.cli.commands.transform import transform
-from workers.cli.commands.worker import worker
-from workers.cli.signals import Stopped
+from octasplat.engine import __version__
+from octasplat.engine.errors import OctasplatError
+from octasplat.workers.cli.commands.backup import backup, restore
+from octasplat.workers.cli.commands.clean import clean
+from octasplat.workers.cli.commands.client import COMMANDS as CLIENT_COMMANDS
+from octasplat.workers.cli.commands.crop import crop
+from octasplat.workers.cli.commands.deform import deform
+from octasplat.workers.cli.commands.demo import demo
+from octasplat.workers.cli.commands.edit import edit
+from octasplat.workers.cli.commands.evaluate import evaluate
+from octasplat.workers.cli.commands.export import export
+from octasplat.workers.cli.commands.fsck import fsck
+from octasplat.workers.cli.commands.import_ import import_
+from octasplat.workers.cli.commands.info import info
+from octasplat.workers.cli.commands.material import material
+from octasplat.workers.cli.commands.merge import merge
+from octasplat.workers.cli.commands.migrate import migrate
+from octasplat.workers.cli.commands.open import open_page
+from octasplat.workers.cli.commands.quota import quota
+from octasplat.workers.cli.commands.reconstruct import reconstruct
+from octasplat.workers.cli.commands.relight import relight
+from octasplat.workers.cli.commands.render import render
+from octasplat.workers.cli.commands.serve import serve
+from octasplat.workers.cli.commands.stage import stage
+from octasplat.workers.cli.commands.surface import surface
+from octasplat.workers.cli.commands.token import token
+from octasplat.workers.cli.commands.transform import transform
+from octasplat.workers.cli.commands.worker import worker
+from octasplat.workers.cli.signals import Stopped
 
 # Threads that wait for each other sleep instead of spinning: no slower alone, several times faster on a
 # shared machine. Must be set before OpenMP is loaded; an explicit setting wins.
@@ -83,7 +83,7 @@ def _fail(ctx: click.Context, message: str, exit_code: int) -> NoReturn:
 @click.group(
     cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
-@click.version_option(engine.__version__, "--version", prog_name="octasplat")
+@click.version_option(__version__, "--version", prog_name="octasplat")
 def cli() -> None:
     """Reconstruct scenes of flat Gaussians from photographs with COLMAP poses, on an ordinary CPU.
 

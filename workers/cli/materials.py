@@ -5,22 +5,22 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from engine.edit.choices import MaterialChange, Selection
-from engine.edit.masked import under_masks
-from engine.edit.material_run import (
+from octasplat.engine.edit.choices import MaterialChange, Selection
+from octasplat.engine.edit.masked import under_masks
+from octasplat.engine.edit.material_run import (
     change_materials,
     check_new_run,
     edit_note,
     follows,
     write_changed_run,
 )
-from engine.edit.selection import chosen_by, in_mesh
-from engine.errors import ConfigError
-from engine.files import read_facts, read_mesh
-from engine.gaussians.materials import MATERIAL_WIDTHS, require_materials
-from engine.run_folder import SCENE, is_run
-from workers.cli.editing import checked_options, speaker, targets_for, write_scene
-from workers.cli.scene_files import open_scene
+from octasplat.engine.edit.selection import chosen_by, in_mesh
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.files import read_facts, read_mesh
+from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS, require_materials
+from octasplat.engine.run_folder import SCENE, is_run
+from octasplat.workers.cli.editing import checked_options, speaker, targets_for, write_scene
+from octasplat.workers.cli.scene_files import open_scene
 
 
 def run_material(options: dict[str, Any]) -> None:

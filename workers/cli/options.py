@@ -6,8 +6,8 @@ from typing import Any, TypeVar
 
 import click
 
-from engine.errors import ConfigError
-from engine.threads import available_threads
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.threads import available_threads
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -34,7 +34,7 @@ def quiet_option(command: F) -> F:
 
 
 def selection_options(command: F) -> F:
-    """The fields of :class:`engine.edit.selection.Selection`."""
+    """The fields of :class:`octasplat.engine.edit.selection.Selection`."""
     for option in reversed(_SELECTION):
         command = option(command)
     return command
@@ -83,7 +83,7 @@ def export_names(text: str | None) -> tuple[str, ...] | None:
     Raises:
         ConfigError: one of them is no name of a result.
     """
-    from workers.work.kinds.options import check_export_name
+    from octasplat.workers.work.kinds.options import check_export_name
 
     if text is None:
         return None

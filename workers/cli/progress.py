@@ -9,7 +9,7 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
-from engine.events import (
+from octasplat.engine.events import (
     Event,
     Listener,
     StageFinished,
@@ -18,9 +18,9 @@ from engine.events import (
     TrainingProgress,
     Warned,
 )
-from engine.stages import DOING
-from workers.telling.lines import PlainLines, StageState
-from workers.telling.wording import clock, training_state
+from octasplat.engine.stages import DOING
+from octasplat.workers.telling.lines import PlainLines, StageState
+from octasplat.workers.telling.wording import clock, training_state
 
 _STOPPING = "Stopping at the next safe point; press Ctrl-C again to stop at once."
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import click
 
-from engine.config import ReconstructionConfig
-from engine.errors import Cancelled, ExportFailed, NoSpaceLeft
-from engine.pipeline import reconstruct
-from engine.stages import stopping
-from workers.cli.progress import show_progress
-from workers.cli.signals import Stopped, stop_on_signals
-from workers.telling.wording import run_summary
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.errors import Cancelled, ExportFailed, NoSpaceLeft
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.stages import stopping
+from octasplat.workers.cli.progress import show_progress
+from octasplat.workers.cli.signals import Stopped, stop_on_signals
+from octasplat.workers.telling.wording import run_summary
 
 
 def run_reconstruction(
@@ -30,7 +30,7 @@ def run_reconstruction(
     Raises:
         Stopped: by SIGINT or SIGTERM, after a checkpoint.
         ExportFailed: some files could not be written; what there is was shown.
-        OctasplatError: as :func:`engine.pipeline.reconstruct` does.
+        OctasplatError: as :func:`octasplat.engine.pipeline.reconstruct` does.
     """
     with stop_on_signals() as should_stop:
         try:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import click
 
-from engine.files import export_losses
-from engine.gaussians.model import FlatGaussians
-from workers.telling.losses import open_scene as read_telling
+from octasplat.engine.files import export_losses
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.workers.telling.losses import open_scene as read_telling
 
 
 def open_scene(path: Path, *, drop_invalid: bool = False, quiet: bool = False) -> FlatGaussians:

@@ -5,11 +5,11 @@ from typing import Any
 
 import click
 
-from workers.cli.progress import show_progress
-from workers.client import submission
-from workers.client.api import Api
-from workers.client.submission import Derivation, JobFailed, Submission
-from workers.telling.wording import run_summary
+from octasplat.workers.cli.progress import show_progress
+from octasplat.workers.client import submission
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.submission import Derivation, JobFailed, Submission
+from octasplat.workers.telling.wording import run_summary
 
 DEMO_OUTPUT = Path("octasplat-demo")
 
@@ -79,7 +79,7 @@ def run_demo(api: Api, output: Path = DEMO_OUTPUT) -> None:
         api: the service.
         output: folder for the scene and the result.
     """
-    from workers.cli.demonstration import make_scene
+    from octasplat.workers.cli.demonstration import make_scene
 
     scene = output / "scene"
     make_scene(scene, {}, quiet=False)

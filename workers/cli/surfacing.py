@@ -12,16 +12,16 @@ import numpy as np
 from jaxtyping import UInt8
 from pydantic import ValidationError
 
-from engine.colour import to_bytes
-from engine.config import read_config
-from engine.errors import ConfigError, DatasetError, OutputError
-from engine.events import Listener
-from engine.files import check_surface_path, read_facts, write_surface
-from engine.gaussians.materials import require_materials
-from engine.gaussians.model import FlatGaussians
-from engine.rays import ImageRays
-from engine.render.cameras import RenderCamera
-from engine.run_folder import (
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.config import read_config
+from octasplat.engine.errors import ConfigError, DatasetError, OutputError
+from octasplat.engine.events import Listener
+from octasplat.engine.files import check_surface_path, read_facts, write_surface
+from octasplat.engine.gaussians.materials import require_materials
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.run_folder import (
     CONFIG,
     ENVIRONMENT,
     SCENE,
@@ -32,20 +32,20 @@ from engine.run_folder import (
     run_exposures,
     run_viewpoints,
 )
-from engine.scene import Dataset, load_scene
-from engine.shading.environment_frame import environment_frame
-from engine.shading.exposure import Exposures
-from engine.surface.cameras import cameras_around, photograph_cameras
-from engine.surface.extract import ExtractedSurface, extract_levels
-from engine.surface.fitting import Picture
-from engine.surface.materials import material_features
-from engine.surface.options import SurfaceOptions
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceSettings
-from engine.writing import replacing
-from workers.cli.progress import show_progress
-from workers.cli.scene_files import open_scene
-from workers.rendering.cameras import light_up
+from octasplat.engine.scene import Dataset, load_scene
+from octasplat.engine.shading.environment_frame import environment_frame
+from octasplat.engine.shading.exposure import Exposures
+from octasplat.engine.surface.cameras import cameras_around, photograph_cameras
+from octasplat.engine.surface.extract import ExtractedSurface, extract_levels
+from octasplat.engine.surface.fitting import Picture
+from octasplat.engine.surface.materials import material_features
+from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.engine.writing import replacing
+from octasplat.workers.cli.progress import show_progress
+from octasplat.workers.cli.scene_files import open_scene
+from octasplat.workers.rendering.cameras import light_up
 
 MATERIAL_DEFAULTS = {"texture_side": 1024, "max_triangles": 60_000}
 """With materials, where nothing else is said."""

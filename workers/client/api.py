@@ -10,8 +10,8 @@ from typing import Any, Self
 
 import httpx
 
-from engine.errors import OctasplatError
-from workers.settings import ADDRESS_FILE, TOKEN_FILE, default_data_folder
+from octasplat.engine.errors import OctasplatError
+from octasplat.workers.settings import ADDRESS_FILE, TOKEN_FILE, default_data_folder
 
 DEFAULT_ADDRESS = "http://127.0.0.1:8642"
 SERVER, TOKEN, DATA = "OCTASPLAT_SERVER", "OCTASPLAT_TOKEN", "OCTASPLAT_DATA"

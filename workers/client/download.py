@@ -8,9 +8,9 @@ from typing import Any
 
 import httpx
 
-from engine.errors import OutputError
-from workers.client.api import TRIES, Api, ServiceError, check_stream
-from workers.store.names import NameSet
+from octasplat.engine.errors import OutputError
+from octasplat.workers.client.api import TRIES, Api, ServiceError, check_stream
+from octasplat.workers.store.names import NameSet
 
 
 def download_results(

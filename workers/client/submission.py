@@ -6,16 +6,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from engine.errors import ConfigError, OctasplatError
-from engine.events import Listener, Warned, ignore
-from engine.light.companions import companions
-from engine.light.stage_file import named_files, read_stage, with_files
-from engine.stages import counted_stage
-from workers.client.api import Api
-from workers.client.download import download_results
-from workers.client.upload import upload_files, upload_scene
-from workers.client.watch import watch_job
-from workers.store.names import NameRefused, check_name
+from octasplat.engine.errors import ConfigError, OctasplatError
+from octasplat.engine.events import Listener, Warned, ignore
+from octasplat.engine.light.companions import companions
+from octasplat.engine.light.stage_file import named_files, read_stage, with_files
+from octasplat.engine.stages import counted_stage
+from octasplat.workers.client.api import Api
+from octasplat.workers.client.download import download_results
+from octasplat.workers.client.upload import upload_files, upload_scene
+from octasplat.workers.client.watch import watch_job
+from octasplat.workers.store.names import NameRefused, check_name
 
 
 class JobFailed(OctasplatError):

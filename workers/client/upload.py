@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engine.errors import DatasetError
-from workers.client.api import Api, ServiceError
+from octasplat.engine.errors import DatasetError
+from octasplat.workers.client.api import Api, ServiceError
 
 PARALLEL = 4
 _PIECE_BYTES = 1 << 20

@@ -7,9 +7,9 @@ from typing import Any
 
 import httpx
 
-from engine.events import Listener
-from workers.client.api import Api, Unreachable, check_stream
-from workers.telling.events import TOLD_KINDS, told_event
+from octasplat.engine.events import Listener
+from octasplat.workers.client.api import Api, Unreachable, check_stream
+from octasplat.workers.telling.events import TOLD_KINDS, told_event
 
 TERMINAL = frozenset({"succeeded", "failed", "canceled"})
 _PATIENCE_SECONDS = 120.0

@@ -3,9 +3,9 @@
 import logging
 import os
 
-from workers.isolation.filters import can_filter
-from workers.isolation.folders import landlock_version
-from workers.isolation.kernel import IS_LINUX
+from octasplat.workers.isolation.filters import can_filter
+from octasplat.workers.isolation.folders import landlock_version
+from octasplat.workers.isolation.kernel import IS_LINUX
 
 logger = logging.getLogger(__name__)
 

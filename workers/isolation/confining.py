@@ -9,10 +9,10 @@ from pathlib import Path
 
 import psutil
 
-from workers.isolation.filters import filter_calls
-from workers.isolation.folders import hide_folders
-from workers.isolation.hiding import hide_memory
-from workers.isolation.kernel import (
+from octasplat.workers.isolation.filters import filter_calls
+from octasplat.workers.isolation.folders import hide_folders
+from octasplat.workers.isolation.hiding import hide_memory
+from octasplat.workers.isolation.kernel import (
     IS_LINUX,
     PR_CAPBSET_DROP,
     PR_SET_NO_NEW_PRIVS,
@@ -40,7 +40,7 @@ def confine(
     """Give up rights, for good; whatever the kernel does not take part in is left.
 
     Args:
-        hidden: folders that cannot be opened, see :func:`workers.isolation.folders.hide_folders`.
+        hidden: folders that cannot be opened, see :func:`octasplat.workers.isolation.folders.hide_folders`.
         written: what can be written all the same.
         read: what can be read all the same.
         may_start_processes: whether other programs can be started, which have no more rights.

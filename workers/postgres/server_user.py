@@ -6,8 +6,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from workers.postgres.binaries import PostgresBinaries
-from workers.records.errors import DatabaseError
+from octasplat.workers.postgres.binaries import PostgresBinaries
+from octasplat.workers.records.errors import DatabaseError
 
 _CANDIDATES = ("octasplat", "postgres", "nobody")
 

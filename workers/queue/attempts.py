@@ -12,13 +12,13 @@ from typing import Any
 
 from psycopg.types.json import Jsonb
 
-from workers.queue.jobs import get_job, queue_again
-from workers.queue.port import Slips
-from workers.queue.storing import Note
-from workers.records.database import Connection, Pool
-from workers.records.journal import add_event, add_log_lines, trim_log
-from workers.records.quotas import NO_QUOTA, Quota, check_bytes
-from workers.records.rows import Job
+from octasplat.workers.queue.jobs import get_job, queue_again
+from octasplat.workers.queue.port import Slips
+from octasplat.workers.queue.storing import Note
+from octasplat.workers.records.database import Connection, Pool
+from octasplat.workers.records.journal import add_event, add_log_lines, trim_log
+from octasplat.workers.records.quotas import NO_QUOTA, Quota, check_bytes
+from octasplat.workers.records.rows import Job
 
 MAX_RESCUES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""

@@ -8,10 +8,10 @@ import uuid
 
 from psycopg.rows import class_row
 
-from workers.queue.jobs import get_job, queue_again
-from workers.queue.port import Slips
-from workers.records.database import Connection, Pool, naming
-from workers.records.rows import Job
+from octasplat.workers.queue.jobs import get_job, queue_again
+from octasplat.workers.queue.port import Slips
+from octasplat.workers.records.database import Connection, Pool, naming
+from octasplat.workers.records.rows import Job
 
 _TRIED = 30
 

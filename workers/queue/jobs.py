@@ -11,12 +11,12 @@ from typing import Any
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from workers.queue.port import QueueDepth, Slips
-from workers.records.database import Connection, naming
-from workers.records.errors import Conflict, Missing
-from workers.records.ids import new_id
-from workers.records.journal import add_event
-from workers.records.rows import Artifact, Job
+from octasplat.workers.queue.port import QueueDepth, Slips
+from octasplat.workers.records.database import Connection, naming
+from octasplat.workers.records.errors import Conflict, Missing
+from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.journal import add_event
+from octasplat.workers.records.rows import Artifact, Job
 
 LOCK_SECONDS = 10
 """A transaction that has locked a job and falls silent for so long is undone; its process is gone."""
@@ -24,7 +24,7 @@ LOCK_SECONDS = 10
 
 @dataclass(frozen=True)
 class NewJob:
-    """What a job is made from; see :class:`workers.records.rows.Job`."""
+    """What a job is made from; see :class:`octasplat.workers.records.rows.Job`."""
 
     owner: str
     kind: str

@@ -6,11 +6,11 @@ from typing import Any
 
 from psycopg.rows import class_row
 
-from workers.queue.attempts import end_job
-from workers.queue.jobs import get_job
-from workers.queue.port import Slips
-from workers.records.database import Connection, Pool, naming
-from workers.records.rows import TERMINAL, Job
+from octasplat.workers.queue.attempts import end_job
+from octasplat.workers.queue.jobs import get_job
+from octasplat.workers.queue.port import Slips
+from octasplat.workers.records.database import Connection, Pool, naming
+from octasplat.workers.records.rows import TERMINAL, Job
 
 
 async def seconds_spent(connection: Connection, job: Job) -> float:

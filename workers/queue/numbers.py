@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from workers.queue.jobs import queue_depths, running_by_queue
-from workers.queue.port import QueueDepth
-from workers.records.database import Connection
+from octasplat.workers.queue.jobs import queue_depths, running_by_queue
+from octasplat.workers.queue.port import QueueDepth
+from octasplat.workers.records.database import Connection
 
 TOTALS = ("attempts", "rescues", "poisoned", "succeeded", "failed", "canceled")
 

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from workers.records.database import Connection
+from octasplat.workers.records.database import Connection
 
 Deliver = Callable[[uuid.UUID, int], Awaitable[None]]
 """Called with the job's id and the slip's number; when it returns the slip is done with."""

@@ -8,8 +8,8 @@ import procrastinate
 from procrastinate.manager import JobManager
 from procrastinate.worker import Worker
 
-from workers.queue.port import Deliver
-from workers.records.database import Connection, Pool
+from octasplat.workers.queue.port import Deliver
+from octasplat.workers.records.database import Connection, Pool
 
 TASK = "octasplat.run_job"
 _RETURNS = 4096

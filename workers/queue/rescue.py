@@ -4,11 +4,11 @@ import logging
 
 from psycopg.rows import class_row
 
-from workers.queue.attempts import rescue
-from workers.queue.jobs import get_job, queue_again
-from workers.queue.port import Slips
-from workers.records.database import Pool, naming
-from workers.records.rows import Job
+from octasplat.workers.queue.attempts import rescue
+from octasplat.workers.queue.jobs import get_job, queue_again
+from octasplat.workers.queue.port import Slips
+from octasplat.workers.records.database import Pool, naming
+from octasplat.workers.records.rows import Job
 
 logger = logging.getLogger(__name__)
 

@@ -15,10 +15,10 @@ from datetime import datetime
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from workers.records.database import Connection, Pool
-from workers.records.ids import new_id
-from workers.store.errors import BlobMissing, StorageUnavailable
-from workers.store.protocol import Storage
+from octasplat.workers.records.database import Connection, Pool
+from octasplat.workers.records.ids import new_id
+from octasplat.workers.store.errors import BlobMissing, StorageUnavailable
+from octasplat.workers.store.protocol import Storage
 
 logger = logging.getLogger(__name__)
 

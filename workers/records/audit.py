@@ -6,7 +6,7 @@ from datetime import datetime
 
 from psycopg.rows import class_row
 
-from workers.records.database import Connection, naming
+from octasplat.workers.records.database import Connection, naming
 
 _MOST_CHARACTERS = 500
 

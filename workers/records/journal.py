@@ -7,8 +7,8 @@ from typing import Any
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from workers.records.database import Connection, naming
-from workers.records.rows import JobEvent, LogLine
+from octasplat.workers.records.database import Connection, naming
+from octasplat.workers.records.rows import JobEvent, LogLine
 
 CHANNEL = "octasplat_events"
 """Notifications on this channel carry the id of the job that has a new event."""

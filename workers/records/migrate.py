@@ -13,7 +13,7 @@ from importlib.resources.abc import Traversable
 
 import psycopg
 
-from workers.records.errors import DatabaseError
+from octasplat.workers.records.errors import DatabaseError
 
 OURS, QUEUE = "octasplat", "procrastinate"
 OLDEST_SERVER = 140000
@@ -106,7 +106,7 @@ def missing_steps(applied: set[tuple[str, str]]) -> list[str]:
 
 def all_steps() -> tuple[Step, ...]:
     """Every step of this version, in order."""
-    return (*queue_steps(), *_steps(OURS, resources.files("workers.records") / "migrations"))
+    return (*queue_steps(), *_steps(OURS, resources.files("octasplat.workers.records") / "migrations"))
 
 
 def queue_steps() -> tuple[Step, ...]:

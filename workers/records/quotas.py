@@ -12,8 +12,8 @@ from typing import Literal, LiteralString
 
 from psycopg.rows import class_row
 
-from engine.errors import OctasplatError
-from workers.records.database import Connection
+from octasplat.engine.errors import OctasplatError
+from octasplat.workers.records.database import Connection
 
 _LOCK = 0x71756F74  # "quot"
 

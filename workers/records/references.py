@@ -3,8 +3,8 @@
 from collections.abc import AsyncIterator
 from typing import Any
 
-from workers.records.database import Connection
-from workers.store.fsck import Reference
+from octasplat.workers.records.database import Connection
+from octasplat.workers.store.fsck import Reference
 
 
 async def references(connection: Connection) -> AsyncIterator[Reference]:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 from psycopg.rows import class_row
 
-from workers.records.database import Connection, naming
-from workers.records.ids import new_id
-from workers.records.rows import Token
-from workers.records.tokens import hash_secret
+from octasplat.workers.records.database import Connection, naming
+from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.rows import Token
+from octasplat.workers.records.tokens import hash_secret
 
 LINK_SECONDS = 300.0
 KEEP_DAYS = 30

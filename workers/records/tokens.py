@@ -8,9 +8,9 @@ from typing import Literal
 
 from psycopg.rows import class_row
 
-from workers.records.database import Connection, naming
-from workers.records.ids import new_id
-from workers.records.rows import Token
+from octasplat.workers.records.database import Connection, naming
+from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.rows import Token
 
 PREFIX = "octa_"
 SCOPES = ("read", "write", "admin")

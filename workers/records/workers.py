@@ -7,8 +7,8 @@ from typing import Any
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from workers.records.database import Connection, naming
-from workers.records.rows import WorkerRow
+from octasplat.workers.records.database import Connection, naming
+from octasplat.workers.records.rows import WorkerRow
 
 
 async def see_worker(

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from engine.config import read_config
-from engine.gaussians.model import FlatGaussians
-from engine.render.cameras import RenderCamera, focal_from_fov
-from engine.render.jobs import (
+from octasplat.engine.config import read_config
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
+from octasplat.engine.render.jobs import (
     DEFAULT_FOV_Y_DEGREES,
     ELEVATION_DEGREES,
     gaussian_turntable,
@@ -18,9 +18,9 @@ from engine.render.jobs import (
     scene_turntable,
     turntable_cameras,
 )
-from engine.render.paths import Turntable, look_at
-from engine.run_folder import CONFIG, is_run
-from engine.scene.model import Viewpoints
+from octasplat.engine.render.paths import Turntable, look_at
+from octasplat.engine.run_folder import CONFIG, is_run
+from octasplat.engine.scene.model import Viewpoints
 
 DEFAULT_FPS = 30.0
 DEFAULT_FRAMES = 120

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.evaluate.scene_facts import HitFacts, SceneFacts, hit_facts, scene_facts
-from engine.render.jobs import turntable_cameras
-from engine.render.renderer import render_rays
-from engine.surface.cameras import photograph_cameras
-from engine.trace.make import make_tracer
-from workers.rendering.stages import StagePlace
+from octasplat.engine.evaluate.scene_facts import HitFacts, SceneFacts, hit_facts, scene_facts
+from octasplat.engine.render.jobs import turntable_cameras
+from octasplat.engine.render.renderer import render_rays
+from octasplat.engine.surface.cameras import photograph_cameras
+from octasplat.engine.trace.make import make_tracer
+from octasplat.workers.rendering.stages import StagePlace
 
 SIDE_PX = 160
 

@@ -9,26 +9,26 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.colour import linear_to_srgb, srgb_to_linear
-from engine.config import read_config
-from engine.errors import ConfigError
-from engine.events import Listener
-from engine.gaussians.materials import require_materials
-from engine.light.environment import EnvironmentMap, environment_frame
-from engine.light.relighting import PathRelighter, Relighter, surroundings
-from engine.light.split_sum_relighting import SplitSumRelighter
-from engine.light.stage import Integrator
-from engine.render.environment_map import read_environment
-from engine.render.identity import identity_of
-from engine.render.images import write_exr, write_png
-from engine.render.jobs import Shot, camera_shots, view_shots
-from engine.render.path_file import read_camera_path
-from engine.render.renderer import background_colour
-from engine.run_folder import CONFIG, SCENE, is_run
-from engine.scene import load_scene
-from engine.shading.material_settings import MaterialSettings
-from workers.rendering.cameras import DEFAULT_FPS, cameras_of_options, light_up
-from workers.rendering.views import Keeping, Series, Source, check_one_file, read_source, run_shots
+from octasplat.engine.colour import linear_to_srgb, srgb_to_linear
+from octasplat.engine.config import read_config
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.events import Listener
+from octasplat.engine.gaussians.materials import require_materials
+from octasplat.engine.light.environment import EnvironmentMap, environment_frame
+from octasplat.engine.light.relighting import PathRelighter, Relighter, surroundings
+from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
+from octasplat.engine.light.stage import Integrator
+from octasplat.engine.render.environment_map import read_environment
+from octasplat.engine.render.identity import identity_of
+from octasplat.engine.render.images import write_exr, write_png
+from octasplat.engine.render.jobs import Shot, camera_shots, view_shots
+from octasplat.engine.render.path_file import read_camera_path
+from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.run_folder import CONFIG, SCENE, is_run
+from octasplat.engine.scene import load_scene
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.workers.rendering.cameras import DEFAULT_FPS, cameras_of_options, light_up
+from octasplat.workers.rendering.views import Keeping, Series, Source, check_one_file, read_source, run_shots
 
 _FRESH = Keeping()
 _OF_THE_PICTURES = (

@@ -7,23 +7,23 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from engine.colour import srgb_to_linear
-from engine.errors import ConfigError, OutputError
-from engine.events import Listener
-from engine.gaussians.model import FlatGaussians
-from engine.light.integrator import LitScene, PathTracer
-from engine.light.layers import stage_layers
-from engine.light.placing import rested, scene_facts
-from engine.light.rendering import refuse_cameras_in_glass, render_preview, stage_paint
-from engine.light.stage import Integrator, Stage
-from engine.light.stage_file import StageFacts, write_first_stage
-from engine.light.staging import stage_meshes
-from engine.render.jobs import Paint, Shot, gaussian_turntable, scene_turntable
-from engine.render.paths import Turntable
-from engine.scene.model import Viewpoints
-from engine.stages import counted_stage
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.events import Listener
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.integrator import LitScene, PathTracer
+from octasplat.engine.light.layers import stage_layers
+from octasplat.engine.light.placing import rested, scene_facts
+from octasplat.engine.light.rendering import refuse_cameras_in_glass, render_preview, stage_paint
+from octasplat.engine.light.stage import Integrator, Stage
+from octasplat.engine.light.stage_file import StageFacts, write_first_stage
+from octasplat.engine.light.staging import stage_meshes
+from octasplat.engine.render.jobs import Paint, Shot, gaussian_turntable, scene_turntable
+from octasplat.engine.render.paths import Turntable
+from octasplat.engine.scene.model import Viewpoints
+from octasplat.engine.stages import counted_stage
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
 
 SIZE_OF_RADIUS = 0.4
 """What the cameras look at is about this share of their distance from the axis they turn about."""

@@ -9,33 +9,40 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from engine.config import read_config
-from engine.errors import ConfigError, OutputError
-from engine.events import Listener
-from engine.files import read_facts
-from engine.files.gaussian_ply import read_gaussian_ply
-from engine.gaussians.model import FlatGaussians
-from engine.light.companions import companions
-from engine.light.stage import Stage
-from engine.light.stage_file import named_files
-from engine.render.identity import identity_of
-from engine.render.jobs import Paint, Shot, camera_shots, gaussian_turntable, scene_paint, view_shots
-from engine.render.kept import RECORD, KeptImages
-from engine.render.names import names_by_number
-from engine.render.path_file import read_camera_path
-from engine.render.renderer import background_colour
-from engine.render.series import Kept, render_film, render_series
-from engine.run_folder import CONFIG, SCENE, is_run, run_background, run_viewpoints
-from engine.scene.model import Viewpoints
-from engine.scene.views_file import SplitViewpoints
-from engine.shading.learnt_background import LearntBackground
-from engine.shading.plain import PLAIN
-from engine.stages import counted_stage
-from engine.trace.make import make_tracer
-from engine.trace.protocol import TraceSettings
-from workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
-from workers.rendering.stages import StagePlace, painted_stage, preview_stage
-from workers.telling.losses import open_scene
+from octasplat.engine.config import read_config
+from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.events import Listener
+from octasplat.engine.files import read_facts
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.companions import companions
+from octasplat.engine.light.stage import Stage
+from octasplat.engine.light.stage_file import named_files
+from octasplat.engine.render.identity import identity_of
+from octasplat.engine.render.jobs import (
+    Paint,
+    Shot,
+    camera_shots,
+    gaussian_turntable,
+    scene_paint,
+    view_shots,
+)
+from octasplat.engine.render.kept import RECORD, KeptImages
+from octasplat.engine.render.names import names_by_number
+from octasplat.engine.render.path_file import read_camera_path
+from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.render.series import Kept, render_film, render_series
+from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_background, run_viewpoints
+from octasplat.engine.scene.model import Viewpoints
+from octasplat.engine.scene.views_file import SplitViewpoints
+from octasplat.engine.shading.learnt_background import LearntBackground
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.stages import counted_stage
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
+from octasplat.workers.rendering.stages import StagePlace, painted_stage, preview_stage
+from octasplat.workers.telling.losses import open_scene
 
 ANY_SIDE_PX = 1 << 30
 """A cap that no photograph reaches."""

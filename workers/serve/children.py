@@ -8,8 +8,8 @@ import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 
-from engine.isolated_python import without_python_variables
-from workers.parent import PARENT
+from octasplat.engine.isolated_python import without_python_variables
+from octasplat.workers.parent import PARENT
 
 logger = logging.getLogger(__name__)
 

@@ -10,18 +10,18 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from engine.errors import OctasplatError, OutputError
-from engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
-from engine.isolated_python import python_command
-from engine.writing import write_json
-from workers.ending import end
-from workers.isolation.abilities import tell_what_lacks
-from workers.isolation.hiding import hide_memory
-from workers.postgres.embedded import LEAST_CONNECTIONS, EmbeddedPostgres
-from workers.records.migrate import migrate
-from workers.serve.children import KeptChild, kill_late
-from workers.serve.own_token import keep_own_token
-from workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings, worker_connections
+from octasplat.engine.errors import OctasplatError, OutputError
+from octasplat.engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
+from octasplat.engine.isolated_python import python_command
+from octasplat.engine.writing import write_json
+from octasplat.workers.ending import end
+from octasplat.workers.isolation.abilities import tell_what_lacks
+from octasplat.workers.isolation.hiding import hide_memory
+from octasplat.workers.postgres.embedded import LEAST_CONNECTIONS, EmbeddedPostgres
+from octasplat.workers.records.migrate import migrate
+from octasplat.workers.serve.children import KeptChild, kill_late
+from octasplat.workers.serve.own_token import keep_own_token
+from octasplat.workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings, worker_connections
 
 logger = logging.getLogger(__name__)
 
@@ -111,8 +111,8 @@ async def _run(
     environment = {"DATABASE_URL": conninfo, **_places(plan.settings)}
     listen = {"HOST": plan.host, "PORT": None if plan.port is None else str(plan.port)}
     front = {f"{PREFIX}{name}": value for name, value in listen.items() if value is not None}
-    api = KeptChild("front end", _program(plan, "service"), {**environment, **front}, hear)
-    command = _program(plan, "workers", "worker", "--queues")
+    api = KeptChild("front end", _program(plan, "octasplat.service.serving"), {**environment, **front}, hear)
+    command = _program(plan, "octasplat", "worker", "--queues")
     children = [api, KeptChild("maintenance", (*command, "", "--name", "maintenance"), environment)]
     if plan.queues:
         queues = ",".join(f"{name}={slots}" for name, slots in plan.queues.items())

@@ -12,8 +12,15 @@ from pathlib import Path
 import psycopg
 from psycopg.rows import dict_row
 
-from engine.errors import OutputError
-from workers.records.tokens import LOCAL_OWNER, add_token, find_token, new_secret, revoke_token, set_origin
+from octasplat.engine.errors import OutputError
+from octasplat.workers.records.tokens import (
+    LOCAL_OWNER,
+    add_token,
+    find_token,
+    new_secret,
+    revoke_token,
+    set_origin,
+)
 
 
 async def keep_own_token(conninfo: str, path: Path) -> None:

@@ -1,6 +1,6 @@
 """Where datasets, checkpoints and results are kept: a folder or a bucket, behind one protocol."""
 
-from workers.store.errors import (
+from octasplat.workers.store.errors import (
     BlobMissing,
     DigestMismatch,
     StorageError,
@@ -8,9 +8,16 @@ from workers.store.errors import (
     StorageUnavailable,
     TooLarge,
 )
-from workers.store.opening import open_storage
-from workers.store.protocol import Blob, BlobWriter, Storage, StoredBlob
-from workers.store.trees import Manifest, TreeFile, fetch_tree, publish_manifest, read_manifest, store_tree
+from octasplat.workers.store.opening import open_storage
+from octasplat.workers.store.protocol import Blob, BlobWriter, Storage, StoredBlob
+from octasplat.workers.store.trees import (
+    Manifest,
+    TreeFile,
+    fetch_tree,
+    publish_manifest,
+    read_manifest,
+    store_tree,
+)
 
 __all__ = [
     "Blob",

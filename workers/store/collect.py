@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 
-from workers.store.protocol import Storage, StoredBlob
+from octasplat.workers.store.protocol import Storage, StoredBlob
 
 
 @dataclass(frozen=True)

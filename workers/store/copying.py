@@ -5,8 +5,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from workers.store.errors import DigestMismatch
-from workers.store.protocol import Blob
+from octasplat.workers.store.errors import DigestMismatch
+from octasplat.workers.store.protocol import Blob
 
 
 def copy_verified(pieces: Iterable[bytes], blob: Blob, target: Path) -> None:

@@ -5,8 +5,8 @@ import threading
 from abc import ABC, abstractmethod
 from typing import Self
 
-from workers.store.errors import DigestMismatch, TooLarge
-from workers.store.protocol import Blob, check_sha256
+from octasplat.workers.store.errors import DigestMismatch, TooLarge
+from octasplat.workers.store.protocol import Blob, check_sha256
 
 
 class CountingWriter(ABC):

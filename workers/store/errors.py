@@ -1,6 +1,6 @@
 """What can go wrong with stored bytes, each fit to be shown as it is."""
 
-from engine.errors import OctasplatError
+from octasplat.engine.errors import OctasplatError
 
 
 class StorageError(OctasplatError):

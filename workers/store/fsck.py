@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from workers.store.errors import StorageError
-from workers.store.protocol import Storage
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.store.protocol import Storage
 
 YOUNG_SECONDS = 3600.0
 """Blobs younger than this may belong to an upload that is not entered yet."""

@@ -21,11 +21,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from workers.store.copying import copy_verified
-from workers.store.counting import CountingWriter
-from workers.store.errors import BlobMissing, StorageFull, StorageUnavailable
-from workers.store.os_errors import MAKE_ROOM, told
-from workers.store.protocol import (
+from octasplat.workers.store.copying import copy_verified
+from octasplat.workers.store.counting import CountingWriter
+from octasplat.workers.store.errors import BlobMissing, StorageFull, StorageUnavailable
+from octasplat.workers.store.os_errors import MAKE_ROOM, told
+from octasplat.workers.store.protocol import (
     MAX_DOCUMENT_BYTES,
     SHA256,
     Blob,
@@ -41,7 +41,7 @@ _CANNOT_LINK = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP,
 
 
 class LocalStorage:
-    """A :class:`workers.store.protocol.Storage` in a folder.
+    """A :class:`octasplat.workers.store.protocol.Storage` in a folder.
 
     Args:
         root: the folder; made with access for its owner only.

@@ -3,9 +3,9 @@
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
-from engine.errors import ConfigError
-from workers.store.local import DEFAULT_FLOOR_BYTES, LocalStorage
-from workers.store.protocol import Storage
+from octasplat.engine.errors import ConfigError
+from octasplat.workers.store.local import DEFAULT_FLOOR_BYTES, LocalStorage
+from octasplat.workers.store.protocol import Storage
 
 
 def open_storage(address: str | Path, *, floor_bytes: int = DEFAULT_FLOOR_BYTES) -> Storage:
@@ -31,7 +31,7 @@ def open_storage(address: str | Path, *, floor_bytes: int = DEFAULT_FLOOR_BYTES)
             f"{parts.scheme}://... is not a store; name a folder or s3://bucket/prefix (no password in it)."
         )
     try:
-        from workers.store.s3 import S3Storage
+        from octasplat.workers.store.s3 import S3Storage
     except ModuleNotFoundError:
         raise ConfigError("A store in S3 needs boto3; install it with: pip install boto3") from None
     prefix = parts.path.strip("/")

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from engine.writing import NO_ROOM
-from workers.store.errors import StorageFull, StorageUnavailable
+from octasplat.engine.writing import NO_ROOM
+from octasplat.workers.store.errors import StorageFull, StorageUnavailable
 
 MAKE_ROOM = "delete datasets or jobs, whose contents then go at once, or add room"
 

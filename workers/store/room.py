@@ -4,9 +4,9 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from workers.store.errors import StorageFull
-from workers.store.os_errors import MAKE_ROOM, told
-from workers.store.protocol import Storage
+from octasplat.workers.store.errors import StorageFull
+from octasplat.workers.store.os_errors import MAKE_ROOM, told
+from octasplat.workers.store.protocol import Storage
 
 LEAST_BYTES = 1 << 20
 """With less than this a disk is full, also where nothing is to be kept free."""

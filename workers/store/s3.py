@@ -22,11 +22,11 @@ import boto3
 from botocore.config import Config
 from botocore.exceptions import BotoCoreError, ClientError
 
-from workers.store.copying import copy_verified
-from workers.store.counting import CountingWriter
-from workers.store.errors import BlobMissing, StorageFull, StorageUnavailable
-from workers.store.os_errors import MAKE_ROOM, told
-from workers.store.protocol import (
+from octasplat.workers.store.copying import copy_verified
+from octasplat.workers.store.counting import CountingWriter
+from octasplat.workers.store.errors import BlobMissing, StorageFull, StorageUnavailable
+from octasplat.workers.store.os_errors import MAKE_ROOM, told
+from octasplat.workers.store.protocol import (
     MAX_DOCUMENT_BYTES,
     SHA256,
     Blob,
@@ -52,7 +52,7 @@ _NO_ROOM = frozenset({"QuotaExceeded", "XMinioStorageFull", "InsufficientStorage
 
 
 class S3Storage:
-    """A :class:`workers.store.protocol.Storage` in a bucket.
+    """A :class:`octasplat.workers.store.protocol.Storage` in a bucket.
 
     Args:
         bucket: an existing bucket.

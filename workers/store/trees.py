@@ -9,10 +9,10 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from workers.store.errors import StorageError
-from workers.store.names import NameSet
-from workers.store.os_errors import told
-from workers.store.protocol import Storage
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.store.names import NameSet
+from octasplat.workers.store.os_errors import told
+from octasplat.workers.store.protocol import Storage
 
 _PIECE_BYTES = 1 << 20
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from engine.events import EVENT_KINDS, Event, StageProgress, TrainingProgress, event_from
+from octasplat.engine.events import EVENT_KINDS, Event, StageProgress, TrainingProgress, event_from
 
 TOLD_KINDS = frozenset({"progress", *EVENT_KINDS})
 

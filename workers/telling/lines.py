@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 
-from engine.events import (
+from octasplat.engine.events import (
     Event,
     HeldOutMeasured,
     StageFinished,
@@ -12,9 +12,9 @@ from engine.events import (
     TrainingProgress,
     Warned,
 )
-from engine.stages import DOING
-from workers.telling.pace import Pace
-from workers.telling.wording import clock, duration, training_state
+from octasplat.engine.stages import DOING
+from octasplat.workers.telling.pace import Pace
+from octasplat.workers.telling.wording import clock, duration, training_state
 
 SECONDS_BETWEEN_LINES = 5.0
 # What a finished stage did, and what its steps are; "" where nobody would want them counted.

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from engine.files import read_scene
-from engine.gaussians.flattening import ImportReport
-from engine.gaussians.model import FlatGaussians
-from engine.run_folder import is_run, not_exported
+from octasplat.engine.files import read_scene
+from octasplat.engine.gaussians.flattening import ImportReport
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.run_folder import is_run, not_exported
 
 
 def open_scene(path: Path, say: Callable[[str], None], *, drop_invalid: bool = False) -> FlatGaussians:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from engine.events import HeldOutMeasured, TrainingProgress
+from octasplat.engine.events import HeldOutMeasured, TrainingProgress
 
 _METRICS = (
     ("psnr", "PSNR {:.2f} dB"),

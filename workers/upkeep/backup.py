@@ -21,15 +21,15 @@ from typing import Any
 import psycopg
 from psycopg import sql
 
-import engine
-from engine.errors import OctasplatError
-from engine.writing import write_json
-from workers.records.migrate import OURS, all_steps, migrate
-from workers.store.errors import BlobMissing
-from workers.store.local import LocalStorage
-from workers.store.os_errors import told
-from workers.store.protocol import Storage
-from workers.store.trees import read_manifest
+from octasplat.engine import __version__
+from octasplat.engine.errors import OctasplatError
+from octasplat.engine.writing import write_json
+from octasplat.workers.records.migrate import OURS, all_steps, migrate
+from octasplat.workers.store.errors import BlobMissing
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.store.os_errors import told
+from octasplat.workers.store.protocol import Storage
+from octasplat.workers.store.trees import read_manifest
 
 FORMAT = 1
 RECORD, TABLES, STORE = "backup.json", "tables-", "store"
@@ -96,7 +96,7 @@ def back_up(
         copy = LocalStorage(folder / STORE, floor_bytes=0)
         contents, size_bytes = _copy_store(storage, copy, wanted, jobs, on_content)
     record = {
-        "format": FORMAT, "version": engine.__version__, "folder": rows.name,
+        "format": FORMAT, "version": __version__, "folder": rows.name,
         "steps": steps, "tables": tables, "sequences": sequences,
     }  # fmt: skip
     with told(folder):

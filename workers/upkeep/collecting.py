@@ -12,12 +12,12 @@ import uuid
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
-from workers.queue.storing import give_up_silent, oldest_note, removing
-from workers.records.database import Connection, Pool, allow_long
-from workers.records.references import references
-from workers.store.collect import Collected, Unused, remove, unchanged, unnamed, unused
-from workers.store.protocol import Storage
-from workers.store.trees import read_manifest
+from octasplat.workers.queue.storing import give_up_silent, oldest_note, removing
+from octasplat.workers.records.database import Connection, Pool, allow_long
+from octasplat.workers.records.references import references
+from octasplat.workers.store.collect import Collected, Unused, remove, unchanged, unnamed, unused
+from octasplat.workers.store.protocol import Storage
+from octasplat.workers.store.trees import read_manifest
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ async def collect_at_once(
     """Remove everything that nothing names, whatever its age, because room is short.
 
     Contents that somebody stores at the moment and has yet to name are spared, see
-    :mod:`workers.queue.storing`.
+    :mod:`octasplat.workers.queue.storing`.
 
     Args:
         pool: connections.
@@ -174,7 +174,8 @@ async def _remove(connection: Connection, storage: Storage, contents: Sequence[U
     """Remove contents, some at a time, while nobody names anything.
 
     Whoever stored one of them once more in this very moment names it afterwards and then looks whether it is
-    there, see :meth:`workers.queue.storing.Note.confirm`; or has named it before, and then it stays.
+    there, see :meth:`octasplat.workers.queue.storing.Note.confirm`; or has named it before, and then it
+    stays.
     """
     removed = Collected()
     for start in range(0, len(contents), AT_ONCE):

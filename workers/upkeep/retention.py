@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 from psycopg import sql
 
-from workers.queue.jobs import delete_job
-from workers.records.database import Connection
-from workers.records.datasets import get_dataset
-from workers.records.errors import Conflict
-from workers.settings import Retention
+from octasplat.workers.queue.jobs import delete_job
+from octasplat.workers.records.database import Connection
+from octasplat.workers.records.datasets import get_dataset
+from octasplat.workers.records.errors import Conflict
+from octasplat.workers.settings import Retention
 
 logger = logging.getLogger(__name__)
 

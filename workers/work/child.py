@@ -1,8 +1,8 @@
 """The child process of a worker: does one job, tells of it in JSON lines, stops when asked or orphaned.
 
-Run by :func:`engine.isolated_python.python_command`. The first line of stdin is the task as JSON; a later
-line ``stop`` asks to stop with a checkpoint, and its end means that the worker is gone. Events go to stdout,
-one JSON object a line; whatever libraries print goes to stderr, which is the job's log.
+Run by :func:`octasplat.engine.isolated_python.python_command`. The first line of stdin is the task as JSON; a
+later line ``stop`` asks to stop with a checkpoint, and its end means that the worker is gone. Events go to
+stdout, one JSON object a line; whatever libraries print goes to stderr, which is the job's log.
 """
 
 import contextlib
@@ -17,12 +17,12 @@ import traceback
 from pathlib import Path
 from typing import Any, NoReturn
 
-from engine.errors import Cancelled, OctasplatError
-from engine.events import Event
-from workers.isolation.confining import confine, limit_growth
-from workers.parent import die_with
-from workers.store.os_errors import lacks_room
-from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE, Task
+from octasplat.engine.errors import Cancelled, OctasplatError
+from octasplat.engine.events import Event
+from octasplat.workers.isolation.confining import confine, limit_growth
+from octasplat.workers.parent import die_with
+from octasplat.workers.store.os_errors import lacks_room
+from octasplat.workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE, Task
 
 _OOM_SCORE = 800
 MAX_CAUSE_LINES = 60

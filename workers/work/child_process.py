@@ -14,8 +14,8 @@ from typing import Any
 
 import psutil
 
-from engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
-from engine.isolated_python import python_command
+from octasplat.engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
+from octasplat.engine.isolated_python import python_command
 
 MAX_LINE_BYTES = 1 << 20
 LAST_WORDS = 20
@@ -76,9 +76,9 @@ class ChildProcess:
         on_event: Callable[[dict[str, Any]], None],
         on_log: Callable[[str], None],
     ) -> "ChildProcess":
-        """Start a child with its task, see :mod:`workers.work.child`."""
+        """Start a child with its task, see :mod:`octasplat.workers.work.child`."""
         process = await asyncio.create_subprocess_exec(
-            *python_command("workers.work.child", further_modules=task["kind_modules"]),
+            *python_command("octasplat.workers.work.child", further_modules=task["kind_modules"]),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,

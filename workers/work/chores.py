@@ -5,7 +5,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from workers.work.contact import DATABASE_ERRORS
+from octasplat.workers.work.contact import DATABASE_ERRORS
 
 logger = logging.getLogger(__name__)
 

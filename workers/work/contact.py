@@ -7,8 +7,8 @@ from collections.abc import Callable
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from workers.queue.attempts import Attempt
-from workers.settings import WorkerSettings
+from octasplat.workers.queue.attempts import Attempt
+from octasplat.workers.settings import WorkerSettings
 
 LOST_SHARE = 2 / 3
 """A worker that could not write for this share of the stale limit stops its child before others take over."""

@@ -8,14 +8,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from engine import versions
-from engine.errors import ConfigError
-from workers.queue.jobs import get_job
-from workers.records.database import Pool
-from workers.records.rows import Job
-from workers.records.workers import live_workers
-from workers.work.kinds import job_kinds, kind_named
-from workers.work.workspace import Checkpoint
+from octasplat.engine import versions
+from octasplat.engine.errors import ConfigError
+from octasplat.workers.queue.jobs import get_job
+from octasplat.workers.records.database import Pool
+from octasplat.workers.records.rows import Job
+from octasplat.workers.records.workers import live_workers
+from octasplat.workers.work.kinds import job_kinds, kind_named
+from octasplat.workers.work.workspace import Checkpoint
 
 
 def announced() -> dict[str, Any]:

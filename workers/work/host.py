@@ -10,11 +10,11 @@ import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
-from engine.isolated_python import python_command
-from workers.store.errors import StorageError, StorageFull
-from workers.store.os_errors import told
-from workers.store.protocol import Storage
-from workers.work.child_process import child_environment
+from octasplat.engine.isolated_python import python_command
+from octasplat.workers.store.errors import StorageError, StorageFull
+from octasplat.workers.store.os_errors import told
+from octasplat.workers.store.protocol import Storage
+from octasplat.workers.work.child_process import child_environment
 
 logger = logging.getLogger(__name__)
 
@@ -131,7 +131,7 @@ class Host:
         """Whether a process starts and can import the program of a job."""
         try:
             process = await asyncio.create_subprocess_exec(
-                *python_command("workers.work.child", further_modules=self._kind_modules),
+                *python_command("octasplat.workers.work.child", further_modules=self._kind_modules),
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=asyncio.subprocess.PIPE,

@@ -5,18 +5,18 @@ import logging
 import time
 import uuid
 
-from workers.queue.jobs import get_job, queue_again
-from workers.queue.limits import fail_unbegun
-from workers.queue.port import Slips
-from workers.records.database import Pool
-from workers.records.rows import Job
-from workers.records.workers import live_workers
-from workers.store.errors import StorageError
-from workers.upkeep.collecting import collect_at_once
-from workers.work.contact import DATABASE_ERRORS
-from workers.work.surroundings import Surroundings
-from workers.work.task import NO_SPACE
-from workers.work.workspace import sweep_workspaces
+from octasplat.workers.queue.jobs import get_job, queue_again
+from octasplat.workers.queue.limits import fail_unbegun
+from octasplat.workers.queue.port import Slips
+from octasplat.workers.records.database import Pool
+from octasplat.workers.records.rows import Job
+from octasplat.workers.records.workers import live_workers
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.upkeep.collecting import collect_at_once
+from octasplat.workers.work.contact import DATABASE_ERRORS
+from octasplat.workers.work.surroundings import Surroundings
+from octasplat.workers.work.task import NO_SPACE
+from octasplat.workers.work.workspace import sweep_workspaces
 
 logger = logging.getLogger(__name__)
 

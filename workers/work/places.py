@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from workers.work.task import RUN
+from octasplat.workers.work.task import RUN
 
 # A path begins where no word, address or other path goes on.
 _ABSOLUTE = re.compile(r"""(?<![\w.~/…])(?!(?<=:)//)(?:/+[^\s/"'`:;,()<>|\[\]{}]+)+/?""")
@@ -21,7 +21,7 @@ class Places:
     """What is called how.
 
     Args:
-        folder: of an attempt, see :class:`workers.work.task.Task`.
+        folder: of an attempt, see :class:`octasplat.workers.work.task.Task`.
         work: folder of all work on this machine.
         others: further folders whose paths are nobody's business, such as that of the store.
     """

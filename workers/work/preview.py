@@ -8,15 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from engine.events import Event, Listener
-from engine.rays import ImageRays
-from engine.render.images import write_png
-from engine.render.renderer import background_colour, render_rays
-from engine.scene import Dataset
-from engine.shading.plain import PLAIN
-from engine.shading.protocol import ShadingModel
-from engine.trace.protocol import Tracer
-from engine.train.shading import background_of
+from octasplat.engine.events import Event, Listener
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.images import write_png
+from octasplat.engine.render.renderer import background_colour, render_rays
+from octasplat.engine.scene import Dataset
+from octasplat.engine.shading.plain import PLAIN
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.train.shading import background_of
 
 SIDE_PX = 320
 LEAST_SIDE_PX = 96

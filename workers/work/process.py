@@ -19,42 +19,42 @@ from typing import Any
 import psutil
 from procrastinate.exceptions import ConnectorException
 
-import engine
-from engine.files import writable_formats
-from engine.threads import available_threads
-from workers.ending import end
-from workers.isolation.abilities import abilities, tell_what_lacks
-from workers.isolation.hiding import hide_memory
-from workers.parent import die_with_server
-from workers.queue.attempts import Fenced, claim
-from workers.queue.fairness import choose
-from workers.queue.limits import end_abandoned
-from workers.queue.procrastinate_slips import ProcrastinateSlips
-from workers.queue.rescue import rescue_lost_jobs
-from workers.records.audit import forget_old_entries
-from workers.records.database import Pool, open_pool
-from workers.records.ids import new_id
-from workers.records.migrate import wait_for_tables
-from workers.records.sessions import forget_old_sessions
-from workers.records.workers import forget_lost_workers, forget_worker, see_worker
-from workers.settings import WorkerSettings, worker_connections
-from workers.store.errors import StorageError
-from workers.store.local import LocalStorage
-from workers.store.opening import open_storage
-from workers.store.room import Room
-from workers.upkeep.collecting import collect
-from workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries, thin_progress
-from workers.upkeep.webhooks.outbox import forget_old
-from workers.upkeep.webhooks.sending import Sender
-from workers.work.chores import Chore, ChoreFailed, keep_doing
-from workers.work.contact import DATABASE_ERRORS
-from workers.work.fitness import announced, unfit
-from workers.work.host import Host
-from workers.work.memory import memory_limit_bytes
-from workers.work.openings import Openings, put_off
-from workers.work.supervisor import Supervisor
-from workers.work.surroundings import LostDatabase, Surroundings
-from workers.work.workspace import sweep_temporary, sweep_workspaces
+from octasplat.engine import __version__
+from octasplat.engine.files import writable_formats
+from octasplat.engine.threads import available_threads
+from octasplat.workers.ending import end
+from octasplat.workers.isolation.abilities import abilities, tell_what_lacks
+from octasplat.workers.isolation.hiding import hide_memory
+from octasplat.workers.parent import die_with_server
+from octasplat.workers.queue.attempts import Fenced, claim
+from octasplat.workers.queue.fairness import choose
+from octasplat.workers.queue.limits import end_abandoned
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.queue.rescue import rescue_lost_jobs
+from octasplat.workers.records.audit import forget_old_entries
+from octasplat.workers.records.database import Pool, open_pool
+from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.migrate import wait_for_tables
+from octasplat.workers.records.sessions import forget_old_sessions
+from octasplat.workers.records.workers import forget_lost_workers, forget_worker, see_worker
+from octasplat.workers.settings import WorkerSettings, worker_connections
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.store.opening import open_storage
+from octasplat.workers.store.room import Room
+from octasplat.workers.upkeep.collecting import collect
+from octasplat.workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries, thin_progress
+from octasplat.workers.upkeep.webhooks.outbox import forget_old
+from octasplat.workers.upkeep.webhooks.sending import Sender
+from octasplat.workers.work.chores import Chore, ChoreFailed, keep_doing
+from octasplat.workers.work.contact import DATABASE_ERRORS
+from octasplat.workers.work.fitness import announced, unfit
+from octasplat.workers.work.host import Host
+from octasplat.workers.work.memory import memory_limit_bytes
+from octasplat.workers.work.openings import Openings, put_off
+from octasplat.workers.work.supervisor import Supervisor
+from octasplat.workers.work.surroundings import LostDatabase, Surroundings
+from octasplat.workers.work.workspace import sweep_temporary, sweep_workspaces
 
 logger = logging.getLogger(__name__)
 
@@ -302,7 +302,7 @@ class _Worker:
             **disk,
             "host": socket.gethostname(),
             "pid": os.getpid(),
-            "version": engine.__version__,
+            "version": __version__,
             "python": platform.python_version(),
             "cores": os.cpu_count(),
             "threads": self._settings.threads or available_threads(),

@@ -8,21 +8,29 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from engine.config import read_config
-from engine.errors import Cancelled, CheckpointError, ConfigError, ExportFailed
-from engine.evaluate.runs import evaluate as evaluate_run
-from engine.events import CheckpointWritten, Event, Listener, StageFinished, StageProgress, Warned, broadcast
-from engine.files import ExportOptions
-from engine.files.gaussian_ply import read_gaussian_ply
-from engine.files.several import export_files
-from engine.light.stage_file import named_files
-from engine.pipeline import reconstruct as reconstruct_scene
-from engine.plain_colours import PlainScene
-from engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE, not_exported
-from engine.stages import counted_stage, stopping
-from engine.writing import write_json
-from workers.store.names import check_name
-from workers.work.kinds.options import (
+from octasplat.engine.config import read_config
+from octasplat.engine.errors import Cancelled, CheckpointError, ConfigError, ExportFailed
+from octasplat.engine.evaluate.runs import evaluate as evaluate_run
+from octasplat.engine.events import (
+    CheckpointWritten,
+    Event,
+    Listener,
+    StageFinished,
+    StageProgress,
+    Warned,
+    broadcast,
+)
+from octasplat.engine.files import ExportOptions
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.files.several import export_files
+from octasplat.engine.light.stage_file import named_files
+from octasplat.engine.pipeline import reconstruct as reconstruct_scene
+from octasplat.engine.plain_colours import PlainScene
+from octasplat.engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE, not_exported
+from octasplat.engine.stages import counted_stage, stopping
+from octasplat.engine.writing import write_json
+from octasplat.workers.store.names import check_name
+from octasplat.workers.work.kinds.options import (
     EvaluateOptions,
     ExportJobOptions,
     MaterialJobOptions,
@@ -31,12 +39,12 @@ from workers.work.kinds.options import (
     RelightJobOptions,
     RenderJobOptions,
 )
-from workers.work.places import Places
-from workers.work.preview import Previews
-from workers.work.task import FRAMES, Task
+from octasplat.workers.work.places import Places
+from octasplat.workers.work.preview import Previews
+from octasplat.workers.work.task import FRAMES, Task
 
 if TYPE_CHECKING:
-    from workers.rendering.views import Keeping
+    from octasplat.workers.rendering.views import Keeping
 
 REPORT = "report.html"
 KEEP_SECONDS = 5.0
@@ -146,7 +154,7 @@ def export(task: Task) -> None:
 
 def render(task: Task) -> None:
     """New views of the scene of a reconstruction."""
-    from workers.rendering.views import Keeping, SetStage, render_files
+    from octasplat.workers.rendering.views import Keeping, SetStage, render_files
 
     options = RenderJobOptions.model_validate(task.options)
     arguments = {**_picture_arguments(task, options), "background": options.background}
@@ -164,8 +172,8 @@ def render(task: Task) -> None:
 
 def relight(task: Task) -> None:
     """The scene of a reconstruction with materials in other light."""
-    from workers.rendering.relighting import relight_files
-    from workers.rendering.views import Keeping
+    from octasplat.workers.rendering.relighting import relight_files
+    from octasplat.workers.rendering.views import Keeping
 
     options = RelightJobOptions.model_validate(task.options)
     for name in options.environments:
@@ -191,8 +199,8 @@ def relight(task: Task) -> None:
 
 def material(task: Task) -> None:
     """The scene of a reconstruction with other materials: results like those of a run."""
-    from engine.edit.material_run import change_materials, edit_note, write_changed_run
-    from engine.edit.selection import chosen_by
+    from octasplat.engine.edit.material_run import change_materials, edit_note, write_changed_run
+    from octasplat.engine.edit.selection import chosen_by
 
     options = MaterialJobOptions.model_validate(task.options)
     tell = stopping(task.listener, task.should_stop)
@@ -234,7 +242,7 @@ def _make_pictures(
     work: "Callable[[Listener, Callable[[str], None], Keeping], tuple[Path, ...]]",
 ) -> None:
     """Let ``work`` make the pictures, those of an earlier attempt kept, and publish them."""
-    from workers.rendering.views import Keeping
+    from octasplat.workers.rendering.views import Keeping
 
     tell = stopping(task.listener, task.should_stop)
     kept, frames = _KeptFrames(task.listener), task.run / FRAMES

@@ -14,17 +14,17 @@ from typing import Any
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from engine.events import Warned
-from workers.ending import end
-from workers.queue.attempts import Attempt, Fenced
-from workers.queue.storing import storing
-from workers.records.quotas import QuotaExceeded
-from workers.store.errors import StorageError
-from workers.telling.events import journal_progress, told_event
-from workers.telling.lines import PlainLines
-from workers.telling.pace import Pace
-from workers.work.task import RUN
-from workers.work.workspace import Checkpoint, Workspace
+from octasplat.engine.events import Warned
+from octasplat.workers.ending import end
+from octasplat.workers.queue.attempts import Attempt, Fenced
+from octasplat.workers.queue.storing import storing
+from octasplat.workers.records.quotas import QuotaExceeded
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.telling.events import journal_progress, told_event
+from octasplat.workers.telling.lines import PlainLines
+from octasplat.workers.telling.pace import Pace
+from octasplat.workers.work.task import RUN
+from octasplat.workers.work.workspace import Checkpoint, Workspace
 
 logger = logging.getLogger(__name__)
 

@@ -10,24 +10,24 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
-from engine import versions
-from engine.errors import ConfigError, OctasplatError
-from workers.ending import end
-from workers.isolation.confining import MOST_PROCESSES
-from workers.queue.attempts import Attempt, Fenced
-from workers.queue.jobs import artifacts_of
-from workers.queue.limits import seconds_spent
-from workers.records.datasets import files_of, get_dataset
-from workers.store.errors import BlobMissing, DigestMismatch, StorageError, StorageFull
-from workers.work.child_process import ChildProcess
-from workers.work.contact import DATABASE_ERRORS, Contact
-from workers.work.kinds import JobKind, kind_named
-from workers.work.places import Places, shown_in
-from workers.work.reporter import Reporter
-from workers.work.surroundings import LostDatabase, Surroundings
-from workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE
-from workers.work.verdicts import Verdicts
-from workers.work.workspace import Checkpoint, Workspace
+from octasplat.engine import versions
+from octasplat.engine.errors import ConfigError, OctasplatError
+from octasplat.workers.ending import end
+from octasplat.workers.isolation.confining import MOST_PROCESSES
+from octasplat.workers.queue.attempts import Attempt, Fenced
+from octasplat.workers.queue.jobs import artifacts_of
+from octasplat.workers.queue.limits import seconds_spent
+from octasplat.workers.records.datasets import files_of, get_dataset
+from octasplat.workers.store.errors import BlobMissing, DigestMismatch, StorageError, StorageFull
+from octasplat.workers.work.child_process import ChildProcess
+from octasplat.workers.work.contact import DATABASE_ERRORS, Contact
+from octasplat.workers.work.kinds import JobKind, kind_named
+from octasplat.workers.work.places import Places, shown_in
+from octasplat.workers.work.reporter import Reporter
+from octasplat.workers.work.surroundings import LostDatabase, Surroundings
+from octasplat.workers.work.task import EXIT_REFUSED, EXIT_STOPPED, EXIT_UNEXPECTED, NO_SPACE
+from octasplat.workers.work.verdicts import Verdicts
+from octasplat.workers.work.workspace import Checkpoint, Workspace
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")

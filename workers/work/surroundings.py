@@ -4,13 +4,13 @@ import asyncio
 import uuid
 from dataclasses import dataclass, field
 
-from workers.queue.port import Slips
-from workers.records.quotas import Quota
-from workers.settings import WorkerSettings
-from workers.store.errors import StorageError
-from workers.store.protocol import Storage
-from workers.store.room import NOTHING, Room, Taken
-from workers.work.host import Host
+from octasplat.workers.queue.port import Slips
+from octasplat.workers.records.quotas import Quota
+from octasplat.workers.settings import WorkerSettings
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.store.protocol import Storage
+from octasplat.workers.store.room import NOTHING, Room, Taken
+from octasplat.workers.work.host import Host
 
 
 class LostDatabase(Exception):

@@ -5,18 +5,18 @@ import logging
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, TypeVar
 
-from engine.errors import OctasplatError
-from workers.queue.attempts import MAX_RESCUES, Attempt, Result
-from workers.queue.storing import Note, storing
-from workers.records.quotas import QuotaExceeded
-from workers.store.errors import BlobMissing, DigestMismatch, StorageError, StorageUnavailable
-from workers.store.os_errors import lacks_room
-from workers.store.room import Taken
-from workers.work.contact import DATABASE_ERRORS, Contact
-from workers.work.reporter import Reporter
-from workers.work.surroundings import LostDatabase, Surroundings
-from workers.work.task import NO_SPACE
-from workers.work.workspace import Workspace
+from octasplat.engine.errors import OctasplatError
+from octasplat.workers.queue.attempts import MAX_RESCUES, Attempt, Result
+from octasplat.workers.queue.storing import Note, storing
+from octasplat.workers.records.quotas import QuotaExceeded
+from octasplat.workers.store.errors import BlobMissing, DigestMismatch, StorageError, StorageUnavailable
+from octasplat.workers.store.os_errors import lacks_room
+from octasplat.workers.store.room import Taken
+from octasplat.workers.work.contact import DATABASE_ERRORS, Contact
+from octasplat.workers.work.reporter import Reporter
+from octasplat.workers.work.surroundings import LostDatabase, Surroundings
+from octasplat.workers.work.task import NO_SPACE
+from octasplat.workers.work.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")

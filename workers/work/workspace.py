@@ -15,16 +15,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from engine import versions
-from engine.render.kept import RECORD
-from workers.queue.attempts import Result
-from workers.records.rows import Artifact, DatasetFile, Job
-from workers.store.errors import StorageError
-from workers.store.os_errors import told
-from workers.store.protocol import Storage
-from workers.store.trees import Manifest, TreeFile, fetch_tree, publish_manifest, read_manifest, store_tree
-from workers.work.media_types import media_type
-from workers.work.task import FILES, FRAMES, RESULTS, RUN
+from octasplat.engine import versions
+from octasplat.engine.render.kept import RECORD
+from octasplat.workers.queue.attempts import Result
+from octasplat.workers.records.rows import Artifact, DatasetFile, Job
+from octasplat.workers.store.errors import StorageError
+from octasplat.workers.store.os_errors import told
+from octasplat.workers.store.protocol import Storage
+from octasplat.workers.store.trees import (
+    Manifest,
+    TreeFile,
+    fetch_tree,
+    publish_manifest,
+    read_manifest,
+    store_tree,
+)
+from octasplat.workers.work.media_types import media_type
+from octasplat.workers.work.task import FILES, FRAMES, RESULTS, RUN
 
 POSES = "poses"
 """Poses that the engine found, in its output folder and among the results."""
@@ -50,7 +57,7 @@ class Checkpoint:
         step: of the stage.
         files: what is needed.
         results: what the same settings gave in the version that made it, see
-            :data:`engine.versions.RESULTS`; versions that did not say so gave the first.
+            :data:`octasplat.engine.versions.RESULTS`; versions that did not say so gave the first.
     """
 
     attempt: int

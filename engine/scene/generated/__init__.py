@@ -21,9 +21,9 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 
-from engine.errors import DatasetError, OutputError
-from engine.scene.generated.config import CAMERA_MODELS, GeneratedSceneConfig
-from engine.writing import write_json
+from octasplat.engine.errors import DatasetError, OutputError
+from octasplat.engine.scene.generated.config import CAMERA_MODELS, GeneratedSceneConfig
+from octasplat.engine.writing import write_json
 
 __all__ = ["CAMERA_MODELS", "GeneratedSceneConfig", "write_generated_scene"]
 
@@ -60,7 +60,7 @@ def write_generated_scene(
         return
 
     # Imported here so that the settings can be used without the ray tracer and the compiler.
-    from engine.scene.generated.dataset import write_files
+    from octasplat.engine.scene.generated.dataset import write_files
 
     root = root.resolve()
     partial = root.with_name(f".{root.name}.{os.getpid()}.{uuid.uuid4().hex[:8]}.partial")

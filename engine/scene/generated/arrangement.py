@@ -11,8 +11,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
-from engine.scene.generated import materials
-from engine.scene.generated.meshes import (
+from octasplat.engine.scene.generated import materials
+from octasplat.engine.scene.generated.meshes import (
     Mesh,
     boulder,
     box,

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float, Float32
 
-from engine.scene.generated.config import GeneratedSceneConfig
+from octasplat.engine.scene.generated.config import GeneratedSceneConfig
 
 # (share of the views, distance from the table's axis, height above the table), metres.
 _RINGS = ((0.4, 2.45, 0.5), (0.35, 2.25, 1.05), (0.25, 1.75, 1.75))

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from engine.scene.generated.cameras import View
-from engine.scene.generated.points import SurfacePoints
+from octasplat.engine.scene.generated.cameras import View
+from octasplat.engine.scene.generated.points import SurfacePoints
 
 
 def write_model(folder: Path, camera: pycolmap.Camera, views: list[View], points: SurfacePoints) -> None:

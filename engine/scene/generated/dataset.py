@@ -5,12 +5,12 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import lru_cache
 from pathlib import Path
 
-from engine.scene.generated import cameras, colmap, files
-from engine.scene.generated.arrangement import still_life
-from engine.scene.generated.config import GeneratedSceneConfig
-from engine.scene.generated.photographs import Photographer
-from engine.scene.generated.points import surface_points
-from engine.scene.generated.tracing import THREADS, LitScene
+from octasplat.engine.scene.generated import cameras, colmap, files
+from octasplat.engine.scene.generated.arrangement import still_life
+from octasplat.engine.scene.generated.config import GeneratedSceneConfig
+from octasplat.engine.scene.generated.photographs import Photographer
+from octasplat.engine.scene.generated.points import surface_points
+from octasplat.engine.scene.generated.tracing import THREADS, LitScene
 
 
 @lru_cache(maxsize=1)

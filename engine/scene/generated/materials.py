@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float32
 
-from engine.scene.generated.textures import (
+from octasplat.engine.scene.generated.textures import (
     cell_noise,
     checker,
     dots,

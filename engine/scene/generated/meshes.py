@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from engine.scene.generated.textures import noise
+from octasplat.engine.scene.generated.textures import noise
 
 Vector = Sequence[float] | Float[np.ndarray, "3"]
 

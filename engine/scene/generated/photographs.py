@@ -6,11 +6,11 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from engine.colour import to_bytes
-from engine.scene.generated.cameras import View, directions_cam
-from engine.scene.generated.config import GeneratedSceneConfig
-from engine.scene.generated.tracing import LitScene
-from engine.trace.meshes import TriangleHits
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.scene.generated.cameras import View, directions_cam
+from octasplat.engine.scene.generated.config import GeneratedSceneConfig
+from octasplat.engine.scene.generated.tracing import LitScene
+from octasplat.engine.trace.meshes import TriangleHits
 
 # Rays traced and shaded at a time: arrays of this many colours stay in the processor's cache.
 _CHUNK_RAYS = 1 << 15

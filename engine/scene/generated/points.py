@@ -6,11 +6,11 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float, UInt8
 
-from engine.colour import to_bytes
-from engine.scene.generated.cameras import View, directions_cam, projected
-from engine.scene.generated.config import GeneratedSceneConfig
-from engine.scene.generated.photographs import rays_world
-from engine.scene.generated.tracing import LitScene
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.scene.generated.cameras import View, directions_cam, projected
+from octasplat.engine.scene.generated.config import GeneratedSceneConfig
+from octasplat.engine.scene.generated.photographs import rays_world
+from octasplat.engine.scene.generated.tracing import LitScene
 
 # Standard deviation of the points' error, as a share of the extent of the cameras.
 _NOISE = 1e-4

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from engine.colour import srgb_to_linear
-from engine.scene.generated import kernels_scene
+from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.scene.generated import kernels_scene
 
 _FONT = {
     "A": "01110 10001 10001 11111 10001 10001 10001",

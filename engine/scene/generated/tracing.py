@@ -6,11 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float, Float32
 
-from engine.colour import linear_to_srgb
-from engine.rays import RayBatch
-from engine.scene.generated import kernels_scene
-from engine.scene.generated.arrangement import StillLife
-from engine.trace.meshes import TriangleHits, TriangleScene
+from octasplat.engine.colour import linear_to_srgb
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.scene.generated import kernels_scene
+from octasplat.engine.scene.generated.arrangement import StillLife
+from octasplat.engine.trace.meshes import TriangleHits, TriangleScene
 
 # Fixed, so that equal sums are summed alike on every machine.
 _PIECES = 16

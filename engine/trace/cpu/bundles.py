@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.trace.protocol import TraceSettings
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import TraceSettings
 
 
 class Rays(NamedTuple):
-    """A :class:`engine.rays.RayBatch`; a single origin, limit or viewer stands for all."""
+    """A :class:`octasplat.engine.rays.RayBatch`; a single origin, limit or viewer stands for all."""
 
     origins: Float32[np.ndarray, "#r 3"]
     directions: Float32[np.ndarray, "r 3"]
@@ -35,7 +35,10 @@ class Rays(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What hits are evaluated from: geometry (see :mod:`engine.trace.cpu.kernels_hit`) and colour."""
+    """What hits are evaluated from: geometry.
+
+    See :mod:`octasplat.engine.trace.cpu.kernels_hit`) and colour.
+    """
 
     records: Float32[np.ndarray, "n 16"]
     sh: Float32[np.ndarray, "n k 3"]
@@ -43,7 +46,10 @@ class Scene(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """The raw geometry of the Gaussians; fields as in :class:`engine.gaussians.model.FlatGaussians`."""
+    """The raw geometry of the Gaussians.
+
+    Fields as in :class:`octasplat.engine.gaussians.model.FlatGaussians`.
+    """
 
     means: Float32[np.ndarray, "n 3"]
     quats: Float32[np.ndarray, "n 4"]
@@ -81,7 +87,7 @@ class Limits(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """The arrays of a :class:`engine.trace.protocol.TraceResult`, to be written."""
+    """The arrays of a :class:`octasplat.engine.trace.protocol.TraceResult`, to be written."""
 
     rgb: Float32[np.ndarray, "r 3"]
     transmittance: Float32[np.ndarray, " r"]
@@ -126,8 +132,9 @@ class OneOrderHits(NamedTuple):
     """What packets keep whose rays see their Gaussians in one order.
 
     Packet p has met ``counts[p]`` Gaussians, front to back from place ``starts[p]`` on: their ``ids``; the
-    ``bits`` of the rays that met them; and the ``lines`` of :mod:`engine.trace.cpu.kernels_sixteen`.
-    ``frames`` are the packets' axes, e and f; ``left`` is the transmittance in the end of each ray.
+    ``bits`` of the rays that met them; and the ``lines`` of
+    :mod:`octasplat.engine.trace.cpu.kernels_sixteen`. ``frames`` are the packets' axes, e and f; ``left`` is
+    the transmittance in the end of each ray.
     """
 
     ids: Int32[np.ndarray, " h"]
@@ -164,7 +171,7 @@ class OutputGradients(NamedTuple):
 
 
 class RawGradients(NamedTuple):
-    """The arrays of a :class:`engine.trace.protocol.GaussianGradients`, to be written."""
+    """The arrays of a :class:`octasplat.engine.trace.protocol.GaussianGradients`, to be written."""
 
     ids: Int32[np.ndarray, " u"]
     means: Float32[np.ndarray, "u 3"]

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from engine.trace.cpu.kernels_hit import MEAN
-from engine.trace.cpu.kernels_rays import ray_viewer, side_shown
-from engine.trace.cpu.kernels_sh import colour, write_ray_view
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.cpu.kernels_hit import MEAN
+from octasplat.engine.trace.cpu.kernels_rays import ray_viewer, side_shown
+from octasplat.engine.trace.cpu.kernels_sh import colour, write_ray_view
+from octasplat.engine.trace.kernels_native import lean
 
 
 class Front(NamedTuple):

@@ -11,7 +11,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from engine.trace.cpu.kernels_lanes import (
+from octasplat.engine.trace.cpu.kernels_lanes import (
     DOUBLE,
     I32,
     INT8,
@@ -30,7 +30,7 @@ from engine.trace.cpu.kernels_lanes import (
     splat,
     store,
 )
-from engine.trace.cpu.kernels_simd import (
+from octasplat.engine.trace.cpu.kernels_simd import (
     DOUBLE8,
     FLOAT8,
     I64,

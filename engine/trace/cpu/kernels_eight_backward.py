@@ -1,11 +1,14 @@
-"""Eight hits of a ray at a time backwards, as explicit vectors; see :mod:`engine.trace.cpu.kernels_eight`."""
+"""Eight hits of a ray at a time backwards, as explicit vectors.
+
+See :mod:`octasplat.engine.trace.cpu.kernels_eight`.
+"""
 
 import llvmlite.ir as ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from engine.trace.cpu.kernels_lanes import (
+from octasplat.engine.trace.cpu.kernels_lanes import (
     DOUBLE,
     FLOAT,
     I32,
@@ -21,7 +24,7 @@ from engine.trace.cpu.kernels_lanes import (
     splat,
     store,
 )
-from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
+from octasplat.engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Lanes, Vector, broadcast
 
 
 @intrinsic

@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
-from engine.trace.cpu.kernels_rays import ray_slopes
-from engine.trace.cpu.kernels_simd import FLOAT8, I64, LANES, ROUNDING, Lanes, broadcast, size_of
+from octasplat.engine.trace.cpu.kernels_rays import ray_slopes
+from octasplat.engine.trace.cpu.kernels_simd import FLOAT8, I64, LANES, ROUNDING, Lanes, broadcast, size_of
 
 BINS = 64
 GRID = 8

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import carray, cfunc, njit, types
 
-from engine.trace.kernels_native import (
+from octasplat.engine.trace.kernels_native import (
     float32_pointer,
     float64_pointer,
     int32_pointer,

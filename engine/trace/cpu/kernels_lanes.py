@@ -3,7 +3,7 @@
 import llvmlite.ir as ir
 from numba.core import cgutils
 
-from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Vector
+from octasplat.engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, LANES, Vector
 
 I1, I32 = ir.IntType(1), ir.IntType(32)
 FLOAT, DOUBLE = ir.FloatType(), ir.DoubleType()

@@ -3,8 +3,8 @@ r"""Packets whose rays see their Gaussians in one order, for training.
 A ray's own order of hits is exact, and most of what a hit costs: each ray tests, sorts and keeps its own.
 Rays of a small packet meet much the same Gaussians in much the same order. Here the candidates of a packet
 are sorted once, by the distance at which its axis meets them (the first steps of
-:mod:`engine.trace.cpu.kernels_packet`), and all of its rays composite them in that order, sixteen rays at a
-time (:mod:`engine.trace.cpu.kernels_sixteen`), until none has light left:
+:mod:`octasplat.engine.trace.cpu.kernels_packet`), and all of its rays composite them in that order, sixteen
+rays at a time (:mod:`octasplat.engine.trace.cpu.kernels_sixteen`), until none has light left:
 
     for each candidate, front to back        rays of the packet, sixteen to a vector
         alphas of the rays that may meet it   [. . a a a . . .]   octagon, distance and limits as ever
@@ -17,8 +17,8 @@ packet, like the other one's.
 
 Not done: where octagons cross, and where a packet sees them obliquely, some of its rays composite in the
 wrong order; what that costs is in docs/experiments.md, "One order". Nor is there a second phase, are there
-features, or gradients by depths and normals; :class:`engine.trace.cpu.tracer.CpuTracer` says when this is
-used.
+features, or gradients by depths and normals; :class:`octasplat.engine.trace.cpu.tracer.CpuTracer` says when
+this is used.
 """
 
 from typing import NamedTuple
@@ -27,8 +27,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt64
 from numba import njit, prange
 
-from engine.trace.cpu.bundles import Forward
-from engine.trace.cpu.kernels_packet import (
+from octasplat.engine.trace.cpu.bundles import Forward
+from octasplat.engine.trace.cpu.kernels_packet import (
     AHEAD,
     RECORD_BYTES,
     SHOWN,
@@ -38,11 +38,11 @@ from engine.trace.cpu.kernels_packet import (
     new_candidates,
     write_row,
 )
-from engine.trace.cpu.kernels_packet_forward import show
-from engine.trace.cpu.kernels_packet_order import sort_by_distance
-from engine.trace.cpu.kernels_packet_walk import new_pyramid, new_walk
-from engine.trace.cpu.kernels_rays import ray_limits, ray_origin, ray_slopes
-from engine.trace.cpu.kernels_sixteen import (
+from octasplat.engine.trace.cpu.kernels_packet_forward import show
+from octasplat.engine.trace.cpu.kernels_packet_order import sort_by_distance
+from octasplat.engine.trace.cpu.kernels_packet_walk import new_pyramid, new_walk
+from octasplat.engine.trace.cpu.kernels_rays import ray_limits, ray_origin, ray_slopes
+from octasplat.engine.trace.cpu.kernels_sixteen import (
     COLOUR,
     COUNT,
     DEPTH,
@@ -65,14 +65,20 @@ from engine.trace.cpu.kernels_sixteen import (
     meet_group,
     show_group,
 )
-from engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch, taken_from_counter
+from octasplat.engine.trace.kernels_native import (
+    ask_for,
+    lean,
+    next_from_counter,
+    prefetch,
+    taken_from_counter,
+)
 
 GROUP = np.uint64((1 << SIXTEEN) - 1)
 NUMBER = np.uint64(0xFFFFFFFF)
 
 
 class View(NamedTuple):
-    """Memory of a thread for a packet: rows of :mod:`engine.trace.cpu.kernels_sixteen`, and what it meets.
+    """Memory of a thread for a packet: rows of the sixteen-ray kernels, and what it meets.
 
     ``met_ids``, ``met_bits`` and ``lines`` have room for as many Gaussians as there are candidates.
     """

@@ -1,8 +1,8 @@
 """The backward pass for packets whose rays see their Gaussians in one order.
 
-Each Gaussian of a packet gets a row of moments as in :mod:`engine.trace.cpu.kernels_packet_backward`, which
-sums them by Gaussian. Rays go back from what they have left in the end; float32 is enough, as what lies
-behind is summed from the back.
+Each Gaussian of a packet gets a row of moments as in
+:mod:`octasplat.engine.trace.cpu.kernels_packet_backward`, which sums them by Gaussian. Rays go back from what
+they have left in the end; float32 is enough, as what lies behind is summed from the back.
 """
 
 from typing import NamedTuple
@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float32
 from numba import njit, prange
 
-from engine.trace.cpu.kernels_one_order import aligned_rows, group_bits, write_ray_rows
-from engine.trace.cpu.kernels_packet_backward import PACKET, RED, ROW_WORDS, W
-from engine.trace.cpu.kernels_sixteen import (
+from octasplat.engine.trace.cpu.kernels_one_order import aligned_rows, group_bits, write_ray_rows
+from octasplat.engine.trace.cpu.kernels_packet_backward import PACKET, RED, ROW_WORDS, W
+from octasplat.engine.trace.cpu.kernels_sixteen import (
     BACK_ROWS,
     BEHIND,
     BY_RED,
@@ -29,11 +29,11 @@ from engine.trace.cpu.kernels_sixteen import (
     add_up,
     replay_group,
 )
-from engine.trace.kernels_native import lean, next_from_counter
+from octasplat.engine.trace.kernels_native import lean, next_from_counter
 
 
 class ViewBack(NamedTuple):
-    """Memory of a thread for a packet, see :mod:`engine.trace.cpu.kernels_sixteen`."""
+    """Memory of a thread for a packet, see :mod:`octasplat.engine.trace.cpu.kernels_sixteen`."""
 
     rays: Float32[np.ndarray, "5 64"]
     back: Float32[np.ndarray, "6 64"]

@@ -15,7 +15,7 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
 
 1. One walk down the hierarchy finds the blocks of eight Gaussians whose box reaches into the pyramid (A, not
    B), and of these Gaussians those whose ellipse does: the candidates, once for all 64 rays
-   (:mod:`engine.trace.cpu.kernels_packet_walk`).
+   (:mod:`octasplat.engine.trace.cpu.kernels_packet_walk`).
 2. The outline of an ellipse, seen from o, lies between two slopes a and two slopes b. Tables over 64 bins of
    each give the rays in between as the bits of one word. A candidate without a bit lies between the rays.
 3. Candidates are sorted by their likely distance and cut into chunks of 128. Within a chunk those that the
@@ -24,7 +24,8 @@ r"""Packets of rays that share an origin: which Gaussians may they meet, and the
    the hits before "safe", eight at once. It ends where its transmittance says so; what lies behind is never
    tested. A Gaussian has one colour for all rays of the packet, found when the first of them meets it.
 5. Backwards, the rays of a packet sum their shares of a Gaussian in one row of moments, which is enough as
-   all share o (:mod:`engine.trace.cpu.kernels_packet_backward`). Rows are sorted and summed by Gaussian.
+   all share o (:mod:`octasplat.engine.trace.cpu.kernels_packet_backward`). Rows are sorted and summed by
+   Gaussian.
 
 Steps 1 to 3 leave out only what no ray meets. Rows are computed in float64 from the record, in the packet's
 frame, and rounded to float32, in which rays are tested: what is lost is 1e-7 of a slope against the axis, the
@@ -39,12 +40,20 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt64
 from numba import njit
 
-from engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X, ROWS
-from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, INNER_RADIUS, MEAN, NORMAL, OPACITY, RECORD_WORDS
-from engine.trace.cpu.kernels_packet_walk import gather_candidates, write_pyramid
-from engine.trace.cpu.kernels_rays import ray_origin, record_vector
-from engine.trace.cpu.kernels_tree import WIDTH
-from engine.trace.kernels_native import LINE, lean, prefetch
+from octasplat.engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X, ROWS
+from octasplat.engine.trace.cpu.kernels_hit import (
+    AXIS_U,
+    AXIS_V,
+    INNER_RADIUS,
+    MEAN,
+    NORMAL,
+    OPACITY,
+    RECORD_WORDS,
+)
+from octasplat.engine.trace.cpu.kernels_packet_walk import gather_candidates, write_pyramid
+from octasplat.engine.trace.cpu.kernels_rays import ray_origin, record_vector
+from octasplat.engine.trace.cpu.kernels_tree import WIDTH
+from octasplat.engine.trace.kernels_native import LINE, lean, prefetch
 
 ROW_BYTES = ROWS * WIDTH * 4
 AHEAD = 8

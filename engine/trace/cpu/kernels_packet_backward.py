@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 from numba import njit, prange
 
-from engine.trace.cpu.kernels_eight_backward import add_row, replay_hits, walk_through
-from engine.trace.cpu.kernels_packet import AHEAD, RECORD_BYTES
-from engine.trace.cpu.kernels_rays import first_place, ray_origin, side_shown
-from engine.trace.cpu.kernels_records import rotation_columns
-from engine.trace.cpu.kernels_sh import add_by_colour, slope_by_mean, write_by_values, write_view
-from engine.trace.cpu.kernels_single_backward import Moments, write_gradients
-from engine.trace.cpu.kernels_tree import WIDTH
-from engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch
+from octasplat.engine.trace.cpu.kernels_eight_backward import add_row, replay_hits, walk_through
+from octasplat.engine.trace.cpu.kernels_packet import AHEAD, RECORD_BYTES
+from octasplat.engine.trace.cpu.kernels_rays import first_place, ray_origin, side_shown
+from octasplat.engine.trace.cpu.kernels_records import rotation_columns
+from octasplat.engine.trace.cpu.kernels_sh import add_by_colour, slope_by_mean, write_by_values, write_view
+from octasplat.engine.trace.cpu.kernels_single_backward import Moments, write_gradients
+from octasplat.engine.trace.cpu.kernels_tree import WIDTH
+from octasplat.engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch
 
 # --- row of sums of a packet's rays for one of its Gaussians, float32, one cache line ---
 H, HU, HV, HUU, HUV, HVV, HUUU, HVVV = range(8)  # the last two: h u (u^2 + v^2), h v (u^2 + v^2)

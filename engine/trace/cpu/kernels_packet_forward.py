@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt64
 from numba import njit, prange
 
-from engine.trace.cpu.bundles import Forward
-from engine.trace.cpu.kernels_eight import (
+from octasplat.engine.trace.cpu.bundles import Forward
+from octasplat.engine.trace.cpu.kernels_eight import (
     add_shown,
     keep_hits,
     know_slots,
@@ -16,8 +16,8 @@ from engine.trace.cpu.kernels_eight import (
     weigh_next,
     write_alphas,
 )
-from engine.trace.cpu.kernels_hit import MEAN, NORMAL
-from engine.trace.cpu.kernels_packet import (
+from octasplat.engine.trace.cpu.kernels_hit import MEAN, NORMAL
+from octasplat.engine.trace.cpu.kernels_packet import (
     CHUNK,
     RECORD_BYTES,
     ROW_BYTES,
@@ -28,9 +28,9 @@ from engine.trace.cpu.kernels_packet import (
     new_candidates,
     write_rows,
 )
-from engine.trace.cpu.kernels_packet_order import keep_candidates, sort_candidates
-from engine.trace.cpu.kernels_packet_walk import new_pyramid, new_walk
-from engine.trace.cpu.kernels_rays import (
+from octasplat.engine.trace.cpu.kernels_packet_order import keep_candidates, sort_candidates
+from octasplat.engine.trace.cpu.kernels_packet_walk import new_pyramid, new_walk
+from octasplat.engine.trace.cpu.kernels_rays import (
     first_place,
     ray_limits,
     ray_origin,
@@ -38,10 +38,10 @@ from engine.trace.cpu.kernels_rays import (
     record_vector,
     side_shown,
 )
-from engine.trace.cpu.kernels_sh import colour, write_view
-from engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit
-from engine.trace.cpu.kernels_tree import WIDTH
-from engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch
+from octasplat.engine.trace.cpu.kernels_sh import colour, write_view
+from octasplat.engine.trace.cpu.kernels_simd import float32_bits, float32_from_bits, lowest_bit
+from octasplat.engine.trace.cpu.kernels_tree import WIDTH
+from octasplat.engine.trace.kernels_native import ask_for, lean, next_from_counter, prefetch
 
 RANKED = 96
 """Hits that are sorted by counting, for each, the smaller ones, eight at once: quadratic, but without a

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from engine.trace.cpu.kernels_footprint import CELLS
-from engine.trace.cpu.kernels_packet import CHUNK, WORD
-from engine.trace.cpu.kernels_tree import WIDTH
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.cpu.kernels_footprint import CELLS
+from octasplat.engine.trace.cpu.kernels_packet import CHUNK, WORD
+from octasplat.engine.trace.cpu.kernels_tree import WIDTH
+from octasplat.engine.trace.kernels_native import lean
 
 FEW_KEYS = 48
 """An insertion sort is faster than two passes over 256 buckets for so few."""

@@ -11,9 +11,15 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt64
 from numba import njit
 
-from engine.trace.cpu.kernels_footprint import BINS, FRAME_WORDS, footprints, rays_between, write_bins
-from engine.trace.cpu.kernels_rays import ray_slopes
-from engine.trace.cpu.kernels_simd import (
+from octasplat.engine.trace.cpu.kernels_footprint import (
+    BINS,
+    FRAME_WORDS,
+    footprints,
+    rays_between,
+    write_bins,
+)
+from octasplat.engine.trace.cpu.kernels_rays import ray_slopes
+from octasplat.engine.trace.cpu.kernels_simd import (
     PLANE_WORDS,
     SIDES,
     boxes_in_pyramid,
@@ -21,8 +27,8 @@ from engine.trace.cpu.kernels_simd import (
     float32_bits,
     lowest_bit,
 )
-from engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
-from engine.trace.kernels_native import ask_for, lean
+from octasplat.engine.trace.cpu.kernels_tree import BOX_ROWS, LEAF_ROWS, WIDTH
+from octasplat.engine.trace.kernels_native import ask_for, lean
 
 STACK = 1024
 """Words for the nodes that wait, two each; a walk goes down at once, so that seven wait on each level."""
@@ -34,7 +40,7 @@ SLOPE_ROOM = 1e-9
 
 
 class Tree(NamedTuple):
-    """The hierarchy; :mod:`engine.trace.cpu.kernels_tree` says how it is laid out."""
+    """The hierarchy; :mod:`octasplat.engine.trace.cpu.kernels_tree` says how it is laid out."""
 
     nodes: Float32[np.ndarray, "m 6 8"]
     level_starts: Int64[np.ndarray, " l"]

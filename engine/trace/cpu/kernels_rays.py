@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_native import lean
 
 SPARE = 8
 """Places for hits beyond the most that a ray can have, as they are written eight at a time."""
@@ -70,7 +70,9 @@ def ray_leaves(rays, r, limits):
 
 @lean(forceinline=True)
 def side_shown(to_mean, normal, limits):
-    """1, or -1 where ``normal`` is turned to the viewer, see :class:`engine.trace.protocol.TraceSettings`.
+    """1, or -1 where ``normal`` is turned to the viewer.
+
+    See :class:`octasplat.engine.trace.protocol.TraceSettings`.
 
     ``to_mean`` leads from the origin of a ray to the Gaussian's mean. A ray that meets a Gaussian in front
     of its origin does so from the side on which the origin lies.

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN, NORMAL, OPACITY
+from octasplat.engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN, NORMAL, OPACITY
 
 
 @njit(error_model="numpy")

@@ -7,16 +7,16 @@ import math
 
 import numpy as np
 
-from engine.gaussians.harmonics import SH_C1, SH_C2, SH_C3
-from engine.gaussians.model import SH_C0
-from engine.trace.cpu.kernels_sh_lanes import (
+from octasplat.engine.gaussians.harmonics import SH_C1, SH_C2, SH_C3
+from octasplat.engine.gaussians.model import SH_C0
+from octasplat.engine.trace.cpu.kernels_sh_lanes import (
     CHANNELS,
     HARMONICS,
     add_harmonics,
     sum_of_harmonics,
     write_by_harmonic,
 )
-from engine.trace.kernels_native import lean
+from octasplat.engine.trace.kernels_native import lean
 
 SH_BYTES = HARMONICS * CHANNELS * 4
 

@@ -4,7 +4,7 @@ import llvmlite.ir as ir
 from numba import types
 from numba.extending import intrinsic
 
-from engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, Lanes, Vector
+from octasplat.engine.trace.cpu.kernels_simd import DOUBLE8, FLOAT8, I64, Lanes, Vector
 
 HARMONICS, CHANNELS = 16, 3
 FOURS = 4

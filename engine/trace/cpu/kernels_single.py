@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float32, UInt64
 from numba import njit, prange
 
-from engine.trace.cpu.bundles import Forward
-from engine.trace.cpu.kernels_composite import Hit, begin, composite, finish
-from engine.trace.cpu.kernels_hit import (
+from octasplat.engine.trace.cpu.bundles import Forward
+from octasplat.engine.trace.cpu.kernels_composite import Hit, begin, composite, finish
+from octasplat.engine.trace.cpu.kernels_hit import (
     ALPHA_MAX,
     BUFFER_FULL,
     COUNT,
@@ -27,8 +27,14 @@ from engine.trace.cpu.kernels_hit import (
     T_LIMIT,
     TRANSMITTANCE,
 )
-from engine.trace.cpu.kernels_rays import first_place, ray_direction, ray_leaves, ray_limits, ray_origin
-from engine.trace.kernels_native import call_with_three_pointers, lean, next_from_counter
+from octasplat.engine.trace.cpu.kernels_rays import (
+    first_place,
+    ray_direction,
+    ray_leaves,
+    ray_limits,
+    ray_origin,
+)
+from octasplat.engine.trace.kernels_native import call_with_three_pointers, lean, next_from_counter
 
 INT32_MAX = 2**31 - 1
 BEFORE, BEHIND = np.float32(0.999999), np.float32(1.000001)
@@ -38,7 +44,7 @@ BEFORE, BEHIND = np.float32(0.999999), np.float32(1.000001)
 class Embree(NamedTuple):
     """Addresses of a function of Embree and of a scene; for each chunk of rays, a ray and arguments.
 
-    The columns of ``scratch`` are those of :mod:`engine.trace.cpu.kernels_hit`.
+    The columns of ``scratch`` are those of :mod:`octasplat.engine.trace.cpu.kernels_hit`.
     """
 
     function: int

@@ -12,18 +12,18 @@ import numpy as np
 from jaxtyping import Float32, Int32
 from numba import njit, prange
 
-from engine.gaussians.model import SH_C0
-from engine.trace.cpu.kernels_hit import MEAN, NORMAL, OPACITY
-from engine.trace.cpu.kernels_rays import (
+from octasplat.engine.gaussians.model import SH_C0
+from octasplat.engine.trace.cpu.kernels_hit import MEAN, NORMAL, OPACITY
+from octasplat.engine.trace.cpu.kernels_rays import (
     ray_direction,
     ray_origin,
     ray_viewer,
     record_vector,
     side_shown,
 )
-from engine.trace.cpu.kernels_records import rotation_columns
-from engine.trace.cpu.kernels_sh import slope_by_mean, write_by_values, write_ray_view
-from engine.trace.kernels_native import lean, next_from_counter
+from octasplat.engine.trace.cpu.kernels_records import rotation_columns
+from octasplat.engine.trace.cpu.kernels_sh import slope_by_mean, write_by_values, write_ray_view
+from octasplat.engine.trace.kernels_native import lean, next_from_counter
 
 RED_OFF, GREEN_OFF, BLUE_OFF = 1 << 28, 1 << 29, 1 << 30
 """Bits of a hit's ray number: this channel's colour was clamped at zero and gets no gradient."""

@@ -2,16 +2,16 @@
 
 What is known of the packet's rays lies in rows of 64 numbers, a lane for each ray; so does what they have
 seen so far, and what goes back along them. A Gaussian is a line of sixteen numbers: the twelve of a row of
-:mod:`engine.trace.cpu.kernels_eight`, its colour, and nothing. No flag allows the compiler to change a
-result.
+:mod:`octasplat.engine.trace.cpu.kernels_eight`, its colour, and nothing. No flag allows the compiler to
+change a result.
 """
 
 import llvmlite.ir as ir
 from numba import types
 from numba.extending import intrinsic
 
-from engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X
-from engine.trace.cpu.kernels_simd import I64, Lanes, Vector, broadcast, exponential
+from octasplat.engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X
+from octasplat.engine.trace.cpu.kernels_simd import I64, Lanes, Vector, broadcast, exponential
 
 SIXTEEN = 16
 GROUPS = 4
@@ -37,9 +37,12 @@ BACK_ROWS = 6
 """Backwards: dL by each ray's colour, its error, dL by what lies behind, and the transmittance there."""
 LINE = 16
 COLOUR = 12
-"""Where a line has its colour; before it are the rows of :mod:`engine.trace.cpu.kernels_eight`."""
+"""Where a line has its colour; before it are the rows of :mod:`octasplat.engine.trace.cpu.kernels_eight`."""
 MOMENTS = 14
-"""Sums of a Gaussian over the rays, as a row of :mod:`engine.trace.cpu.kernels_packet_backward` begins."""
+"""Sums of a Gaussian over the rays.
+
+A row of :mod:`octasplat.engine.trace.cpu.kernels_packet_backward` begins so.
+"""
 
 
 def _rows(builder, address, group):

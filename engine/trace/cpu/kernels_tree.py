@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from engine.gaussians.kernels_order import spread_bits
-from engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
+from octasplat.engine.gaussians.kernels_order import spread_bits
+from octasplat.engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
 
 WIDTH = 8
 BOX_ROWS = 6

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import DTypeLike
 
-from engine.trace.cpu.bundles import OutputGradients, Outputs, RawGradients
-from engine.trace.kernels_native import LINE
-from engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
+from octasplat.engine.trace.cpu.bundles import OutputGradients, Outputs, RawGradients
+from octasplat.engine.trace.kernels_native import LINE
+from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, TraceResult
 
 
 def aligned_empty(shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:

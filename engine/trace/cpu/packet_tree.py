@@ -1,11 +1,14 @@
-"""The packets' hierarchy as arrays; :mod:`engine.trace.cpu.kernels_tree` says how they are laid out."""
+"""The packets' hierarchy as arrays.
+
+Their layout is described in :mod:`octasplat.engine.trace.cpu.kernels_tree`.
+"""
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from engine.trace.cpu.kernels_packet_walk import Tree
-from engine.trace.cpu.kernels_sort import stable_order
-from engine.trace.cpu.kernels_tree import (
+from octasplat.engine.trace.cpu.kernels_packet_walk import Tree
+from octasplat.engine.trace.cpu.kernels_sort import stable_order
+from octasplat.engine.trace.cpu.kernels_tree import (
     BOX_ROWS,
     KEY_BITS,
     LEAF_ROWS,
@@ -17,7 +20,7 @@ from engine.trace.cpu.kernels_tree import (
     write_leaves,
     write_upper_levels,
 )
-from engine.trace.cpu.memory import aligned_empty
+from octasplat.engine.trace.cpu.memory import aligned_empty
 
 _SAMPLE = 4096
 

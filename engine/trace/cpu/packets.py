@@ -5,8 +5,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from engine.rays import RayBatch
-from engine.trace.cpu.bundles import (
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.bundles import (
     ByGaussian,
     Forward,
     Limits,
@@ -17,10 +17,10 @@ from engine.trace.cpu.bundles import (
     Rays,
     Scene,
 )
-from engine.trace.cpu.kernels_one_order import see_packets
-from engine.trace.cpu.kernels_one_order_backward import replay_one_order
-from engine.trace.cpu.kernels_packet import packet_starts
-from engine.trace.cpu.kernels_packet_backward import (
+from octasplat.engine.trace.cpu.kernels_one_order import see_packets
+from octasplat.engine.trace.cpu.kernels_one_order_backward import replay_one_order
+from octasplat.engine.trace.cpu.kernels_packet import packet_starts
+from octasplat.engine.trace.cpu.kernels_packet_backward import (
     GEOMETRY_WORDS,
     ROW_WORDS,
     Rows,
@@ -28,14 +28,14 @@ from engine.trace.cpu.kernels_packet_backward import (
     sum_packets,
     sum_weights,
 )
-from engine.trace.cpu.kernels_packet_forward import absorb_packets, trace_packets
-from engine.trace.cpu.kernels_rays import SPARE
-from engine.trace.cpu.kernels_sixteen import LINE
-from engine.trace.cpu.kernels_sort import sort_by_gaussian
-from engine.trace.cpu.memory import Pool, empty_gradients, raw_gradients
-from engine.trace.cpu.packet_tree import PacketTree
-from engine.trace.cpu.recording import CpuRecording
-from engine.trace.protocol import GaussianGradients
+from octasplat.engine.trace.cpu.kernels_packet_forward import absorb_packets, trace_packets
+from octasplat.engine.trace.cpu.kernels_rays import SPARE
+from octasplat.engine.trace.cpu.kernels_sixteen import LINE
+from octasplat.engine.trace.cpu.kernels_sort import sort_by_gaussian
+from octasplat.engine.trace.cpu.memory import Pool, empty_gradients, raw_gradients
+from octasplat.engine.trace.cpu.packet_tree import PacketTree
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.protocol import GaussianGradients
 
 MAX_RAYS = 64
 """Rays of a packet: their set is the bits of one word."""

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int32, Int64
 
-from engine.rays import RayBatch
-from engine.trace.cpu.bundles import Hits, Limits, OneOrderHits, PacketHits
-from engine.trace.cpu.kernels_rays import first_place
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.cpu.bundles import Hits, Limits, OneOrderHits, PacketHits
+from octasplat.engine.trace.cpu.kernels_rays import first_place
 
 
 @dataclass(frozen=True)
 class CpuRecording:
-    """Hits in order along each ray; follows :class:`engine.trace.protocol.Recording`.
+    """Hits in order along each ray; follows :class:`octasplat.engine.trace.protocol.Recording`.
 
     Attributes:
         rays: the rays.

@@ -3,21 +3,29 @@
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from engine.trace.cpu.bundles import ByGaussian, Forward, Limits, OutputGradients, Parameters, Rays, Scene
-from engine.trace.cpu.kernels_hit import (
+from octasplat.engine.trace.cpu.bundles import (
+    ByGaussian,
+    Forward,
+    Limits,
+    OutputGradients,
+    Parameters,
+    Rays,
+    Scene,
+)
+from octasplat.engine.trace.cpu.kernels_hit import (
     RAY_WORDS,
     SCRATCH_WORDS,
     absorb_octagon,
     intersect_octagon,
     octagon_bounds,
 )
-from engine.trace.cpu.kernels_single import Embree, absorb_rays, trace_rays
-from engine.trace.cpu.kernels_single_backward import Shares, gather_gaussians, replay_rays
-from engine.trace.cpu.kernels_sort import sort_by_gaussian
-from engine.trace.cpu.memory import aligned_empty, empty_gradients, raw_gradients
-from engine.trace.cpu.recording import CpuRecording
-from engine.trace.embree_library import BoxScene, Device, intersect1_address, occluded1_address
-from engine.trace.protocol import GaussianGradients
+from octasplat.engine.trace.cpu.kernels_single import Embree, absorb_rays, trace_rays
+from octasplat.engine.trace.cpu.kernels_single_backward import Shares, gather_gaussians, replay_rays
+from octasplat.engine.trace.cpu.kernels_sort import sort_by_gaussian
+from octasplat.engine.trace.cpu.memory import aligned_empty, empty_gradients, raw_gradients
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.embree_library import BoxScene, Device, intersect1_address, occluded1_address
+from octasplat.engine.trace.protocol import GaussianGradients
 
 MAX_CHUNKS = 1024
 """Each chunk of rays has scratch memory of its own, 1.2 kB, so that any thread may take it."""

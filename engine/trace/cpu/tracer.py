@@ -4,10 +4,10 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from engine.gaussians.model import FlatGaussians
-from engine.rays import RayBatch
-from engine.threads import use_threads
-from engine.trace.cpu.bundles import (
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.threads import use_threads
+from octasplat.engine.trace.cpu.bundles import (
     Forward,
     Hits,
     Limits,
@@ -17,33 +17,45 @@ from engine.trace.cpu.bundles import (
     Rays,
     Scene,
 )
-from engine.trace.cpu.kernels_hit import RECORD_WORDS
-from engine.trace.cpu.kernels_rays import SPARE
-from engine.trace.cpu.kernels_records import outgrown_boxes, refresh_records, write_boxes, write_records
-from engine.trace.cpu.memory import Pool, aligned_empty, empty_result, output_gradients, outputs
-from engine.trace.cpu.packets import PacketTracer, Ways, find_packets
-from engine.trace.cpu.recording import CpuRecording
-from engine.trace.cpu.single_rays import SingleRayTracer
-from engine.trace.protocol import GaussianGradients, Recording, TraceGradients, TraceResult, TraceSettings
-from engine.trace.sums import add_gradients, heavier
+from octasplat.engine.trace.cpu.kernels_hit import RECORD_WORDS
+from octasplat.engine.trace.cpu.kernels_rays import SPARE
+from octasplat.engine.trace.cpu.kernels_records import (
+    outgrown_boxes,
+    refresh_records,
+    write_boxes,
+    write_records,
+)
+from octasplat.engine.trace.cpu.memory import Pool, aligned_empty, empty_result, output_gradients, outputs
+from octasplat.engine.trace.cpu.packets import PacketTracer, Ways, find_packets
+from octasplat.engine.trace.cpu.recording import CpuRecording
+from octasplat.engine.trace.cpu.single_rays import SingleRayTracer
+from octasplat.engine.trace.protocol import (
+    GaussianGradients,
+    Recording,
+    TraceGradients,
+    TraceResult,
+    TraceSettings,
+)
+from octasplat.engine.trace.sums import add_gradients, heavier
 
 MAX_RAYS_PER_TRACE = 1 << 28
 
 
 class CpuTracer:
-    """Flat Gaussians for a CPU; follows :class:`engine.trace.protocol.Tracer`.
+    """Flat Gaussians for a CPU; follows :class:`octasplat.engine.trace.protocol.Tracer`.
 
     Rays that lie beside each other in the batch, share their origin, have their viewer there and look about
-    one way form packets; the others are followed one by one (:func:`engine.trace.cpu.packets.find_packets`).
+    one way form packets; the others are followed one by one
+    (:func:`octasplat.engine.trace.cpu.packets.find_packets`).
 
     A hierarchy only says which octagons to test, the test and the distance come from the parameters, and hits
     are ordered by (float32 distance, id). So neither the shape of a hierarchy nor the number of threads
     changes a result. Single rays test in float64; packets in float32 in a frame of their own
-    (:mod:`engine.trace.cpu.kernels_packet`), so that the two agree but for that rounding, which is largest
-    for needles and for octagons seen edge on. Where ``settings.order`` is ``packet``, the rays of a packet
-    composite in one order (:mod:`engine.trace.cpu.kernels_one_order`), unless Gaussians have features or
-    there is a second phase. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy and a box
-    of 24 B; Embree's hierarchy over the boxes is built when single rays first want it.
+    (:mod:`octasplat.engine.trace.cpu.kernels_packet`), so that the two agree but for that rounding, which is
+    largest for needles and for octagons seen edge on. Where ``settings.order`` is ``packet``, the rays of a
+    packet composite in one order (:mod:`octasplat.engine.trace.cpu.kernels_one_order`), unless Gaussians have
+    features or there is a second phase. Memory per Gaussian: a record of 64 B, 48 B of the packets' hierarchy
+    and a box of 24 B; Embree's hierarchy over the boxes is built when single rays first want it.
 
     Not done: no gradient through octagon edges or visibility, and in one order none by depths and normals.
 

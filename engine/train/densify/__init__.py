@@ -1,9 +1,9 @@
 """Strategies that add, move and remove Gaussians while training, behind one protocol."""
 
-from engine.train.config import McmcConfig, PaperConfig
-from engine.train.densify.mcmc import Mcmc
-from engine.train.densify.paper import Paper
-from engine.train.densify.protocol import Densifier
+from octasplat.engine.train.config import McmcConfig, PaperConfig
+from octasplat.engine.train.densify.mcmc import Mcmc
+from octasplat.engine.train.densify.paper import Paper
+from octasplat.engine.train.densify.protocol import Densifier
 
 __all__ = ["Densifier", "Mcmc", "Paper", "make_densifier"]
 

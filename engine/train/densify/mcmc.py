@@ -8,10 +8,10 @@ from math import comb
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.trace.protocol import GaussianGradients
-from engine.train.config import McmcConfig
-from engine.train.optimiser import Adam
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.trace.protocol import GaussianGradients
+from octasplat.engine.train.config import McmcConfig
+from octasplat.engine.train.optimiser import Adam
 
 MAX_COPIES = 32
 

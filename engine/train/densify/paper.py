@@ -6,10 +6,10 @@
 import numpy as np
 from jaxtyping import Float32
 
-from engine.gaussians.model import FlatGaussians, concatenate
-from engine.trace.protocol import GaussianGradients
-from engine.train.config import PaperConfig
-from engine.train.optimiser import Adam
+from octasplat.engine.gaussians.model import FlatGaussians, concatenate
+from octasplat.engine.trace.protocol import GaussianGradients
+from octasplat.engine.train.config import PaperConfig
+from octasplat.engine.train.optimiser import Adam
 
 
 class Paper:

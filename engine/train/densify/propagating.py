@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
-from engine.gaussians.frames import quaternions
-from engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
-from engine.gaussians.model import SH_C0, FlatGaussians
-from engine.shading.material_settings import MaterialSettings
-from engine.trace.protocol import GaussianGradients
-from engine.train.densify.protocol import Densifier
-from engine.train.optimiser import Adam
+from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
+from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.trace.protocol import GaussianGradients
+from octasplat.engine.train.densify.protocol import Densifier
+from octasplat.engine.train.optimiser import Adam
 
 NEIGHBOURS = 12
 LEAST_COSINE = 0.9

@@ -5,9 +5,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
-from engine.gaussians.model import FlatGaussians
-from engine.trace.protocol import GaussianGradients
-from engine.train.optimiser import Adam
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.trace.protocol import GaussianGradients
+from octasplat.engine.train.optimiser import Adam
 
 
 @runtime_checkable

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from workers.settings import WorkerSettings
+    from octasplat.workers.settings import WorkerSettings
 
 _DATA = click.option(
     "--data", type=click.Path(path_type=Path), metavar="FOLDER", help="Data folder of octasplat serve."
@@ -24,9 +24,9 @@ def backup(folder: Path, data: Path | None) -> None:
     The service may run meanwhile; everything is of one moment. Into the folder of an earlier backup only new
     contents are copied. Whoever can read FOLDER can read everything; of tokens it holds digests only.
     """
-    from workers.settings import WorkerSettings, load_settings
-    from workers.store.opening import open_storage
-    from workers.upkeep.backup import back_up, explained
+    from octasplat.workers.settings import WorkerSettings, load_settings
+    from octasplat.workers.store.opening import open_storage
+    from octasplat.workers.upkeep.backup import back_up, explained
 
     settings = load_settings(WorkerSettings, data=data)
     with _database(settings) as conninfo, explained():
@@ -45,10 +45,10 @@ def restore(folder: Path, data: Path | None) -> None:
 
     No service may run on them. Jobs that were queued or under way when the backup was made are queued again.
     """
-    from workers.settings import WorkerSettings, load_settings
-    from workers.store.opening import open_storage
-    from workers.upkeep.backup import explained
-    from workers.upkeep.backup import restore as put_back
+    from octasplat.workers.settings import WorkerSettings, load_settings
+    from octasplat.workers.store.opening import open_storage
+    from octasplat.workers.upkeep.backup import explained
+    from octasplat.workers.upkeep.backup import restore as put_back
 
     settings = load_settings(WorkerSettings, data=data)
     with _database(settings, alone=True) as conninfo, explained():
@@ -62,8 +62,8 @@ def restore(folder: Path, data: Path | None) -> None:
 @contextlib.contextmanager
 def _database(settings: "WorkerSettings", *, alone: bool = False) -> Iterator[str]:
     """How to connect; the private database is started for as long as the block runs if it does not run."""
-    from workers.postgres.embedded import EmbeddedPostgres
-    from workers.serve.machine import hold_data
+    from octasplat.workers.postgres.embedded import EmbeddedPostgres
+    from octasplat.workers.serve.machine import hold_data
 
     if settings.database_url is not None:
         yield settings.conninfo()

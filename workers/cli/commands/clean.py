@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from workers.cli.options import quiet_option
+from octasplat.workers.cli.options import quiet_option
 
 
 @click.command(short_help="Remove faint Gaussians, oversized ones and floaters.")
@@ -55,14 +55,14 @@ def clean(
     if (output is None) != dry_run:
         raise click.UsageError("Name the result with -o, or say --dry-run.")
 
-    from engine.edit.cleaning import CleanOptions
-    from engine.edit.cleaning import clean as find_clean
-    from engine.errors import ConfigError
-    from engine.files import read_facts
-    from engine.run_folder import is_run, run_near_zones
-    from workers.cli.editing import checked_options, speaker, targets_for, write_scene
-    from workers.cli.scene_files import open_scene
-    from workers.cli.signals import orderly_termination
+    from octasplat.engine.edit.cleaning import CleanOptions
+    from octasplat.engine.edit.cleaning import clean as find_clean
+    from octasplat.engine.errors import ConfigError
+    from octasplat.engine.files import read_facts
+    from octasplat.engine.run_folder import is_run, run_near_zones
+    from octasplat.workers.cli.editing import checked_options, speaker, targets_for, write_scene
+    from octasplat.workers.cli.scene_files import open_scene
+    from octasplat.workers.cli.signals import orderly_termination
 
     options: CleanOptions = checked_options(CleanOptions, given)
     targets = targets_for(output, [source], [source]) if output is not None else ()

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from engine.errors import ConfigError
-from engine.train.preset_names import PRESETS
-from workers.cli.options import export_names, exports_option, quiet_option
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.train.preset_names import PRESETS
+from octasplat.workers.cli.options import export_names, exports_option, quiet_option
 
 if TYPE_CHECKING:
-    from workers.client.api import Api
+    from octasplat.workers.client.api import Api
 
 F = TypeVar("F", bound=Callable[..., Any])
 STATES = ("queued", "running", "canceling", "succeeded", "failed", "canceled")
@@ -45,7 +45,7 @@ def set_option(command: F) -> F:
 @contextmanager
 def connected(server: str | None) -> Iterator["Api"]:
     """The service that the user means; the token is no option, as others on a machine see those."""
-    from workers.client.api import Api, find_address, find_token
+    from octasplat.workers.client.api import Api, find_address, find_token
 
     address = server or find_address(os.environ)
     with Api(address, find_token(os.environ, address)) as api:
@@ -83,8 +83,8 @@ def submit(
 
     The same command goes on with an upload that broke off.
     """
-    from workers.cli.submitting import submit, submit_and_wait
-    from workers.client.submission import Submission
+    from octasplat.workers.cli.submitting import submit, submit_and_wait
+    from octasplat.workers.client.submission import Submission
 
     what = Submission(scene, _options(given), given["label"], given["queue"], given["priority"])
     with connected(server) as api:
@@ -134,8 +134,8 @@ def derive(
     'last' is the newest job. For example: octasplat derive render last --stage stage.toml --set frames=60,
     or: octasplat derive material last --set set.roughness=0.3 --set where="metallic > 0.5" --wait
     """
-    from workers.cli.submitting import derive, submit_and_wait
-    from workers.client.submission import Derivation, with_environments, with_stage
+    from octasplat.workers.cli.submitting import derive, submit_and_wait
+    from octasplat.workers.client.submission import Derivation, with_environments, with_stage
 
     with connected(server) as api:
         source = _job(api, job_id)["id"]
@@ -177,7 +177,7 @@ def jobs(state: tuple[str, ...], limit: int, server: str | None) -> None:
 @quiet_option
 def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bool) -> None:
     """Show how far JOB is; 'last' is the newest one."""
-    from workers.cli.submitting import wait_for
+    from octasplat.workers.cli.submitting import wait_for
 
     with connected(server) as api:
         job = _job(api, job_id)
@@ -265,7 +265,7 @@ def download(
     job_id: str, names: tuple[str, ...], output: Path | None, server: str | None, quiet: bool
 ) -> None:
     """Save the results of JOB, or only those called NAMES; goes on where it broke off."""
-    from workers.cli.submitting import fetch
+    from octasplat.workers.cli.submitting import fetch
 
     with connected(server) as api:
         job = _job(api, job_id)
@@ -296,7 +296,7 @@ def _assigned(
         if not equals:
             raise ConfigError(f"--set {assignment}: write it as name=value, e.g. rates.quat=0.02.")
         if training:
-            from engine.config import training_setting  # here, as it takes half a second
+            from octasplat.engine.config import training_setting  # here, as it takes half a second
 
             inner = training_setting(name.strip())
             name = f"train.{inner}" if inner else name

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workers.cli.options import quiet_option, selection_options
+from octasplat.workers.cli.options import quiet_option, selection_options
 
 
 @click.command(short_help="Keep part of a scene.")
@@ -28,13 +28,13 @@ def crop(
     if where is None and box is None and sphere is None:
         raise click.UsageError("Say what to keep: --box, --sphere or --where.")
 
-    from engine.edit.choices import Selection
-    from engine.edit.selection import chosen_by
-    from engine.errors import ConfigError
-    from engine.files import read_facts
-    from workers.cli.editing import checked_options, speaker, targets_for, write_scene
-    from workers.cli.scene_files import open_scene
-    from workers.cli.signals import orderly_termination
+    from octasplat.engine.edit.choices import Selection
+    from octasplat.engine.edit.selection import chosen_by
+    from octasplat.engine.errors import ConfigError
+    from octasplat.engine.files import read_facts
+    from octasplat.workers.cli.editing import checked_options, speaker, targets_for, write_scene
+    from octasplat.workers.cli.scene_files import open_scene
+    from octasplat.workers.cli.signals import orderly_termination
 
     (target,) = targets_for(output, [source], [source])
     gaussians = open_scene(source, quiet=quiet)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workers.cli.options import quiet_option, report_option, scenes_output_option
+from octasplat.workers.cli.options import quiet_option, report_option, scenes_output_option
 
 
 @click.command(short_help="A scene that follows a deformed cage or coarse mesh.")
@@ -67,8 +67,8 @@ def deform(
     quiet: bool,
 ) -> None:
     """Let the scene IN follow a coarse mesh, as an artist or a physics engine deformed it."""
-    from workers.cli.editing import run_deform
-    from workers.cli.signals import orderly_termination
+    from octasplat.workers.cli.editing import run_deform
+    from octasplat.workers.cli.signals import orderly_termination
 
     with orderly_termination():
         run_deform(

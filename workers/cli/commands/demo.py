@@ -5,9 +5,9 @@ from typing import Any
 
 import click
 
-from engine.train.preset_names import PRESETS
-from workers.cli.browsing import has_display
-from workers.cli.options import quiet_option, threads_option
+from octasplat.engine.train.preset_names import PRESETS
+from octasplat.workers.cli.browsing import has_display
+from octasplat.workers.cli.options import quiet_option, threads_option
 
 DEFAULT_OUTPUT = Path("octasplat-demo")
 
@@ -42,7 +42,7 @@ def demo(output: Path, open_report: bool | None, **options: Any) -> None:
 
     The same command goes on where it was interrupted.
     """
-    from workers.cli.demonstration import make_scene, reconstruct_scene
+    from octasplat.workers.cli.demonstration import make_scene, reconstruct_scene
 
     size = {"views": options["views"], "width_px": options["width"], "height_px": options["height"]}
     quiet, threads = options["quiet"], options["threads"]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workers.cli.options import quiet_option, report_option, scenes_output_option
+from octasplat.workers.cli.options import quiet_option, report_option, scenes_output_option
 
 
 @click.command(short_help="A mesh edited elsewhere back to Gaussians.")
@@ -75,8 +75,8 @@ def edit(
     The mesh is what octasplat export wrote for IN, moved, bent, cut or copied in a mesh editor. Gaussians
     whose octagon stayed keep every bit. See docs/editing.md.
     """
-    from workers.cli.editing import run_edit
-    from workers.cli.signals import orderly_termination
+    from octasplat.workers.cli.editing import run_edit
+    from octasplat.workers.cli.signals import orderly_termination
 
     given = {
         "method": method,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workers.cli.options import quiet_option, threads_option
+from octasplat.workers.cli.options import quiet_option, threads_option
 
 
 @click.command(short_help="Measure a finished run again.")
@@ -38,12 +38,12 @@ def evaluate(
         return
     if scene is not None and on is not None:
         raise click.UsageError("Choose one of --scene (the run's own photographs) and --on (others).")
-    from engine.config import read_config
-    from engine.evaluate import runs
-    from engine.run_folder import CONFIG
-    from workers.cli.progress import show_progress
-    from workers.cli.signals import orderly_termination
-    from workers.telling.wording import measured_summary, run_summary
+    from octasplat.engine.config import read_config
+    from octasplat.engine.evaluate import runs
+    from octasplat.engine.run_folder import CONFIG
+    from octasplat.workers.cli.progress import show_progress
+    from octasplat.workers.cli.signals import orderly_termination
+    from octasplat.workers.telling.wording import measured_summary, run_summary
 
     with orderly_termination(), show_progress(quiet=quiet) as listener:
         metrics = runs.evaluate(output, scene=scene, on=on, threads=threads, listener=listener)
@@ -65,9 +65,9 @@ def _evaluate_scales(
         numbers = [0]
     if on is not None or numbers[0] < 1:
         raise click.UsageError("--scales takes whole numbers such as 2,4,8, and the run's own photographs.")
-    from engine.evaluate.runs import evaluate_scales
-    from workers.cli.progress import show_progress
-    from workers.cli.signals import orderly_termination
+    from octasplat.engine.evaluate.runs import evaluate_scales
+    from octasplat.workers.cli.progress import show_progress
+    from octasplat.workers.cli.signals import orderly_termination
 
     with orderly_termination(), show_progress(quiet=quiet) as listener:
         found = evaluate_scales(output, numbers, scene=scene, threads=threads, listener=listener)

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from workers.cli.camera_options import AXES
-from workers.cli.options import quiet_option
+from octasplat.workers.cli.camera_options import AXES
+from octasplat.workers.cli.options import quiet_option
 
 if TYPE_CHECKING:
-    from engine.files import ExportOptions
-    from engine.gaussians.model import FlatGaussians
+    from octasplat.engine.files import ExportOptions
+    from octasplat.engine.gaussians.model import FlatGaussians
 
 
 CORES_OF_CHUNKS, CORES_IN_ORDER = 0.3, 0.5
@@ -23,7 +23,7 @@ class _ExportCommand(click.Command):
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the formats, one a row."""
-        from engine.files import exporters
+        from octasplat.engine.files import exporters
 
         rows = [
             (exporter.name, f"{', '.join(exporter.patterns)}: {exporter.description}")
@@ -128,12 +128,12 @@ def export(
     """
     if up and not materials:
         raise click.UsageError("--up goes with --materials.")
-    from engine.files import ExportOptions, export_scene, exporter_for, read_facts
-    from engine.gaussians.materials import require_materials
-    from engine.gaussians.octagon import CHI2_2_99
-    from workers.cli.scene_files import open_scene, warn_of_losses
-    from workers.cli.signals import orderly_termination
-    from workers.rendering.cameras import light_up
+    from octasplat.engine.files import ExportOptions, export_scene, exporter_for, read_facts
+    from octasplat.engine.gaussians.materials import require_materials
+    from octasplat.engine.gaussians.octagon import CHI2_2_99
+    from octasplat.workers.cli.scene_files import open_scene, warn_of_losses
+    from octasplat.workers.cli.signals import orderly_termination
+    from octasplat.workers.rendering.cameras import light_up
 
     exporter = exporter_for(target, format_name)  # complain before the long work
     if opaque and exporter.name != "glb":
@@ -180,8 +180,8 @@ def _drawn_in_order(
     """In one chunk and in the order of most photographs' cameras, where these agree; else as it was."""
     import numpy as np
 
-    from engine.render.draw_order import AGREEMENT, common_order
-    from engine.run_folder import CONFIG, is_run, run_viewpoints
+    from octasplat.engine.render.draw_order import AGREEMENT, common_order
+    from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
 
     if not (is_run(source) and (source / CONFIG).exists()):
         return gaussians, options
@@ -195,7 +195,7 @@ def _drawn_in_order(
 
 def _colour(text: str | None, source: Path) -> "str | tuple[float, float, float]":
     """What ``--colour`` says: ``cameras``, ``constant``, or a direction."""
-    from engine.run_folder import is_run
+    from octasplat.engine.run_folder import is_run
 
     if text is None:
         return "cameras" if is_run(source) else "constant"
@@ -215,9 +215,9 @@ def _one_colour(
 ) -> "FlatGaussians":
     import numpy as np
 
-    from engine.plain_colours import PlainScene
-    from engine.render.one_colour import colours_toward, with_colours
-    from engine.run_folder import is_run
+    from octasplat.engine.plain_colours import PlainScene
+    from octasplat.engine.render.one_colour import colours_toward, with_colours
+    from octasplat.engine.run_folder import is_run
 
     if colour == "constant" or gaussians.sh_degree == 0:
         return gaussians

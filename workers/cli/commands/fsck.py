@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from workers.settings import WorkerSettings
-    from workers.store.fsck import Reference, Report
+    from octasplat.workers.settings import WorkerSettings
+    from octasplat.workers.store.fsck import Reference, Report
 
 _SHOWN = 50
 
@@ -26,7 +26,7 @@ def fsck(data: Path | None, verify: bool, as_json: bool) -> None:
     import dataclasses
     import json
 
-    from workers.settings import WorkerSettings, load_settings
+    from octasplat.workers.settings import WorkerSettings, load_settings
 
     settings = load_settings(WorkerSettings, data=data)
     report = _report(settings, verify)
@@ -66,8 +66,8 @@ def describe(report: "Report") -> list[str]:
 def _report(settings: "WorkerSettings", verify: bool) -> "Report":
     import asyncio
 
-    from workers.store.fsck import compare
-    from workers.store.opening import open_storage
+    from octasplat.workers.store.fsck import compare
+    from octasplat.workers.store.opening import open_storage
 
     conninfo = settings.conninfo()
     storage = open_storage(settings.storage_address, floor_bytes=0)
@@ -75,8 +75,8 @@ def _report(settings: "WorkerSettings", verify: bool) -> "Report":
 
 
 async def _references(conninfo: str) -> "list[Reference]":
-    from workers.records.database import open_pool
-    from workers.records.references import references
+    from octasplat.workers.records.database import open_pool
+    from octasplat.workers.records.references import references
 
     async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
         return [reference async for reference in references(connection)]

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from workers.cli.options import quiet_option
+from octasplat.workers.cli.options import quiet_option
 
 if TYPE_CHECKING:
-    from engine.files import ChannelChoice
-    from engine.gaussians.flattening import ImportReport
+    from octasplat.engine.files import ChannelChoice
+    from octasplat.engine.gaussians.flattening import ImportReport
 
 
 @click.command("import", short_help="Splats of any format to a scene of flat Gaussians.")
@@ -45,11 +45,11 @@ def import_(
     .glb with KHR_gaussian_splatting. A Gaussian with three extents loses the smallest; what that means for
     the scene is told. All other commands read the same formats.
     """
-    from engine.files import read_facts, read_scene
-    from engine.files.gaussian_ply import write_gaussian_ply
-    from workers.cli.progress import show_progress
-    from workers.cli.signals import orderly_termination
-    from workers.telling.losses import losses
+    from octasplat.engine.files import read_facts, read_scene
+    from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+    from octasplat.workers.cli.progress import show_progress
+    from octasplat.workers.cli.signals import orderly_termination
+    from octasplat.workers.telling.losses import losses
 
     if target.suffix.lower() != ".ply":
         raise click.UsageError(f"{target} should end in .ply; octasplat export writes the other formats.")

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from workers.cli.camera_options import AXES
-from workers.cli.options import threads_option
+from octasplat.workers.cli.camera_options import AXES
+from octasplat.workers.cli.options import threads_option
 
 if TYPE_CHECKING:
-    from workers.rendering.facts import Found
+    from octasplat.workers.rendering.facts import Found
 
 BAR = 24
 WIDTH = 60
@@ -41,10 +41,10 @@ def info(
     """
     from dataclasses import replace
 
-    from engine.render.images import write_png
-    from workers.cli.scene_files import speaker_of_losses
-    from workers.rendering.facts import find_facts
-    from workers.rendering.views import stage_place
+    from octasplat.engine.render.images import write_png
+    from octasplat.workers.cli.scene_files import speaker_of_losses
+    from octasplat.workers.rendering.facts import find_facts
+    from octasplat.workers.rendering.views import stage_place
 
     place, up_world = stage_place(source, scene, up, speaker_of_losses(as_json))
     found = find_facts(replace(place, threads=threads), up_world)
@@ -60,7 +60,7 @@ def info(
 
 
 def _as_json(source: Path, found: "Found") -> dict[str, Any]:
-    from engine.evaluate.scene_facts import OPACITY_EDGES, QUANTILES
+    from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES, QUANTILES
 
     facts = asdict(found.scene)
     facts["seen"] = {
@@ -78,7 +78,7 @@ def _as_json(source: Path, found: "Found") -> dict[str, Any]:
 
 
 def _lines(source: Path, found: "Found") -> list[str]:
-    from engine.evaluate.scene_facts import OPACITY_EDGES
+    from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES
 
     scene = found.scene
     size = source.stat().st_size if source.is_file() else 0

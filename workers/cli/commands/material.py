@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from workers.cli.options import quiet_option, selection_options
+from octasplat.workers.cli.options import quiet_option, selection_options
 
 
 @click.command(short_help="Change the materials of a scene.")
@@ -54,8 +54,8 @@ def material(**options: Any) -> None:
     Without a choice all Gaussians are changed; of several choices all must hold. For example:
     octasplat material OUT --set roughness=0.3 --where "metallic > 0.5" -o OUT2
     """
-    from workers.cli.materials import run_material
-    from workers.cli.signals import orderly_termination
+    from octasplat.workers.cli.materials import run_material
+    from octasplat.workers.cli.signals import orderly_termination
 
     with orderly_termination():
         run_material(options)

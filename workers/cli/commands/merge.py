@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from workers.cli.options import quiet_option
+from octasplat.workers.cli.options import quiet_option
 
 
 @click.command(short_help="Put scenes together.")
@@ -24,12 +24,12 @@ def merge(sources: tuple[Path, ...], output: Path, sh_degree: int | None, quiet:
     if len(sources) < 2:
         raise click.UsageError("Name at least two scenes.")
 
-    from engine.edit.selection import merge as merge_scenes
-    from engine.files import read_facts
-    from engine.gaussians.scene_facts import shared_facts
-    from workers.cli.editing import speaker, targets_for, write_scene
-    from workers.cli.scene_files import open_scene
-    from workers.cli.signals import orderly_termination
+    from octasplat.engine.edit.selection import merge as merge_scenes
+    from octasplat.engine.files import read_facts
+    from octasplat.engine.gaussians.scene_facts import shared_facts
+    from octasplat.workers.cli.editing import speaker, targets_for, write_scene
+    from octasplat.workers.cli.scene_files import open_scene
+    from octasplat.workers.cli.signals import orderly_termination
 
     (target,) = targets_for(output, [sources[0]], sources)
     with orderly_termination():

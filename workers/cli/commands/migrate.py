@@ -15,8 +15,8 @@ def migrate(data: Path | None) -> None:
     octasplat serve and the front end do so by themselves as they start; workers wait for it, and no other
     command does. Processes of the version before go on meanwhile.
     """
-    from workers.records.migrate import migrate
-    from workers.settings import WorkerSettings, load_settings
+    from octasplat.workers.records.migrate import migrate
+    from octasplat.workers.settings import WorkerSettings, load_settings
 
     applied = migrate(load_settings(WorkerSettings, data=data).conninfo())
     click.echo(f"Applied {', '.join(applied)}." if applied else "Nothing to do.")

@@ -38,7 +38,7 @@ def quota(owner: str, clear: bool, data: Path | None, **limits: int | None) -> N
     """
     import asyncio
 
-    from workers.settings import WorkerSettings, load_settings
+    from octasplat.workers.settings import WorkerSettings, load_settings
 
     settings = load_settings(WorkerSettings, data=data)
     for line in asyncio.run(_run(settings.conninfo(), owner, clear, limits)):
@@ -46,8 +46,8 @@ def quota(owner: str, clear: bool, data: Path | None, **limits: int | None) -> N
 
 
 async def _run(conninfo: str, owner: str, clear: bool, limits: dict[str, int | None]) -> list[str]:
-    from workers.records.database import open_pool
-    from workers.records.quotas import NO_QUOTA, Quota, quota_of, set_quota, usage_of
+    from octasplat.workers.records.database import open_pool
+    from octasplat.workers.records.quotas import NO_QUOTA, Quota, quota_of, set_quota, usage_of
 
     async with open_pool(conninfo, max_size=1) as pool, pool.connection() as connection:
         if clear or any(value is not None for value in limits.values()):

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from engine.train.preset_names import PRESETS
-from workers.cli.options import (
+from octasplat.engine.train.preset_names import PRESETS
+from octasplat.workers.cli.options import (
     background_option,
     export_names,
     exports_option,
@@ -15,7 +15,7 @@ from workers.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from engine.config import ReconstructionConfig
+    from octasplat.engine.config import ReconstructionConfig
 
 _NOT_SETTINGS = ("scene", "output", "threads", "resume", "quiet", "exports")
 
@@ -96,7 +96,7 @@ def reconstruct(**options: Any) -> None:
     The output folder gets scene.ply, meshes, metrics.json, report.html, renders of the held-out views and
     checkpoints. Ctrl-C stops after writing a checkpoint; the same command with --resume goes on.
     """
-    from workers.cli.reconstruction import run_reconstruction
+    from octasplat.workers.cli.reconstruction import run_reconstruction
 
     output: Path = options["output"]
     run_reconstruction(
@@ -111,8 +111,8 @@ def reconstruct(**options: Any) -> None:
 
 def _config(output: Path, options: dict[str, Any]) -> "ReconstructionConfig":
     """The settings asked for; with ``--resume`` and none given, those of the run."""
-    from engine.config import read_config, resolve_config
-    from engine.train.config import FOR_SURFACE
+    from octasplat.engine.config import read_config, resolve_config
+    from octasplat.engine.train.config import FOR_SURFACE
 
     given = any(
         value not in (None, (), False) for name, value in options.items() if name not in _NOT_SETTINGS

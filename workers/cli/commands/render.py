@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from workers.cli.camera_options import AXES, camera_options, check_cameras, check_output
-from workers.cli.options import quiet_option, threads_option
+from octasplat.workers.cli.camera_options import AXES, camera_options, check_cameras, check_output
+from octasplat.workers.cli.options import quiet_option, threads_option
 
 PREVIEW_SIDE_PX = 480
 
@@ -66,7 +66,7 @@ def render(**options: Any) -> None:
         raise click.UsageError("Choose one of --views, --turntable, --path and --camera.")
     if options["frames"] and options["seconds"]:
         raise click.UsageError("Choose one of --frames and --seconds.")
-    from engine.run_folder import is_run
+    from octasplat.engine.run_folder import is_run
 
     of_run = is_run(options["source"])
     mode = modes[0] if modes else "views" if of_run else "turntable"
@@ -92,13 +92,13 @@ def render(**options: Any) -> None:
         single = mode == "camera" or (mode == "turntable" and options["frames"] == 1)
         check_output(options["output"], options["exr"], single=single, known=mode == "turntable")
 
-    from engine.errors import Cancelled
-    from engine.light.stage_file import read_stage
-    from engine.stages import stopping
-    from workers.cli.progress import show_progress
-    from workers.cli.scene_files import speaker_of_losses
-    from workers.cli.signals import Stopped, stop_on_signals
-    from workers.rendering.views import Keeping, SetStage, render_files
+    from octasplat.engine.errors import Cancelled
+    from octasplat.engine.light.stage_file import read_stage
+    from octasplat.engine.stages import stopping
+    from octasplat.workers.cli.progress import show_progress
+    from octasplat.workers.cli.scene_files import speaker_of_losses
+    from octasplat.workers.cli.signals import Stopped, stop_on_signals
+    from octasplat.workers.rendering.views import Keeping, SetStage, render_files
 
     path, quiet = options["stage"], options["quiet"]
     say = speaker_of_losses(quiet)

@@ -37,13 +37,13 @@ def serve(
     import contextlib
     import threading
 
-    from engine.errors import OctasplatError
-    from workers.cli.browsing import has_display, open_signed_in
-    from workers.cli.commands.worker import parse_queues
-    from workers.client.api import Api
-    from workers.logs import log_to_stderr
-    from workers.serve.machine import Plan, serve
-    from workers.settings import WorkerSettings, load_settings
+    from octasplat.engine.errors import OctasplatError
+    from octasplat.workers.cli.browsing import has_display, open_signed_in
+    from octasplat.workers.cli.commands.worker import parse_queues
+    from octasplat.workers.client.api import Api
+    from octasplat.workers.logs import log_to_stderr
+    from octasplat.workers.serve.machine import Plan, serve
+    from octasplat.workers.settings import WorkerSettings, load_settings
 
     log_to_stderr()
     settings = load_settings(WorkerSettings, data=data)
@@ -59,7 +59,7 @@ def serve(
             threading.Thread(target=show_page, daemon=True).start()
 
     async def show(address: str) -> None:
-        from workers.cli.submitting import run_demo
+        from octasplat.workers.cli.submitting import run_demo
 
         say(address)
         with Api.local(settings.data) as api:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from workers.cli.camera_options import AXES
-from workers.cli.options import quiet_option
+from octasplat.workers.cli.camera_options import AXES
+from octasplat.workers.cli.options import quiet_option
 
 
 @click.group(short_help="Stages: things and lights put into a scene.")
@@ -27,10 +27,10 @@ def init(source: Path, output: Path, up: str | None, scene: Path | None, quiet: 
     It knows what is up, has a glass ball on what seems to be the floor, and a light from where the scene's
     own seems to come. What else there is stands in it as comments.
     """
-    from workers.cli.scene_files import speaker_of_losses
-    from workers.cli.signals import orderly_termination
-    from workers.rendering.stages import first_stage
-    from workers.rendering.views import stage_place
+    from octasplat.workers.cli.scene_files import speaker_of_losses
+    from octasplat.workers.cli.signals import orderly_termination
+    from octasplat.workers.rendering.stages import first_stage
+    from octasplat.workers.rendering.views import stage_place
 
     with orderly_termination():
         place, axis = stage_place(source, scene, up, speaker_of_losses(quiet))

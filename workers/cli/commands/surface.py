@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
-from workers.cli.camera_options import AXES
-from workers.cli.options import quiet_option, threads_option
+from octasplat.workers.cli.camera_options import AXES
+from octasplat.workers.cli.options import quiet_option, threads_option
 
 FACTORS = {"": 1, "k": 1000, "M": 1_000_000}
 
@@ -156,9 +156,9 @@ def surface(
     """
     if up and not materials:
         raise click.UsageError("--up goes with --materials.")
-    from engine.errors import Cancelled
-    from workers.cli.signals import Stopped, stop_on_signals
-    from workers.cli.surfacing import ROOM, Asked, run_surface
+    from octasplat.engine.errors import Cancelled
+    from octasplat.workers.cli.signals import Stopped, stop_on_signals
+    from octasplat.workers.cli.surfacing import ROOM, Asked, run_surface
 
     # None means "all" for the holes, and the default for everything else.
     options = {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 if TYPE_CHECKING:
-    from workers.records.database import Connection
+    from octasplat.workers.records.database import Connection
 
 T = TypeVar("T")
 
@@ -33,7 +33,7 @@ def create(
     name: str, owner: str | None, scopes: tuple[str, ...], days: float | None, data: Path | None
 ) -> None:
     """Make a token called NAME and show its secret, this once. From the first on, nobody gets in without."""
-    from workers.records.tokens import add_token, new_secret
+    from octasplat.workers.records.tokens import add_token, new_secret
 
     secret = new_secret()
 
@@ -56,7 +56,7 @@ def create(
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
 def list_all(data: Path | None) -> None:
     """List all tokens, without their secrets."""
-    from workers.records.tokens import list_tokens
+    from octasplat.workers.records.tokens import list_tokens
 
     now = datetime.now(UTC)
     for row in _with_database(data, list_tokens):
@@ -71,7 +71,7 @@ def list_all(data: Path | None) -> None:
 @click.option("--data", type=click.Path(path_type=Path), metavar="FOLDER")
 def revoke(token_id: uuid.UUID, data: Path | None) -> None:
     """Shut the token TOKEN_ID out, with the sessions of browsers that were begun with it."""
-    from workers.records.tokens import revoke_token
+    from octasplat.workers.records.tokens import revoke_token
 
     async def shut(connection: "Connection") -> bool:
         await _write_down(connection, "token revoke", f"/v1/tokens/{token_id}")
@@ -81,7 +81,7 @@ def revoke(token_id: uuid.UUID, data: Path | None) -> None:
 
 
 async def _write_down(connection: "Connection", action: str, target: str) -> None:
-    from workers.records.audit import add_entry
+    from octasplat.workers.records.audit import add_entry
 
     await add_entry(connection, address="command line", owner=_user(), action=action, target=target)
 
@@ -100,9 +100,9 @@ def _with_database(data: Path | None, what: Callable[["Connection"], Awaitable[T
 
     import psycopg
 
-    from workers.records.database import open_pool
-    from workers.records.errors import DatabaseError
-    from workers.settings import WorkerSettings, load_settings
+    from octasplat.workers.records.database import open_pool
+    from octasplat.workers.records.errors import DatabaseError
+    from octasplat.workers.settings import WorkerSettings, load_settings
 
     conninfo = load_settings(WorkerSettings, data=data).conninfo()
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from workers.cli.camera_options import AXES
-from workers.cli.options import quiet_option
+from octasplat.workers.cli.camera_options import AXES
+from octasplat.workers.cli.options import quiet_option
 
 
 @click.command(short_help="Move, turn or scale a scene.")
@@ -62,11 +62,11 @@ def transform(
 
     import numpy as np
 
-    from engine.edit import affine
-    from engine.files import read_facts
-    from workers.cli.editing import speaker, targets_for, write_scene
-    from workers.cli.scene_files import open_scene
-    from workers.cli.signals import orderly_termination
+    from octasplat.engine.edit import affine
+    from octasplat.engine.files import read_facts
+    from octasplat.workers.cli.editing import speaker, targets_for, write_scene
+    from octasplat.workers.cli.scene_files import open_scene
+    from octasplat.workers.cli.signals import orderly_termination
 
     (target,) = targets_for(output, [source], [source])
     turns = np.eye(4)

@@ -45,9 +45,9 @@ def worker(queues: str, name: str | None, data: Path | None) -> None:
     """
     import asyncio
 
-    from workers.logs import log_to_stderr
-    from workers.settings import WorkerSettings, load_settings
-    from workers.work.process import run_worker
+    from octasplat.workers.logs import log_to_stderr
+    from octasplat.workers.settings import WorkerSettings, load_settings
+    from octasplat.workers.work.process import run_worker
 
     chosen = parse_queues(queues)
     log_to_stderr()

@@ -5,7 +5,13 @@ import socket
 
 import httpx
 
-from workers.upkeep.webhooks.addresses import AddressRefused, IPAddress, is_allowed, is_public, read_address
+from octasplat.workers.upkeep.webhooks.addresses import (
+    AddressRefused,
+    IPAddress,
+    is_allowed,
+    is_public,
+    read_address,
+)
 
 
 class GuardedTransport(httpx.AsyncBaseTransport):
@@ -16,7 +22,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
     The name is still what the certificate must be for and what the header ``Host`` says.
 
     Args:
-        allowed_hosts: see :func:`workers.upkeep.webhooks.addresses.check_url`.
+        allowed_hosts: see :func:`octasplat.workers.upkeep.webhooks.addresses.check_url`.
         inner: what sends requests to numeric addresses.
     """
 

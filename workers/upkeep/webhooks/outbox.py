@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from psycopg.rows import class_row
 
-from workers.records.database import Connection
-from workers.upkeep.webhooks.rows import Delivery, Endpoint, get_endpoint
+from octasplat.workers.records.database import Connection
+from octasplat.workers.upkeep.webhooks.rows import Delivery, Endpoint, get_endpoint
 
 LEASE_SECONDS = 60
 """After so long a message whose sender was lost is taken by another."""

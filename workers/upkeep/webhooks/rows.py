@@ -9,10 +9,10 @@ from typing import Any, Literal
 from psycopg.rows import class_row
 from psycopg.types.json import Jsonb
 
-from engine.errors import OctasplatError
-from workers.records.database import Connection, naming
-from workers.records.errors import Missing
-from workers.records.ids import new_id
+from octasplat.engine.errors import OctasplatError
+from octasplat.workers.records.database import Connection, naming
+from octasplat.workers.records.errors import Missing
+from octasplat.workers.records.ids import new_id
 
 EventName = Literal[
     "job.queued", "job.running", "job.canceling", "job.succeeded", "job.failed", "job.canceled"

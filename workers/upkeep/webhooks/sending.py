@@ -9,13 +9,13 @@ import httpx
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from workers.ending import end
-from workers.records.database import Pool
-from workers.upkeep.webhooks.addresses import AddressRefused, check_url
-from workers.upkeep.webhooks.guarding import GuardedTransport
-from workers.upkeep.webhooks.outbox import Outcome, settle, take_due
-from workers.upkeep.webhooks.rows import Delivery, Endpoint
-from workers.upkeep.webhooks.signing import message
+from octasplat.workers.ending import end
+from octasplat.workers.records.database import Pool
+from octasplat.workers.upkeep.webhooks.addresses import AddressRefused, check_url
+from octasplat.workers.upkeep.webhooks.guarding import GuardedTransport
+from octasplat.workers.upkeep.webhooks.outbox import Outcome, settle, take_due
+from octasplat.workers.upkeep.webhooks.rows import Delivery, Endpoint
+from octasplat.workers.upkeep.webhooks.signing import message
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ class Sender:
 
     Args:
         pool: connections.
-        allowed_hosts: see :func:`workers.upkeep.webhooks.addresses.check_url`.
+        allowed_hosts: see :func:`octasplat.workers.upkeep.webhooks.addresses.check_url`.
     """
 
     def __init__(self, pool: Pool, allowed_hosts: tuple[str, ...] = ()) -> None:

@@ -5,11 +5,11 @@ from typing import cast
 
 from pydantic import BaseModel
 
-from engine.light.stage_file import named_files
-from engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
-from workers.records.sizes import Sizes
-from workers.work.kinds.demands import Demand
-from workers.work.kinds.estimates import (
+from octasplat.engine.light.stage_file import named_files
+from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
+from octasplat.workers.records.sizes import Sizes
+from octasplat.workers.work.kinds.demands import Demand
+from octasplat.workers.work.kinds.estimates import (
     estimate_reconstruction,
     estimate_relight,
     estimate_render,
@@ -18,7 +18,7 @@ from workers.work.kinds.estimates import (
     rendered_pixels,
     training_pixels,
 )
-from workers.work.kinds.options import (
+from octasplat.workers.work.kinds.options import (
     EvaluateOptions,
     ExportJobOptions,
     MaterialJobOptions,
@@ -28,7 +28,7 @@ from workers.work.kinds.options import (
     resolve_reconstruction,
     revise_reconstruction,
 )
-from workers.work.kinds.table import JobKind, register, validated
+from octasplat.workers.work.kinds.table import JobKind, register, validated
 
 _RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl")
 _LIGHT = "environment.hdr"
@@ -45,7 +45,7 @@ def register_all() -> None:
             title="Photographs to a scene, its meshes and measurements",
             needs="dataset",
             options=ReconstructOptions,
-            program="workers.work.programs:reconstruct",
+            program="octasplat.workers.work.programs:reconstruct",
             stages=_reconstruction_stages,
             resolve=resolve_reconstruction,
             needs_poses=lambda options: cast(ReconstructOptions, options).poses == "given",
@@ -66,7 +66,7 @@ def register_all() -> None:
             title="Measure views of a reconstruction: those held out again, or other photographs",
             needs="result",
             options=EvaluateOptions,
-            program="workers.work.programs:evaluate",
+            program="octasplat.workers.work.programs:evaluate",
             stages=lambda _options: ("evaluate",),
             resolve=validated(EvaluateOptions),
             source_files=(*_RUN_FILES, _LIGHT, _BACKGROUND, "edits.json"),
@@ -80,7 +80,7 @@ def register_all() -> None:
             title="The scene of a reconstruction in other formats",
             needs="result",
             options=ExportJobOptions,
-            program="workers.work.programs:export",
+            program="octasplat.workers.work.programs:export",
             stages=lambda _options: ("export",),
             resolve=validated(ExportJobOptions),
             writes=lambda options: cast(ExportJobOptions, options).files,
@@ -97,7 +97,7 @@ def register_all() -> None:
             title="New views of the scene of a reconstruction, as a video or images",
             needs="result",
             options=RenderJobOptions,
-            program="workers.work.programs:render",
+            program="octasplat.workers.work.programs:render",
             stages=lambda _options: ("render",),
             resolve=validated(RenderJobOptions),
             demands=_render_demands,
@@ -114,7 +114,7 @@ def register_all() -> None:
             title="The scene of a reconstruction with materials in other light",
             needs="result",
             options=RelightJobOptions,
-            program="workers.work.programs:relight",
+            program="octasplat.workers.work.programs:relight",
             stages=lambda _options: ("render",),
             resolve=validated(RelightJobOptions),
             demands=_relight_demands,
@@ -134,7 +134,7 @@ def register_all() -> None:
             title="The scene of a reconstruction with other materials",
             needs="result",
             options=MaterialJobOptions,
-            program="workers.work.programs:material",
+            program="octasplat.workers.work.programs:material",
             stages=lambda _options: ("edit",),
             resolve=validated(MaterialJobOptions),
             source_files=(_LIGHT, *_RUN_FILES, "edits.json"),

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, computed_field
 
-from engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
-from workers.records.sizes import Sizes
-from workers.telling.wording import duration
-from workers.work.kinds.options import (
+from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
+from octasplat.workers.records.sizes import Sizes
+from octasplat.workers.telling.wording import duration
+from octasplat.workers.work.kinds.options import (
     PictureOptions,
     ReconstructOptions,
     RelightJobOptions,

@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from engine.config import ReconstructionConfig
-from engine.edit.choices import MaterialChange, Selection
-from engine.errors import SceneFileError
-from engine.files import exporter_for
-from engine.light.stage import Stage
-from engine.train.config import preset, with_materials
-from engine.train.preset_names import PRESETS
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.edit.choices import MaterialChange, Selection
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import exporter_for
+from octasplat.engine.light.stage import Stage
+from octasplat.engine.train.config import preset, with_materials
+from octasplat.engine.train.preset_names import PRESETS
 
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _TAKEN = frozenset(

@@ -6,10 +6,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
-from engine.errors import ConfigError
-from workers.records.sizes import Sizes
-from workers.work.kinds.demands import Demand
-from workers.work.kinds.estimates import Estimate
+from octasplat.engine.errors import ConfigError
+from octasplat.workers.records.sizes import Sizes
+from octasplat.workers.work.kinds.demands import Demand
+from octasplat.workers.work.kinds.estimates import Estimate
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class JobKind:
         needs: what it works on: a committed dataset, or the results of a finished job.
         options: model of its options, whose JSON Schema is published.
         program: ``module:function`` that does the work, imported by the job's own process only; it takes a
-            :class:`workers.work.task.Task` and returns the names of its results.
+            :class:`octasplat.workers.work.task.Task` and returns the names of its results.
         stages: names of its stages, in order, given the options.
         resolve: from what a user asks for to complete options.
         source_files: results of the source job that it reads, if it needs one; those that are missing are
@@ -38,8 +38,8 @@ class JobKind:
         writes_at: where the options name those files.
         demands: what the options ask for that a service may set a ceiling to, given the photographs' sizes.
         names_files: files that the options name, each after the place where they do, with dots; they are
-            uploaded as a dataset that holds files, and are in :attr:`workers.work.task.Task.files`. None for
-            a kind that takes no files.
+            uploaded as a dataset that holds files, and are in :attr:`octasplat.workers.work.task.Task.files`.
+            None for a kind that takes no files.
         estimate: time and memory that it takes, given the options, the photographs' sizes and the number of
             cores; None where nobody knows.
     """

@@ -1,4 +1,4 @@
-"""``python -m service``: the front end alone, configured by the environment.
+"""The front end alone, configured by the environment: the program behind ``octasplat api``.
 
 On SIGTERM requests under way are finished and streams end.
 """
@@ -12,14 +12,14 @@ import sys
 import uvicorn
 from fastapi import FastAPI
 
-from engine.errors import OctasplatError
-from service.app import create_app
-from service.settings import ServiceSettings
-from workers.isolation.abilities import tell_what_lacks
-from workers.isolation.hiding import hide_memory
-from workers.logs import log_to_stderr
-from workers.parent import die_with_server
-from workers.settings import load_settings
+from octasplat.engine.errors import OctasplatError
+from octasplat.service.app import create_app
+from octasplat.service.settings import ServiceSettings
+from octasplat.workers.isolation.abilities import tell_what_lacks
+from octasplat.workers.isolation.hiding import hide_memory
+from octasplat.workers.logs import log_to_stderr
+from octasplat.workers.parent import die_with_server
+from octasplat.workers.settings import load_settings
 
 GRACE_SECONDS = 10
 KEEP_ALIVE_SECONDS = 75
