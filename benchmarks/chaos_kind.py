@@ -15,7 +15,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted
 from octasplat.workers.work.kinds import JobKind, register
-from octasplat.workers.work.kinds.table import validated
 from octasplat.workers.work.task import Task
 
 EVERY = 5
@@ -109,7 +108,6 @@ register(
         needs="dataset",
         options=ChainOptions,
         program="benchmarks.chaos_kind:run",
-        stages=lambda _options: ("train",),
-        resolve=validated(ChainOptions),
+        stages=("train",),
     )
 )

@@ -7,7 +7,6 @@ from pydantic import BaseModel, ConfigDict
 
 from octasplat.engine.events import StageProgress, StageStarted
 from octasplat.workers.work.kinds import JobKind, register
-from octasplat.workers.work.kinds.table import validated
 from octasplat.workers.work.task import Task
 
 PIECE_BYTES = 1 << 20
@@ -38,7 +37,6 @@ register(
         needs="dataset",
         options=GluttonOptions,
         program="benchmarks.glutton_kind:run",
-        stages=lambda _options: ("train",),
-        resolve=validated(GluttonOptions),
+        stages=("train",),
     )
 )

@@ -100,6 +100,14 @@ class Warned(Event):
 
 
 @dataclass(frozen=True)
+class Noted(Event):
+    """Something worth a line of the log, in one sentence, that needs no attention."""
+
+    kind: ClassVar[str] = "note"
+    message: str
+
+
+@dataclass(frozen=True)
 class RunFinished(Event):
     """The whole job is done; ``outputs`` are paths relative to the output folder."""
 
@@ -118,6 +126,7 @@ EVENT_KINDS: dict[str, type[Event]] = {
         HeldOutMeasured,
         CheckpointWritten,
         Warned,
+        Noted,
     )
 }
 

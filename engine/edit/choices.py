@@ -17,27 +17,35 @@ from pydantic import (
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.edit.where import MAX_LENGTH, check_where
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.fields import Spelling
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
 
 _HEX = re.compile(r"#([0-9a-fA-F]{6})")
 
 
-class Selection(BaseModel):
-    """Which Gaussians are meant: those for which all that is given holds.
+_Box = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+_Sphere = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
-    Attributes:
-        where: comparisons that hold for them, such as 'metallic > 0.5 and z < 0'; None means all.
-        box: two corners of a box that their centres lie in, x, y, z of each, smallest coordinates first.
-        sphere: centre x, y, z and radius of a sphere that their centres lie in.
-        inverse: the others instead.
-    """
+
+class Selection(BaseModel):
+    """Which Gaussians are meant: those for which all that is given holds."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    where: str | None = Field(None, max_length=MAX_LENGTH)
-    box: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
-    sphere: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat] | None = None
-    inverse: bool = False
+    where: Annotated[str | None, Spelling(metavar="EXPRESSION")] = Field(
+        None,
+        max_length=MAX_LENGTH,
+        description="Comparisons joined by and, or, not that hold for them, of x, y, z, opacity and channels "
+        "such as metallic, roughness and albedo.r: 'metallic > 0.5 and z < 0'.",
+    )
+    box: Annotated[_Box | None, Spelling(metavar="X0 Y0 Z0 X1 Y1 Z1")] = Field(
+        None,
+        description="Two corners of a box that their centres lie in, smallest coordinates first.",
+    )
+    sphere: Annotated[_Sphere | None, Spelling(metavar="X Y Z R")] = Field(
+        None, description="Centre and radius of a sphere that their centres lie in."
+    )
+    inverse: bool = Field(False, description="Take the other Gaussians instead.")
 
     @field_validator("where")
     @classmethod

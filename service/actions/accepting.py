@@ -167,7 +167,7 @@ async def _source(connection: Connection, who: Principal, asked: _Asked) -> _Inp
     new, kind = asked.new, asked.kind
     if new.source_id is None:
         raise input_problem("source_id", f"The kind {kind.name} works on source_id, a finished job.")
-    if new.dataset_id is not None and kind.on_others is None:
+    if new.dataset_id is not None and not kind.takes_other_photographs:
         detail = f"The kind {kind.name} works on source_id alone, a finished job."
         raise input_problem("dataset_id", detail)
     source = await rows.get_job(connection, new.source_id, lock=True)
@@ -178,12 +178,12 @@ async def _source(connection: Connection, who: Principal, asked: _Asked) -> _Inp
         raise Problem(409, "source", f"The job in source_id is {source.state} and has no results.")
     if kind.source_files and kind.source_files[0] not in names:
         raise input_problem("source_id", f"The job in source_id has no {kind.source_files[0]}.")
-    if new.dataset_id is not None and kind.on_others is not None:
+    if new.dataset_id is not None and kind.takes_other_photographs:
         dataset = await _photographs(connection, who, new.dataset_id)
         if not dataset.has_poses:
             detail = "The dataset holds no COLMAP model, which says where in the scene its photographs are."
             raise input_problem("dataset_id", detail)
-        return _Inputs(dataset.id, source.id, kind.on_others(asked.options))
+        return _Inputs(dataset.id, source.id, kind.on_other_photographs(asked.options))
     return _Inputs(source.dataset_id, source.id, asked.options)
 
 

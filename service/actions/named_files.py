@@ -28,10 +28,10 @@ async def check_named_files(
     Raises:
         Problem: 422, with the place of each such name; 409 if the dataset is not committed.
     """
-    names = [] if kind.names_files is None else list(kind.names_files(options))
+    names = list(kind.named_files(options))
     sent: set[str] = set()
     if files_id is not None:
-        if kind.names_files is None:
+        if not kind.takes_files:
             raise input_problem("files_id", f"Jobs of the kind {kind.name} take no files.")
         dataset = await get_dataset(connection, files_id, lock=True)
         if dataset is None or not who.owns(dataset.owner):

@@ -5,8 +5,8 @@ from dataclasses import replace
 import toy_kind
 from toy_kind import ToyOptions
 
-from octasplat.workers.work.kinds import register
-from octasplat.workers.work.kinds.table import _KINDS, validated
+from octasplat.workers.work.kinds import JobKind, register
+from octasplat.workers.work.kinds.table import _KINDS
 from octasplat.workers.work.task import Task
 
 
@@ -19,10 +19,15 @@ def run(task: Task) -> None:
     toy_kind.run(replace(task, options=known))
 
 
-TOY = _KINDS.pop("toy")
+_KINDS.pop("toy")
 for name in ("toy", "later"):
     register(
-        replace(
-            TOY, name=name, options=LaterOptions, program="later_toy:run", resolve=validated(LaterOptions)
+        JobKind(
+            name=name,
+            title="Counts",
+            needs="dataset",
+            options=LaterOptions,
+            program="later_toy:run",
+            stages=("train",),
         )
     )

@@ -9,7 +9,6 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from octasplat.workers.work.kinds import JobKind, register
-from octasplat.workers.work.kinds.table import validated
 from octasplat.workers.work.task import Task
 
 
@@ -73,7 +72,6 @@ register(
         needs="dataset",
         options=SpyOptions,
         program="spy_kind:run",
-        stages=lambda _options: ("train",),
-        resolve=validated(SpyOptions),
+        stages=("train",),
     )
 )

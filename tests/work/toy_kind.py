@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict
 from octasplat.engine.errors import Cancelled, DatasetError
 from octasplat.engine.events import CheckpointWritten, StageFinished, StageProgress, StageStarted, Warned
 from octasplat.workers.work.kinds import JobKind, register
-from octasplat.workers.work.kinds.table import validated
 from octasplat.workers.work.task import Task
 
 if Path(os.environ.get("XDG_CACHE_HOME", "/nowhere"), "broken").exists():
@@ -121,7 +120,6 @@ register(
         needs="dataset",
         options=ToyOptions,
         program="toy_kind:run",
-        stages=lambda _options: ("train",),
-        resolve=validated(ToyOptions),
+        stages=("train",),
     )
 )

@@ -12,6 +12,7 @@ from rich.text import Text
 from octasplat.engine.events import (
     Event,
     Listener,
+    Noted,
     StageFinished,
     StageProgress,
     StageStarted,
@@ -76,6 +77,8 @@ class Bars:
             self._print(self._state.finished(event))
         elif isinstance(event, Warned):
             self._print(f"Warning: {event.message}", style="yellow")
+        elif isinstance(event, Noted):
+            self._print(event.message, style="dim")
 
     def _begin(self, event: StageStarted) -> None:
         self._end()
@@ -114,7 +117,7 @@ def show_progress(
         return
     console = Console(file=sys.stdout)
     if not sys.stdout.isatty() or console.is_dumb_terminal:
-        yield PlainLines(_echo, warn=_complain)
+        yield PlainLines(_echo, warn=_complain, note=_complain)
         return
     display = Bars(console, should_stop)
     with display.bars:

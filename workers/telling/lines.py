@@ -6,6 +6,7 @@ from collections.abc import Callable
 from octasplat.engine.events import (
     Event,
     HeldOutMeasured,
+    Noted,
     StageFinished,
     StageProgress,
     StageStarted,
@@ -90,6 +91,7 @@ class PlainLines:
         write: takes a line.
         every_seconds: between two lines of one stage.
         warn: takes a warning; by default as any other line.
+        note: takes a note; by default as any other line.
     """
 
     def __init__(
@@ -98,9 +100,11 @@ class PlainLines:
         every_seconds: float = SECONDS_BETWEEN_LINES,
         *,
         warn: Callable[[str], None] | None = None,
+        note: Callable[[str], None] | None = None,
     ) -> None:
         self._write = write
         self._warn = warn or write
+        self._note = note or write
         self._every = every_seconds
         self._next = 0.0
         self._state = StageState()
@@ -115,6 +119,8 @@ class PlainLines:
             self._write(self._state.finished(event))
         elif isinstance(event, Warned):
             self._warn(f"Warning: {event.message}")
+        elif isinstance(event, Noted):
+            self._note(event.message)
         elif isinstance(event, StageProgress | TrainingProgress) and time.monotonic() >= self._next:
             self._next = time.monotonic() + self._every
             self._write(self._line(event))

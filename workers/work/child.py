@@ -83,6 +83,7 @@ def _work(given: dict[str, Any], lines: _Lines, stop: threading.Event) -> int:
                 threads=given["threads"],
                 listener=tell,
                 should_stop=stop.is_set,
+                kind=given.get("kind", ""),
             )
         )
     except Cancelled as error:

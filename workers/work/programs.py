@@ -15,6 +15,7 @@ from octasplat.engine.events import (
     CheckpointWritten,
     Event,
     Listener,
+    Noted,
     StageFinished,
     StageProgress,
     Warned,
@@ -30,6 +31,8 @@ from octasplat.engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCEN
 from octasplat.engine.stages import counted_stage, stopping
 from octasplat.engine.writing import write_json
 from octasplat.workers.store.names import check_name
+from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
     EvaluateOptions,
     ExportJobOptions,
@@ -212,6 +215,20 @@ def material(task: Task) -> None:
         write_changed_run(task.run, changed, folder, edit_note(options, options, chosen))
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         _publish(task, path, path.relative_to(folder).as_posix())
+
+
+def run_operation(task: Task) -> None:
+    """What the job's kind says, by the operation of the engine; publishes what it writes."""
+    kind = kind_named(task.kind)
+    assert isinstance(kind, OperationKind)
+    options = kind.resolve(task.options)
+    tell = stopping(task.listener, task.should_stop)
+    with counted_stage(kind.stages(options)[0], tell, 0):
+        result = kind.operation.run(
+            kind.request(task), progress=tell, should_stop=task.should_stop, threads=task.threads
+        )
+        for line in result.lines():
+            tell(Noted(_places(task).named(line)))
 
 
 def _picture_arguments(task: Task, options: PictureOptions) -> dict[str, Any]:

@@ -170,6 +170,7 @@ class Supervisor:
         self._reporter.expect(kind.stages(options))
         return {
             "program": kind.program,
+            "kind": kind.name,
             "kind_modules": list(settings.kind_modules),
             "folder": str(self._workspace.folder),
             "options": job.options,

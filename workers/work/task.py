@@ -10,6 +10,9 @@ from octasplat.engine.events import Listener, ignore
 RUN, RESULTS, SCENE, FILES = "run", "results", "scene", "files"
 """Folders of an attempt: the engine's output, what is to be published, photographs, files that are named."""
 
+SCENE_FILE, CONFIG_FILE = "scene.ply", "config.json"
+"""Results that tell a scene, and that it is one of a run."""
+
 FRAMES = "frames"
 """In the engine's output, images of a render that are done; they are kept for later attempts."""
 
@@ -36,6 +39,7 @@ class Task:
         threads: to use; 0 means all cores.
         listener: hears the progress.
         should_stop: asked now and then; True asks to stop with what is needed to go on.
+        kind: name of the job's kind.
     """
 
     folder: Path
@@ -45,11 +49,17 @@ class Task:
     threads: int = 0
     listener: Listener = ignore
     should_stop: Callable[[], bool] = field(default=lambda: False)
+    kind: str = ""
 
     @property
     def run(self) -> Path:
         """The engine's output folder."""
         return self.folder / RUN
+
+    @property
+    def source(self) -> Path:
+        """The source job's results as a run, or, where they are no whole run, the scene among them."""
+        return self.run if (self.run / CONFIG_FILE).exists() else self.run / SCENE_FILE
 
     @property
     def files(self) -> Path:

@@ -1,15 +1,15 @@
 """The kinds that octasplat brings."""
 
-from collections.abc import Iterator, Sequence
-from typing import cast
-
-from pydantic import BaseModel
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from octasplat.engine.light.stage_file import named_files
+from octasplat.engine.operations.crop import OPERATION as CROP
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
 from octasplat.workers.work.kinds.estimates import (
+    Estimate,
     estimate_reconstruction,
     estimate_relight,
     estimate_render,
@@ -18,6 +18,7 @@ from octasplat.workers.work.kinds.estimates import (
     rendered_pixels,
     training_pixels,
 )
+from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
     EvaluateOptions,
     ExportJobOptions,
@@ -28,7 +29,7 @@ from octasplat.workers.work.kinds.options import (
     resolve_reconstruction,
     revise_reconstruction,
 )
-from octasplat.workers.work.kinds.table import JobKind, register, validated
+from octasplat.workers.work.kinds.table import JobKind, register
 
 _RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl")
 _LIGHT = "environment.hdr"
@@ -37,176 +38,213 @@ _BACKGROUND = "background.exr"
 """What results with a learnt background have, and no others."""
 
 
+class Reconstruct(JobKind[ReconstructOptions]):
+    """Photographs to a scene."""
+
+    writes_at = "exports"
+
+    def resolve(self, asked: Mapping[str, Any]) -> ReconstructOptions:
+        """Return complete options: those of the preset, and what was asked for on top."""
+        return resolve_reconstruction(asked)
+
+    def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructOptions:
+        """Return the options of a job with changes; another preset brings its own settings."""
+        return revise_reconstruction(before, changes)
+
+    def stages(self, options: ReconstructOptions) -> tuple[str, ...]:
+        """Return the stages, those that find poses among them if there are none."""
+        stages = ("load", "train", "evaluate", "export")
+        return stages if options.poses == "given" else ("features", "matches", "poses", *stages)
+
+    def needs_poses(self, options: ReconstructOptions) -> bool:
+        """Return whether the dataset must hold a COLMAP model."""
+        return options.poses == "given"
+
+    def settle(self, options: ReconstructOptions, has_poses: bool) -> ReconstructOptions:
+        """Return the options with poses decided, so that no job shows stages that it will not have."""
+        if options.poses != "missing":
+            return options
+        return options.model_copy(update={"poses": "given" if has_poses else "auto"})
+
+    def goes_on(self, before: ReconstructOptions, after: ReconstructOptions) -> bool:
+        """Return whether only the files differ, which are written after everything else."""
+        return before.model_copy(update={"exports": after.exports}) == after
+
+    def writes(self, options: ReconstructOptions) -> tuple[str, ...]:
+        """Return the names of the files to export."""
+        return options.exports
+
+    def demands(self, options: ReconstructOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+        """Return what the training asks for."""
+        train = options.train
+        pixels = training_pixels(options, sizes)
+        gaussians = most_gaussians(train, pixels)
+        iterations = MOST_PLANNED_ITERATIONS if options.minutes else iteration_count(train, pixels)
+        return (
+            Demand("train.iterations", "iterations", iterations),
+            Demand("train.max_gaussians", "gaussians", gaussians),
+            Demand("train.rays", "rays", train.rays),
+            Demand("train.probe_rays", "rays", train.probe_rays),
+            Demand("train.window_rays", "rays", train.window_rays),
+            Demand("train.patch_side", "rays", train.patch_side**2),
+            Demand("max_side", "side_px", options.max_side or 0),
+            Demand("exports", "exports", len(options.exports)),
+            Demand("max_side", "workspace_bytes", reconstruction_bytes(options, sizes)),
+        )
+
+    def estimate(self, options: ReconstructOptions, sizes: Sequence[Sizes], cores: int) -> Estimate:
+        """Return the time and memory that it takes."""
+        return estimate_reconstruction(options, sizes, cores)
+
+
+class Evaluate(JobKind[EvaluateOptions]):
+    """Views measured."""
+
+    takes_other_photographs = True
+
+    def needs_photographs(self, options: EvaluateOptions) -> bool:
+        """Return True: views are compared with photographs."""
+        return True
+
+    def on_other_photographs(self, options: EvaluateOptions) -> EvaluateOptions:
+        """Return the options for photographs of which none was trained on."""
+        return options.model_copy(update={"all_views": True})
+
+
+class Export(JobKind[ExportJobOptions]):
+    """A scene in other formats."""
+
+    writes_at = "files"
+
+    def writes(self, options: ExportJobOptions) -> tuple[str, ...]:
+        """Return the names of the files."""
+        return options.files
+
+    def demands(self, options: ExportJobOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+        """Return the number of files."""
+        return (Demand("files", "exports", len(options.files)),)
+
+
+class Render(JobKind[RenderJobOptions]):
+    """New views."""
+
+    takes_files = True
+
+    def named_files(self, options: RenderJobOptions) -> Iterator[tuple[str, str]]:
+        """Return the files of the stage."""
+        for key, name in named_files(options.stage) if options.stage is not None else ():
+            yield f"stage.{key.replace('[', '.').replace(']', '')}", name
+
+    def demands(self, options: RenderJobOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+        """Return the pixels and paths of all images."""
+        path = "frames" if options.mode == "turntable" else "max_side"
+        pixels = rendered_pixels(options, sizes)
+        always = (
+            Demand(path, "render_pixels", pixels),
+            Demand("format", "workspace_bytes", image_bytes(options, sizes)),
+        )
+        if options.stage is None:
+            return always
+        samples = options.stage.integrator.samples
+        return (*always, Demand("stage.integrator.samples", "render_paths", pixels * samples))
+
+    def estimate(self, options: RenderJobOptions, sizes: Sequence[Sizes], cores: int) -> Estimate:
+        """Return the time and memory that it takes."""
+        return estimate_render(options, sizes, cores)
+
+
+class Relight(JobKind[RelightJobOptions]):
+    """Other light."""
+
+    takes_files = True
+
+    def named_files(self, options: RelightJobOptions) -> Iterator[tuple[str, str]]:
+        """Return the environments."""
+        return ((f"environments.{place}", name) for place, name in enumerate(options.environments))
+
+    def demands(self, options: RelightJobOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+        """Return the pixels and paths of all images."""
+        path = "frames" if options.mode == "turntable" else "max_side"
+        pixels, count = rendered_pixels(options, sizes), len(options.environments)
+        return (
+            Demand(path, "render_pixels", pixels * count),
+            Demand("format", "workspace_bytes", image_bytes(options, sizes, count)),
+            Demand("samples", "render_paths", pixels * options.rays),
+        )
+
+    def estimate(self, options: RelightJobOptions, sizes: Sequence[Sizes], cores: int) -> Estimate:
+        """Return the time and memory that it takes."""
+        return estimate_relight(options, sizes, cores)
+
+
+class Material(JobKind[MaterialJobOptions]):
+    """Other materials."""
+
+
 def register_all() -> None:
     """Register them."""
     register(
-        JobKind(
+        Reconstruct(
             name="reconstruct",
             title="Photographs to a scene, its meshes and measurements",
             needs="dataset",
             options=ReconstructOptions,
             program="octasplat.workers.work.programs:reconstruct",
-            stages=_reconstruction_stages,
-            resolve=resolve_reconstruction,
-            needs_poses=lambda options: cast(ReconstructOptions, options).poses == "given",
-            settle=_settled_poses,
-            revise=revise_reconstruction,
-            goes_on=_same_training,
-            writes=lambda options: cast(ReconstructOptions, options).exports,
-            writes_at="exports",
-            demands=_reconstruction_demands,
-            estimate=lambda options, sizes, cores: estimate_reconstruction(
-                cast(ReconstructOptions, options), sizes, cores
-            ),
         )
     )
     register(
-        JobKind(
+        Evaluate(
             name="evaluate",
             title="Measure views of a reconstruction: those held out again, or other photographs",
             needs="result",
             options=EvaluateOptions,
             program="octasplat.workers.work.programs:evaluate",
-            stages=lambda _options: ("evaluate",),
-            resolve=validated(EvaluateOptions),
+            stages=("evaluate",),
             source_files=(*_RUN_FILES, _LIGHT, _BACKGROUND, "edits.json"),
-            needs_photographs=lambda _options: True,
-            on_others=lambda options: options.model_copy(update={"all_views": True}),
         )
     )
     register(
-        JobKind(
+        Export(
             name="export",
             title="The scene of a reconstruction in other formats",
             needs="result",
             options=ExportJobOptions,
             program="octasplat.workers.work.programs:export",
-            stages=lambda _options: ("export",),
-            resolve=validated(ExportJobOptions),
-            writes=lambda options: cast(ExportJobOptions, options).files,
-            writes_at="files",
-            demands=lambda options, _sizes: (
-                Demand("files", "exports", len(cast(ExportJobOptions, options).files)),
-            ),
+            stages=("export",),
             source_files=("scene.ply", "config.json"),
         )
     )
     register(
-        JobKind(
+        Render(
             name="render",
             title="New views of the scene of a reconstruction, as a video or images",
             needs="result",
             options=RenderJobOptions,
             program="octasplat.workers.work.programs:render",
-            stages=lambda _options: ("render",),
-            resolve=validated(RenderJobOptions),
-            demands=_render_demands,
-            estimate=lambda options, sizes, cores: estimate_render(
-                cast(RenderJobOptions, options), sizes, cores
-            ),
-            names_files=_files_of_stage,
+            stages=("render",),
             source_files=(*_RUN_FILES[:4], _BACKGROUND),
         )
     )
     register(
-        JobKind(
+        Relight(
             name="relight",
             title="The scene of a reconstruction with materials in other light",
             needs="result",
             options=RelightJobOptions,
             program="octasplat.workers.work.programs:relight",
-            stages=lambda _options: ("render",),
-            resolve=validated(RelightJobOptions),
-            demands=_relight_demands,
-            estimate=lambda options, sizes, cores: estimate_relight(
-                cast(RelightJobOptions, options), sizes, cores
-            ),
-            names_files=lambda options: (
-                (f"environments.{place}", name)
-                for place, name in enumerate(cast(RelightJobOptions, options).environments)
-            ),
+            stages=("render",),
             source_files=(_LIGHT, *_RUN_FILES[:4]),
         )
     )
     register(
-        JobKind(
+        Material(
             name="material",
             title="The scene of a reconstruction with other materials",
             needs="result",
             options=MaterialJobOptions,
             program="octasplat.workers.work.programs:material",
-            stages=lambda _options: ("edit",),
-            resolve=validated(MaterialJobOptions),
+            stages=("edit",),
             source_files=(_LIGHT, *_RUN_FILES, "edits.json"),
         )
     )
-
-
-def _reconstruction_stages(options: BaseModel) -> tuple[str, ...]:
-    stages = ("load", "train", "evaluate", "export")
-    given = cast(ReconstructOptions, options).poses == "given"
-    return stages if given else ("features", "matches", "poses", *stages)
-
-
-def _settled_poses(options: BaseModel, has_poses: bool) -> BaseModel:
-    """Known together with the dataset, so that no job shows stages that it will not have."""
-    if cast(ReconstructOptions, options).poses != "missing":
-        return options
-    return options.model_copy(update={"poses": "given" if has_poses else "auto"})
-
-
-def _reconstruction_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
-    asked = cast(ReconstructOptions, options)
-    train = asked.train
-    pixels = training_pixels(asked, sizes)
-    gaussians = most_gaussians(train, pixels)
-    iterations = MOST_PLANNED_ITERATIONS if asked.minutes else iteration_count(train, pixels)
-    return (
-        Demand("train.iterations", "iterations", iterations),
-        Demand("train.max_gaussians", "gaussians", gaussians),
-        Demand("train.rays", "rays", train.rays),
-        Demand("train.probe_rays", "rays", train.probe_rays),
-        Demand("train.window_rays", "rays", train.window_rays),
-        Demand("train.patch_side", "rays", train.patch_side**2),
-        Demand("max_side", "side_px", asked.max_side or 0),
-        Demand("exports", "exports", len(asked.exports)),
-        Demand("max_side", "workspace_bytes", reconstruction_bytes(asked, sizes)),
-    )
-
-
-def _render_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
-    asked = cast(RenderJobOptions, options)
-    path = "frames" if asked.mode == "turntable" else "max_side"
-    pixels = rendered_pixels(asked, sizes)
-    always = (
-        Demand(path, "render_pixels", pixels),
-        Demand("format", "workspace_bytes", image_bytes(asked, sizes)),
-    )
-    if asked.stage is None:
-        return always
-    return (
-        *always,
-        Demand("stage.integrator.samples", "render_paths", pixels * asked.stage.integrator.samples),
-    )
-
-
-def _relight_demands(options: BaseModel, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
-    asked = cast(RelightJobOptions, options)
-    path = "frames" if asked.mode == "turntable" else "max_side"
-    pixels = rendered_pixels(asked, sizes)
-    return (
-        Demand(path, "render_pixels", pixels * len(asked.environments)),
-        Demand("format", "workspace_bytes", image_bytes(asked, sizes, len(asked.environments))),
-        Demand("samples", "render_paths", pixels * asked.rays),
-    )
-
-
-def _files_of_stage(options: BaseModel) -> Iterator[tuple[str, str]]:
-    stage = cast(RenderJobOptions, options).stage
-    for key, name in named_files(stage) if stage is not None else ():
-        yield f"stage.{key.replace('[', '.').replace(']', '')}", name
-
-
-def _same_training(before: BaseModel, after: BaseModel) -> bool:
-    """Files are written after everything else, so that others can be asked for at any time."""
-    return before.model_copy(update={"exports": cast(ReconstructOptions, after).exports}) == after
+    register(OperationKind(CROP, stages=("edit",)))

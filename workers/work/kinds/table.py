@@ -1,78 +1,109 @@
-"""The table of job kinds."""
+"""What a kind of job is, and the table of them."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Generic, Literal
 
 from pydantic import BaseModel, ValidationError
+from typing_extensions import TypeVar
 
 from octasplat.engine.errors import ConfigError
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
 from octasplat.workers.work.kinds.estimates import Estimate
 
+OptionsT = TypeVar("OptionsT", bound=BaseModel, default=Any)
 
-@dataclass(frozen=True)
-class JobKind:
-    """A kind of job.
 
-    Attributes:
+class JobKind(Generic[OptionsT]):
+    """A kind of job; subclasses override what is otherwise for them.
+
+    Args:
         name: what the API calls it.
         title: one line for people.
         needs: what it works on: a committed dataset, or the results of a finished job.
         options: model of its options, whose JSON Schema is published.
         program: ``module:function`` that does the work, imported by the job's own process only; it takes a
-            :class:`octasplat.workers.work.task.Task` and returns the names of its results.
-        stages: names of its stages, in order, given the options.
-        resolve: from what a user asks for to complete options.
+            :class:`octasplat.workers.work.task.Task`.
+        stages: names of its stages, in order.
         source_files: results of the source job that it reads, if it needs one; those that are missing are
-            left out.
-        needs_photographs: whether it reads the photographs of the source job as well.
-        on_others: the options as they are kept where the job names photographs to work on in the place of the
-            source job's; None for a kind that works on those only.
-        needs_poses: whether its dataset must hold a COLMAP model, given the options.
-        settle: the options as they are kept, given whether the dataset holds a COLMAP model.
-        revise: complete options from those of a job and what a user changes of them.
-        goes_on: whether the work that was done with the first options can be gone on with under the second.
-        writes: names of the files that it writes in formats of their own, given the options.
-        writes_at: where the options name those files.
-        demands: what the options ask for that a service may set a ceiling to, given the photographs' sizes.
-        names_files: files that the options name, each after the place where they do, with dots; they are
-            uploaded as a dataset that holds files, and are in :attr:`octasplat.workers.work.task.Task.files`.
-            None for a kind that takes no files.
-        estimate: time and memory that it takes, given the options, the photographs' sizes and the number of
-            cores; None where nobody knows.
+            left out, but for the first.
     """
 
-    name: str
-    title: str
-    needs: Literal["dataset", "result"]
-    options: type[BaseModel]
-    program: str
-    stages: Callable[[BaseModel], tuple[str, ...]]
-    resolve: Callable[[Mapping[str, Any]], BaseModel]
-    source_files: tuple[str, ...] = ()
-    needs_photographs: Callable[[BaseModel], bool] = lambda _options: False
-    on_others: Callable[[BaseModel], BaseModel] | None = None
-    needs_poses: Callable[[BaseModel], bool] = lambda _options: False
-    settle: Callable[[BaseModel, bool], BaseModel] = lambda options, _has_poses: options
-    revise: Callable[[Mapping[str, Any], Mapping[str, Any]], BaseModel] | None = None
-    goes_on: Callable[[BaseModel, BaseModel], bool] = lambda before, after: before == after
-    writes: Callable[[BaseModel], tuple[str, ...]] = lambda _options: ()
-    writes_at: str = ""
-    demands: Callable[[BaseModel, Sequence[Sizes]], Iterable[Demand]] = lambda _options, _sizes: ()
-    names_files: Callable[[BaseModel], Iterable[tuple[str, str]]] | None = None
-    estimate: Callable[[BaseModel, Sequence[Sizes], int], Estimate | None] = lambda _options, _sizes, _n: None
+    takes_files = False
+    """Whether options may name files, which are uploaded as a dataset that holds files."""
+    takes_other_photographs = False
+    """Whether a job may name photographs to work on in the place of the source job's."""
+    writes_at = ""
+    """Where the options name the files of :meth:`writes`."""
 
-    def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> BaseModel:
-        """Complete options of a job that is tried again with changes; raises pydantic's ValidationError."""
-        return self.resolve({**before, **changes}) if self.revise is None else self.revise(before, changes)
+    def __init__(
+        self,
+        *,
+        name: str,
+        title: str,
+        needs: Literal["dataset", "result"],
+        options: type[OptionsT],
+        program: str,
+        stages: Sequence[str] = (),
+        source_files: Sequence[str] = (),
+    ) -> None:
+        self.name, self.title, self.needs, self.options, self.program = name, title, needs, options, program
+        self.source_files = tuple(source_files)
+        self._stages = tuple(stages)
+
+    def resolve(self, asked: Mapping[str, Any]) -> OptionsT:
+        """Return complete options from what a user asks for; raises pydantic's ValidationError."""
+        return self.options.model_validate(dict(asked))
+
+    def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> OptionsT:
+        """Return the options of a job that is tried again with changes; raises ValidationError."""
+        return self.resolve({**before, **changes})
+
+    def stages(self, options: OptionsT) -> tuple[str, ...]:
+        """Return the names of its stages, in order."""
+        return self._stages
+
+    def needs_photographs(self, options: OptionsT) -> bool:
+        """Return whether it reads the photographs of the source job as well."""
+        return False
+
+    def on_other_photographs(self, options: OptionsT) -> OptionsT:
+        """Return the options as they are kept where the job names photographs of its own."""
+        return options
+
+    def needs_poses(self, options: OptionsT) -> bool:
+        """Return whether its dataset must hold a COLMAP model."""
+        return False
+
+    def settle(self, options: OptionsT, has_poses: bool) -> OptionsT:
+        """Return the options as they are kept, given whether the dataset holds a COLMAP model."""
+        return options
+
+    def goes_on(self, before: OptionsT, after: OptionsT) -> bool:
+        """Return whether the work that was done with the first options can go on under the second."""
+        return before == after
+
+    def writes(self, options: OptionsT) -> tuple[str, ...]:
+        """Return the names of the files that it writes in formats of their own."""
+        return ()
+
+    def demands(self, options: OptionsT, sizes: Sequence[Sizes]) -> Iterable[Demand]:
+        """Return what the options ask for that a service may set a ceiling to, for such photographs."""
+        return ()
+
+    def named_files(self, options: OptionsT) -> Iterable[tuple[str, str]]:
+        """Return the files that the options name, each after the place where they do, with dots."""
+        return ()
+
+    def estimate(self, options: OptionsT, sizes: Sequence[Sizes], cores: int) -> Estimate | None:
+        """Return the time and memory that it takes on so many cores; None where nobody knows."""
+        return None
 
 
-_KINDS: dict[str, JobKind] = {}
+_KINDS: dict[str, JobKind[Any]] = {}
 
 
-def register(kind: JobKind) -> JobKind:
+def register(kind: JobKind[Any]) -> JobKind[Any]:
     """Add a kind; its name must be new."""
     if kind.name in _KINDS:
         raise ValueError(f"a job kind named '{kind.name}' is registered already")
@@ -80,13 +111,13 @@ def register(kind: JobKind) -> JobKind:
     return kind
 
 
-def job_kinds() -> tuple[JobKind, ...]:
-    """All kinds, in the order in which they were registered."""
+def job_kinds() -> tuple[JobKind[Any], ...]:
+    """Return all kinds, in the order in which they were registered."""
     return tuple(_KINDS.values())
 
 
-def kind_named(name: str) -> JobKind:
-    """The kind of that name.
+def kind_named(name: str) -> JobKind[Any]:
+    """Return the kind of that name.
 
     Raises:
         ConfigError: there is none.
@@ -96,13 +127,4 @@ def kind_named(name: str) -> JobKind:
     return _KINDS[name]
 
 
-def validated(model: type[BaseModel]) -> Callable[[Mapping[str, Any]], BaseModel]:
-    """A ``resolve`` that only validates; it raises pydantic's :class:`ValidationError`."""
-
-    def resolve(asked: Mapping[str, Any]) -> BaseModel:
-        return model.model_validate(dict(asked))
-
-    return resolve
-
-
-__all__ = ["JobKind", "ValidationError", "job_kinds", "kind_named", "register", "validated"]
+__all__ = ["JobKind", "ValidationError", "job_kinds", "kind_named", "register"]

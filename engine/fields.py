@@ -1,0 +1,137 @@
+"""What the fields of requests say beside their type: unit, role, and how a command spells them."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
+Level = Literal["basic", "advanced", "experimental"]
+
+
+class _InSchema:
+    """Base of marks that stand in the JSON schema of a field, too."""
+
+    def schema_entries(self) -> Mapping[str, object]:
+        raise NotImplementedError
+
+    def __get_pydantic_json_schema__(
+        self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        return {**handler(core_schema), **self.schema_entries()}
+
+
+@dataclass(frozen=True)
+class Unit(_InSchema):
+    """The unit of a number, such as ``px`` or ``degrees``."""
+
+    symbol: str
+
+    def schema_entries(self) -> Mapping[str, object]:
+        """Return what stands in the schema."""
+        return {"unit": self.symbol}
+
+
+@dataclass(frozen=True)
+class Group(_InSchema):
+    """How many users need a setting; forms and documents begin with the basic ones."""
+
+    level: Level
+
+    def schema_entries(self) -> Mapping[str, object]:
+        """Return what stands in the schema."""
+        return {"group": self.level}
+
+
+@dataclass(frozen=True)
+class Spelling:
+    """How a command spells a field, where it is not ``--name-of-field``.
+
+    Attributes:
+        flags: flags of the option, such as ``("-o", "--output")``.
+        metavar: what stands for the value in the help.
+        hidden: whether the command does not have it.
+    """
+
+    flags: tuple[str, ...] = ()
+    metavar: str | None = None
+    hidden: bool = False
+
+
+@dataclass(frozen=True)
+class Positional:
+    """Mark of a field that a command takes as an argument rather than an option."""
+
+    metavar: str
+
+
+@dataclass(frozen=True)
+class NamedFile(_InSchema):
+    """Mark of a file that options name; a job finds it by name among the files that came with it."""
+
+    def schema_entries(self) -> Mapping[str, object]:
+        """Return what stands in the schema."""
+        return {"format": "octasplat-file"}
+
+
+InputFile = Annotated[Path, NamedFile()]
+"""A file that options name: a path here, a name among the job's files in a service."""
+Source = Annotated[Path, Positional("IN")]
+"""The input that a verb works on; a job has its own."""
+Output = Annotated[Path, Spelling(("-o", "--output"))]
+"""Where a verb writes; a job has its own place."""
+
+
+def named_files(options: BaseModel) -> Iterator[tuple[str, Path]]:
+    """Yield each file that the options name, after the place where they do, with dots."""
+    for name, info in type(options).model_fields.items():
+        annotation = Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
+        yield from _files_in(annotation, getattr(options, name), name)
+
+
+def takes_files(model: type[BaseModel]) -> bool:
+    """Return whether options of this class can name files."""
+    return any(
+        _has_files(Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation)
+        for info in model.model_fields.values()
+    )
+
+
+def map_named_files(options: BaseModel, change: Callable[[Path], Path]) -> dict[str, Any]:
+    """Return the values of the options by field name, each file that they name replaced by ``change``."""
+    values: dict[str, Any] = {}
+    for name, info in type(options).model_fields.items():
+        annotation = Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
+        values[name] = _mapped(annotation, getattr(options, name), change)
+    return values
+
+
+def _is_file(annotation: Any) -> bool:
+    return get_origin(annotation) is Annotated and any(
+        isinstance(mark, NamedFile) for mark in get_args(annotation)[1:]
+    )
+
+
+def _has_files(annotation: Any) -> bool:
+    return _is_file(annotation) or any(_has_files(inner) for inner in get_args(annotation))
+
+
+def _files_in(annotation: Any, value: Any, place: str) -> Iterator[tuple[str, Path]]:
+    if value is None or not _has_files(annotation):
+        return
+    if isinstance(value, tuple | list):
+        for number, item in enumerate(value):
+            yield from _files_in(annotation, item, f"{place}.{number}")
+    elif isinstance(value, Path):
+        yield place, value
+
+
+def _mapped(annotation: Any, value: Any, change: Callable[[Path], Path]) -> Any:
+    if value is None or not _has_files(annotation):
+        return value
+    if isinstance(value, tuple | list):
+        return tuple(_mapped(annotation, item, change) for item in value)
+    return change(value) if isinstance(value, Path) else value

@@ -1,0 +1,167 @@
+"""What the requests, results and operations of all verbs have in common."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.events import Event, Listener, Warned, ignore
+from octasplat.engine.fields import Output, Positional, Source
+
+
+class Options(BaseModel):
+    """Base of the options of a verb: everything but where its input is read and its output written."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+
+
+class Request(Options):
+    """Base of requests: the options of a verb, the input that it reads and the output that it writes."""
+
+
+class SceneRequest(Request):
+    """Base of requests that read a scene and write one."""
+
+    source: Source = Field(description="The scene to read: a file of any format, or the folder of a run.")
+    output: Output = Field(description="The scene to write; the suffix says in which format.")
+
+
+class Result(BaseModel):
+    """Base of results.
+
+    Attributes:
+        files: the files that were written.
+    """
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+
+    files: tuple[Path, ...] = ()
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what a command prints about the result, a sentence each."""
+        return tuple(f"Wrote {path}." for path in self.files)
+
+
+class ScenesWritten(Result):
+    """Base of results that are scenes.
+
+    Attributes:
+        notes: sentences about what was done, in order.
+    """
+
+    notes: tuple[str, ...] = ()
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the notes, which end with the files."""
+        return self.notes
+
+
+RequestT = TypeVar("RequestT", bound=Request)
+RequestT_contra = TypeVar("RequestT_contra", bound=Request, contravariant=True)
+ResultT_co = TypeVar("ResultT_co", bound=Result, covariant=True)
+OptionsT = TypeVar("OptionsT", bound=Options)
+
+
+def never() -> bool:
+    """Return False: nobody asks to stop."""
+    return False
+
+
+@runtime_checkable
+class Run(Protocol[RequestT_contra, ResultT_co]):
+    """The function that does a request."""
+
+    def __call__(
+        self,
+        request: RequestT_contra,
+        /,
+        *,
+        progress: Listener = ignore,
+        should_stop: Callable[[], bool] = never,
+        threads: int = 0,
+    ) -> ResultT_co:
+        """Do what ``request`` says.
+
+        Args:
+            request: what to do.
+            progress: called with each event; warnings are events, too.
+            should_stop: asked now and then; True ends the work with ``Cancelled``.
+            threads: number of threads; 0 means all cores. It never changes the result.
+
+        Raises:
+            OctasplatError: something cannot be read, done or written.
+        """
+
+
+@dataclass(frozen=True)
+class Operation(Generic[RequestT, ResultT_co]):
+    """A verb.
+
+    Attributes:
+        name: the verb, as the command and the job type are called.
+        title: what it does, in one imperative sentence.
+        request: class of its requests.
+        options: class of its options, from which ``request`` inherits: what a job or a form is asked for.
+        run: does a request.
+    """
+
+    name: str
+    title: str
+    request: type[RequestT]
+    options: type[Options]
+    run: Run[RequestT, ResultT_co]
+
+
+def build(
+    model: type[OptionsT], values: Mapping[str, Any], place: Callable[[str], str] = lambda path: path
+) -> OptionsT:
+    """Return the options or request with these values; None stands for the default.
+
+    Args:
+        model: class to make.
+        values: values by field name.
+        place: what users call the field at a path with dots, such as ``--max-side`` for ``max_side``.
+
+    Raises:
+        ConfigError: a name is unknown, or a value is out of range or contradicts another; one sentence.
+    """
+    try:
+        return model.model_validate({name: value for name, value in values.items() if value is not None})
+    except ValidationError as error:
+        raise ConfigError(first_complaint(error, place)) from None
+
+
+def first_complaint(error: ValidationError, place: Callable[[str], str] = lambda path: path) -> str:
+    """Return the first complaint of a validation as one sentence that names the field."""
+    first = error.errors()[0]
+    path = ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ").removesuffix(".")
+    return f"{place(path)}: {message}." if path else f"{message}."
+
+
+def warn(progress: Listener, message: str) -> None:
+    """Tell a warning: something that the user should know; the work goes on."""
+    progress(Warned(message))
+
+
+__all__ = [
+    "Event",
+    "Listener",
+    "Operation",
+    "Options",
+    "Output",
+    "Positional",
+    "Request",
+    "Result",
+    "Run",
+    "SceneRequest",
+    "ScenesWritten",
+    "build",
+    "first_complaint",
+    "ignore",
+    "never",
+    "warn",
+]

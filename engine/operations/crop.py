@@ -1,0 +1,77 @@
+"""``crop``: keep part of a scene."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pydantic import model_validator
+
+from octasplat.engine.edit.choices import Selection
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.operations.base import Operation, Options, SceneRequest, ScenesWritten, never
+
+
+class CropOptions(Selection, Options):
+    """Which Gaussians to keep: those for which all that is given holds."""
+
+    @model_validator(mode="after")
+    def _chooses(self) -> "CropOptions":
+        if self.where is None and self.box is None and self.sphere is None:
+            raise ValueError("say what to keep: a box, a sphere or an expression (where)")
+        return self
+
+
+class CropRequest(CropOptions, SceneRequest):
+    """Keep those Gaussians of the scene for which all that is given holds.
+
+    Boxes and spheres ask for centres; ``octasplat info`` tells where they lie.
+    """
+
+
+class CropResult(ScenesWritten):
+    """The cropped scene.
+
+    Attributes:
+        kept: number of Gaussians that were kept.
+        count: number of Gaussians of the source.
+    """
+
+    kept: int
+    count: int
+
+
+def run(
+    request: CropRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> CropResult:
+    """Keep part of a scene; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        ConfigError: nothing would be kept.
+        SceneFileError: the scene cannot be read or written.
+    """
+    from octasplat.engine.edit.selection import chosen_by
+    from octasplat.engine.files import read_facts
+    from octasplat.engine.operations.scenes import check_target, open_scene, write_scene
+
+    source: Path = request.source
+    check_target(request.output, [source])
+    gaussians = open_scene(source, progress)
+    keep = chosen_by(gaussians, request)
+    if not keep.any():
+        low, high = gaussians.means_world.min(axis=0), gaussians.means_world.max(axis=0)
+        bounds = " to ".join(" ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
+        raise ConfigError(
+            f"{source}: nothing of it would be kept; its centres lie in {bounds} (octasplat info tells where "
+            "its solid part is)."
+        )
+    kept, count = int(keep.sum()), len(keep)
+    written = write_scene(gaussians.select(keep), read_facts(source), request.output, progress)
+    notes = (f"{source}: {kept:,} of {count:,} Gaussians kept.", written)
+    return CropResult(files=(request.output,), notes=notes, kept=kept, count=count)
+
+
+OPERATION = Operation("crop", "Keep part of a scene.", CropRequest, CropOptions, run)

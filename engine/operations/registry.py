@@ -1,0 +1,36 @@
+"""The verbs by name."""
+
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.operations.base import Operation
+
+_MODULES = {
+    "crop": "crop",
+}
+"""Module of each verb, in the order in which users meet them."""
+
+
+def operation_names() -> tuple[str, ...]:
+    """Return the names of all verbs."""
+    return tuple(_MODULES)
+
+
+@cache
+def operation(name: str) -> Operation[Any, Any]:
+    """Return the operation of that name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name not in _MODULES:
+        raise ConfigError(f"There is no operation '{name}'; choose one of {', '.join(_MODULES)}.")
+    found: Operation[Any, Any] = import_module(f"octasplat.engine.operations.{_MODULES[name]}").OPERATION
+    return found
+
+
+def operations() -> tuple[Operation[Any, Any], ...]:
+    """Return all operations."""
+    return tuple(map(operation, _MODULES))

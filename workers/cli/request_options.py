@@ -1,0 +1,239 @@
+"""Options of commands, made from the fields of requests."""
+
+import functools
+import types
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import annotated_types
+import click
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from octasplat.engine.fields import Positional, Spelling
+from octasplat.engine.operations.base import Operation, Result, build, never
+from octasplat.workers.cli.options import quiet_option, threads_option
+from octasplat.workers.cli.progress import show_progress
+from octasplat.workers.cli.signals import orderly_termination, stop_on_signals
+
+Command = Callable[..., Any]
+
+
+def request_options(model: type[BaseModel], *, leave_out: Sequence[str] = ()) -> Callable[[Command], Command]:
+    """Return a decorator that gives a command the options of a request.
+
+    The command is called with one keyword argument for each field; what the user did not give is None.
+
+    Args:
+        model: class of the request.
+        leave_out: fields that the command spells in another way.
+    """
+    fields = {name: info for name, info in model.model_fields.items() if name not in leave_out}
+    decorators = [_decorator(name, info) for name, info in fields.items() if not _spelling(info).hidden]
+
+    def decorate(command: Command) -> Command:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return decorate
+
+
+def operation_command(
+    operation: Operation[Any, Any], *, stops: bool = False, threads: bool = False
+) -> click.Command:
+    """Return the command of an operation that needs nothing but its request.
+
+    Args:
+        operation: the verb.
+        stops: whether the operation asks ``should_stop``; else a signal ends it where it is.
+        threads: whether the command has ``--threads``.
+    """
+
+    def run(quiet: bool, threads: int = 0, **given: Any) -> None:
+        request = request_of(operation.request, given)
+        run_operation(operation, request, quiet=quiet, threads=threads, stops=stops)
+
+    command: Command = run
+    command = quiet_option(command)
+    if threads:
+        command = threads_option(command)
+    command = request_options(operation.request)(command)
+    return click.command(operation.name, short_help=operation.title, help=operation.request.__doc__)(command)
+
+
+def request_of(model: type[Any], given: dict[str, Any]) -> Any:
+    """Return the request with what the user gave; what was not given keeps its default.
+
+    Raises:
+        ConfigError: a value is out of range or contradicts another; the sentence names the option.
+    """
+    values = {name: value for name, value in given.items() if value is not None and value != ()}
+    return build(model, values, functools.partial(option_name, model))
+
+
+def run_operation(
+    operation: Operation[Any, Any], request: Any, *, quiet: bool, threads: int = 0, stops: bool = False
+) -> Result:
+    """Do a request with its progress shown, print what came of it, and return it.
+
+    Raises:
+        OctasplatError: as the operation does.
+    """
+    if stops:
+        with (
+            stop_on_signals() as should_stop,
+            show_progress(quiet=quiet, should_stop=should_stop) as progress,
+        ):
+            result: Result = operation.run(
+                request, progress=progress, should_stop=should_stop, threads=threads
+            )
+    else:
+        with orderly_termination(), show_progress(quiet=quiet) as progress:
+            result = operation.run(request, progress=progress, should_stop=never, threads=threads)
+    if not quiet:
+        for line in result.lines():
+            click.echo(line)
+    return result
+
+
+def option_name(model: type[BaseModel], path: str) -> str:
+    """Return what users of the command call the field at a path with dots."""
+    name, _, _rest = path.partition(".")
+    info = model.model_fields.get(name)
+    if info is None:
+        return path
+    if (place := _mark(info, Positional)) is not None:
+        return place.metavar
+    return _flags(name, info)[-1].partition("/")[0]
+
+
+def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
+    inner, optional = _without_none(info.annotation)
+    if (place := _mark(info, Positional)) is not None:
+        many = _is_sequence(inner)
+        return (
+            click.argument(
+                name,
+                metavar=f"{place.metavar}...",
+                nargs=-1,
+                required=True,
+                type=_type(get_args(inner)[0], None),
+            )
+            if many
+            else click.argument(
+                name, metavar=place.metavar, required=info.is_required(), type=_type(inner, info)
+            )
+        )
+    spelling = _spelling(info)
+    settings: dict[str, Any] = {
+        "help": _help(info, optional),
+        "required": info.is_required(),
+        "metavar": spelling.metavar or _metavar(inner),
+        "default": None,
+    }
+    flags = _flags(name, info)
+    if inner is bool:
+        return click.option(*flags, name, is_flag=True, help=settings["help"], default=None)
+    if _is_sequence(inner):
+        item = get_args(inner)[0]
+        settings["multiple"] = True
+        if get_origin(item) is tuple:
+            return click.option(*flags, name, type=tuple(map(_plain_type, get_args(item))), **settings)
+        return click.option(*flags, name, type=_type(item, None), **settings)
+    if get_origin(inner) is tuple:
+        parts = get_args(inner)
+        if len(set(parts)) == 1:
+            return click.option(*flags, name, nargs=len(parts), type=_type(parts[0], None), **settings)
+        return click.option(*flags, name, type=tuple(map(_plain_type, parts)), **settings)
+    return click.option(*flags, name, type=_type(inner, info), **settings)
+
+
+def _flags(name: str, info: FieldInfo) -> tuple[str, ...]:
+    if flags := _spelling(info).flags:
+        return flags
+    flag = "--" + name.replace("_", "-")
+    inner, _ = _without_none(info.annotation)
+    return (f"{flag}/--no-{name.replace('_', '-')}" if inner is bool and info.default is True else flag,)
+
+
+def _help(info: FieldInfo, optional: bool) -> str:
+    text = info.description or ""
+    default = info.default
+    shown = default not in (None, PydanticUndefined, ()) and not isinstance(default, bool | BaseModel)
+    if shown:
+        value = " ".join(map(str, default)) if isinstance(default, tuple) else default
+        return f"{text}  [default: {value}]"
+    return text
+
+
+def _metavar(annotation: Any) -> str | None:
+    parts = get_args(annotation) if get_origin(annotation) is tuple else ()
+    if parts and parts[-1] is not Ellipsis and len(set(parts)) == 1 and len(parts) == 3:
+        return "X Y Z"
+    return None
+
+
+def _without_none(annotation: Any) -> tuple[Any, bool]:
+    """The annotation without None and marks, and whether None was in it."""
+    if get_origin(annotation) is Annotated:
+        return _without_none(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        parts = [part for part in get_args(annotation) if part is not type(None)]
+        if len(parts) == 1:
+            inner, _ = _without_none(parts[0])
+            return inner, True
+    return annotation, False
+
+
+def _is_sequence(annotation: Any) -> bool:
+    return get_origin(annotation) is tuple and get_args(annotation)[-1] is Ellipsis
+
+
+def _type(annotation: Any, info: FieldInfo | None) -> Any:
+    marks: list[Any] = list(info.metadata) if info is not None else []
+    while get_origin(annotation) is Annotated:
+        annotation, *more = get_args(annotation)
+        marks += more
+    if get_origin(annotation) is Literal:
+        return click.Choice([str(value) for value in get_args(annotation)])
+    if annotation is Path:
+        return click.Path(path_type=Path)
+    if annotation in (int, float):
+        return _range(annotation, marks)
+    return annotation if annotation in (str, bool) else str
+
+
+def _plain_type(annotation: Any) -> Any:
+    return _type(annotation, None)
+
+
+def _range(kind: type, marks: Sequence[Any]) -> Any:
+    low: Any = None
+    high: Any = None
+    low_open = high_open = False
+    for mark in marks:
+        for part in getattr(mark, "metadata", None) or (mark,):
+            if isinstance(part, annotated_types.Ge):
+                low = part.ge
+            elif isinstance(part, annotated_types.Gt):
+                low, low_open = part.gt, True
+            elif isinstance(part, annotated_types.Le):
+                high = part.le
+            elif isinstance(part, annotated_types.Lt):
+                high, high_open = part.lt, True
+    if low is None and high is None:
+        return kind
+    if kind is int:
+        return click.IntRange(low, high, min_open=low_open, max_open=high_open)
+    return click.FloatRange(low, high, min_open=low_open, max_open=high_open)
+
+
+def _spelling(info: FieldInfo) -> Spelling:
+    return _mark(info, Spelling) or Spelling()
+
+
+def _mark(info: FieldInfo, kind: type[Any]) -> Any:
+    return next((mark for mark in info.metadata if isinstance(mark, kind)), None)

@@ -1,0 +1,63 @@
+"""Kinds of jobs that do an operation of the engine."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
+
+from octasplat.engine.fields import map_named_files, named_files, takes_files
+from octasplat.engine.operations.base import Operation, Options, Request
+from octasplat.workers.store.names import check_name
+from octasplat.workers.work.kinds.table import JobKind
+from octasplat.workers.work.task import SCENE_FILE, Task
+
+PROGRAM = "octasplat.workers.work.programs:run_operation"
+
+
+class OperationKind(JobKind[Any]):
+    """A kind of job that does an operation: its options are the operation's.
+
+    Args:
+        operation: what it does.
+        stages: names of its stages.
+        source_files: results of the source job that it reads.
+        output: name of the file or folder, among the results, that the request calls its output.
+        needs: what it works on.
+    """
+
+    def __init__(
+        self,
+        operation: Operation[Any, Any],
+        *,
+        stages: Sequence[str],
+        source_files: Sequence[str] = (SCENE_FILE, "config.json"),
+        output: str = SCENE_FILE,
+        needs: Literal["dataset", "result"] = "result",
+        program: str = PROGRAM,
+    ) -> None:
+        super().__init__(
+            name=operation.name,
+            title=operation.title.removesuffix("."),
+            needs=needs,
+            options=operation.options,
+            program=program,
+            stages=stages,
+            source_files=source_files,
+        )
+        self.operation = operation
+        self.takes_files = takes_files(operation.options)
+        self._output = output
+
+    def named_files(self, options: Options) -> Iterable[tuple[str, str]]:
+        """Return the files that the options name."""
+        return ((place, path.as_posix()) for place, path in named_files(options))
+
+    def request(self, task: Task) -> Request:
+        """Return the request of a job, whose files lie in the task's folders.
+
+        Raises:
+            ConfigError: an option names a file that is outside of them.
+        """
+        options = self.resolve(task.options)
+        values = map_named_files(options, lambda path: task.files / check_name(path.as_posix()))
+        places = {"source": task.source, "output": task.results / self._output}
+        request: Request = self.operation.request.model_validate({**values, **places})
+        return request
