@@ -4,11 +4,13 @@ import json
 import subprocess
 import sys
 
+import click
 import pytest
 
 from octasplat.engine import __version__
 from octasplat.engine.files import exporters
 from octasplat.engine.threads import available_threads
+from octasplat.workers.cli.main import cli
 
 COMMANDS = ("reconstruct", "evaluate", "export", "render", "demo")
 HEAVY = ("torch", "numba", "pycolmap", "numpy", "pydantic", "OpenImageIO", "scipy")
@@ -37,6 +39,15 @@ assert not heavy, heavy
 def test_help_names_every_command(octasplat):
     text = octasplat("--help").stdout
     assert all(name in text for name in COMMANDS)
+
+
+def test_help_lists_each_command_with_its_own_line(octasplat):
+    text = octasplat("--help").stdout
+    with click.Context(cli) as context:
+        for name in cli.list_commands(context):
+            command = cli.get_command(context, name)
+            assert command.name == name and f"{name} " in text
+            assert " ".join(command.get_short_help_str(100).split()) in " ".join(text.split()), name
 
 
 def test_help_of_export_names_every_format(octasplat):

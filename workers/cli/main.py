@@ -6,38 +6,13 @@ Everything heavy is imported by the commands when they run, so that ``--help`` a
 import errno
 import os
 import traceback
+from importlib import import_module
 from typing import Any, NoReturn
 
 import click
 
 from octasplat.engine import __version__
 from octasplat.engine.errors import OctasplatError
-from octasplat.workers.cli.commands.backup import backup, restore
-from octasplat.workers.cli.commands.clean import clean
-from octasplat.workers.cli.commands.client import COMMANDS as CLIENT_COMMANDS
-from octasplat.workers.cli.commands.crop import crop
-from octasplat.workers.cli.commands.deform import deform
-from octasplat.workers.cli.commands.demo import demo
-from octasplat.workers.cli.commands.edit import edit
-from octasplat.workers.cli.commands.evaluate import evaluate
-from octasplat.workers.cli.commands.export import export
-from octasplat.workers.cli.commands.fsck import fsck
-from octasplat.workers.cli.commands.import_ import import_
-from octasplat.workers.cli.commands.info import info
-from octasplat.workers.cli.commands.material import material
-from octasplat.workers.cli.commands.merge import merge
-from octasplat.workers.cli.commands.migrate import migrate
-from octasplat.workers.cli.commands.open import open_page
-from octasplat.workers.cli.commands.quota import quota
-from octasplat.workers.cli.commands.reconstruct import reconstruct
-from octasplat.workers.cli.commands.relight import relight
-from octasplat.workers.cli.commands.render import render
-from octasplat.workers.cli.commands.serve import serve
-from octasplat.workers.cli.commands.stage import stage
-from octasplat.workers.cli.commands.surface import surface
-from octasplat.workers.cli.commands.token import token
-from octasplat.workers.cli.commands.transform import transform
-from octasplat.workers.cli.commands.worker import worker
 from octasplat.workers.cli.signals import Stopped
 
 # Threads that wait for each other sleep instead of spinning: no slower alone, several times faster on a
@@ -49,8 +24,70 @@ EXIT_UNEXPECTED = 70
 EXIT_INTERRUPTED = 130
 
 
+_COMMANDS = {
+    "reconstruct": ("reconstruct", "Photographs to a scene, its meshes, and measurements."),
+    "evaluate": ("evaluate", "Measure a finished run again."),
+    "info": ("info", "What is in a scene: counts, bounds, sizes, cost."),
+    "export": ("export", "Gaussians to meshes and other formats."),
+    "import": ("import_", "Splats of any format to a scene of flat Gaussians."),
+    "render": ("render", "New views of a scene as images or a video."),
+    "relight": ("relight", "A scene with materials in other light."),
+    "stage": ("stage", "Stages: things and lights put into a scene."),
+    "surface": ("surface", "One coloured triangle mesh of a scene."),
+    "material": ("material", "Change the materials of a scene."),
+    "edit": ("edit", "A mesh edited elsewhere back to Gaussians."),
+    "deform": ("deform", "A scene that follows a deformed cage or coarse mesh."),
+    "transform": ("transform", "Move, turn or scale a scene."),
+    "crop": ("crop", "Keep part of a scene."),
+    "merge": ("merge", "Put scenes together."),
+    "clean": ("clean", "Remove faint Gaussians, oversized ones and floaters."),
+    "demo": ("demo", "Try everything on a generated scene."),
+    "backup": ("backup", "Copy a service, tables and store, while it runs."),
+    "restore": ("backup", "Put a backup into an empty service."),
+    "serve": ("serve", "Run the whole service on this machine."),
+    "worker": ("worker", "Take jobs from the queue of a service."),
+    "open": ("open", "Sign a browser in to the service."),
+    "token": ("token", "Who may use the service."),
+    "fsck": ("fsck", "Compare the tables of a service with its store."),
+    "quota": ("quota", "Show or set what an owner may take."),
+    "migrate": ("migrate", "Bring a database to this version's tables."),
+    "submit": ("client", "Send a scene to the service and queue its reconstruction."),
+    "derive": ("client", "Queue a job on the results of a finished one, such as a render."),
+    "jobs": ("client", "List jobs."),
+    "status": ("client", "Show a job, or wait for it."),
+    "logs": ("client", "Show the log of a job."),
+    "cancel": ("client", "Stop a job."),
+    "retry": ("client", "Queue a failed or cancelled job again."),
+    "download": ("client", "Save the results of a job."),
+}
+"""Each command: its module in :mod:`octasplat.workers.cli.commands`, imported when the command runs, and its
+line in the help."""
+
+
 class _Commands(click.Group):
-    """A group whose commands end with one sentence and an exit code, never with a traceback."""
+    """A group that imports a command when it is called.
+
+    Commands end with one sentence and an exit code, never with a traceback.
+    """
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all commands."""
+        return sorted({*_COMMANDS, *self.commands})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return the command of that name, imported now; None if there is none."""
+        if cmd_name not in _COMMANDS:
+            return super().get_command(ctx, cmd_name)
+        module = import_module(f"octasplat.workers.cli.commands.{_COMMANDS[cmd_name][0]}")
+        commands = (value for value in vars(module).values() if isinstance(value, click.Command))
+        return next(command for command in commands if command.name == cmd_name)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands without importing them."""
+        added = {name: command.get_short_help_str(100) for name, command in self.commands.items()}
+        told = {name: text for name, (_, text) in _COMMANDS.items()} | added
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, told[name]) for name in self.list_commands(ctx)])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the chosen command."""
@@ -89,14 +126,6 @@ def cli() -> None:
 
     Try it without photographs: octasplat demo
     """
-
-
-for _command in (
-    reconstruct, evaluate, info, export, import_, render, relight, stage, surface,
-    material, edit, deform, transform, crop, merge, clean, demo, backup, restore,
-    serve, worker, open_page, token, fsck, quota, migrate, *CLIENT_COMMANDS,
-):  # fmt: skip
-    cli.add_command(_command)
 
 
 def main() -> None:

@@ -344,6 +344,3 @@ def _where(job: dict[str, Any]) -> str:
         return ""
     count = f" {job['step']}/{job['total_steps']}" if job["total_steps"] else ""
     return f"{job['stage']}{count}"
-
-
-COMMANDS = (submit, derive, jobs, status, logs, cancel, retry, download)
