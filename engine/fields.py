@@ -54,11 +54,13 @@ class Spelling:
         flags: flags of the option, such as ``("-o", "--output")``.
         metavar: what stands for the value in the help.
         hidden: whether the command does not have it.
+        repeated: whether the option may be given several times, each time with a text that the field reads.
     """
 
     flags: tuple[str, ...] = ()
     metavar: str | None = None
     hidden: bool = False
+    repeated: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,8 @@ Source = Annotated[Path, Positional("IN")]
 """The input that a verb works on; a job has its own."""
 Output = Annotated[Path, Spelling(("-o", "--output"))]
 """Where a verb writes; a job has its own place."""
+DatasetFolder = Annotated[Path | None, Spelling(("--scene", "--dataset"), metavar="FOLDER")]
+"""The folder of a run's photographs; a job that needs them has its own."""
 
 
 def named_files(options: BaseModel) -> Iterator[tuple[str, Path]]:

@@ -34,11 +34,13 @@ class Result(BaseModel):
 
     Attributes:
         files: the files that were written.
+        folder: of them; a job's results are named as they lie in it. None for the folder of the output.
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
 
     files: tuple[Path, ...] = ()
+    folder: Path | None = None
 
     def lines(self) -> tuple[str, ...]:
         """Return what a command prints about the result, a sentence each."""

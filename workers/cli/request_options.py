@@ -8,15 +8,16 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import annotated_types
 import click
-from pydantic import BaseModel
+from pydantic import BaseModel, BeforeValidator, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from octasplat.engine.errors import Cancelled
 from octasplat.engine.fields import Positional, Spelling
-from octasplat.engine.operations.base import Operation, Result, build, never
+from octasplat.engine.operations.base import Operation, Result, build, first_complaint, never
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.progress import show_progress
-from octasplat.workers.cli.signals import orderly_termination, stop_on_signals
+from octasplat.workers.cli.signals import Stopped, orderly_termination, stop_on_signals
 
 Command = Callable[..., Any]
 
@@ -81,15 +82,17 @@ def run_operation(
 
     Raises:
         OctasplatError: as the operation does.
+        Stopped: a signal asked to stop.
     """
     if stops:
-        with (
-            stop_on_signals() as should_stop,
-            show_progress(quiet=quiet, should_stop=should_stop) as progress,
-        ):
-            result: Result = operation.run(
-                request, progress=progress, should_stop=should_stop, threads=threads
-            )
+        with stop_on_signals() as should_stop:
+            try:
+                with show_progress(quiet=quiet, should_stop=should_stop) as progress:
+                    result: Result = operation.run(
+                        request, progress=progress, should_stop=should_stop, threads=threads
+                    )
+            except Cancelled as error:
+                raise Stopped(str(error), should_stop.exit_code) from None
     else:
         with orderly_termination(), show_progress(quiet=quiet) as progress:
             result = operation.run(request, progress=progress, should_stop=never, threads=threads)
@@ -101,13 +104,15 @@ def run_operation(
 
 def option_name(model: type[BaseModel], path: str) -> str:
     """Return what users of the command call the field at a path with dots."""
-    name, _, _rest = path.partition(".")
+    name, _, rest = path.partition(".")
     info = model.model_fields.get(name)
     if info is None:
         return path
     if (place := _mark(info, Positional)) is not None:
         return place.metavar
-    return _flags(name, info)[-1].partition("/")[0]
+    part = rest.partition(".")[0]
+    flag = _flags(name, info)[-1].partition("/")[0]
+    return f"{flag} {part}" if part and not part.isdigit() else flag
 
 
 def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
@@ -135,6 +140,10 @@ def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
         "default": None,
     }
     flags = _flags(name, info)
+    if any(isinstance(mark, BeforeValidator) for mark in info.metadata):
+        if spelling.repeated:
+            return click.option(*flags, name, multiple=True, **settings)
+        return click.option(*flags, name, type=_ReadText(info), **settings)
     if inner is bool:
         return click.option(*flags, name, is_flag=True, help=settings["help"], default=None)
     if _is_sequence(inner):
@@ -149,6 +158,22 @@ def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
             return click.option(*flags, name, nargs=len(parts), type=_type(parts[0], None), **settings)
         return click.option(*flags, name, type=tuple(map(_plain_type, parts)), **settings)
     return click.option(*flags, name, type=_type(inner, info), **settings)
+
+
+class _ReadText(click.ParamType[Any]):
+    """Text that the field reads by itself, such as ``5k,50k``."""
+
+    name = "text"
+
+    def __init__(self, info: FieldInfo) -> None:
+        self._annotation: Any = Annotated[info.annotation, *info.metadata]
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return what the text says."""
+        try:
+            return TypeAdapter(self._annotation).validate_python(value)
+        except ValidationError as error:
+            self.fail(first_complaint(error), param, ctx)
 
 
 def _flags(name: str, info: FieldInfo) -> tuple[str, ...]:

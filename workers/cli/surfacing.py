@@ -19,6 +19,7 @@ from octasplat.engine.events import Listener
 from octasplat.engine.files import check_surface_path, read_facts, write_surface
 from octasplat.engine.gaussians.materials import require_materials
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.operations.axes import light_up
 from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.cameras import RenderCamera
 from octasplat.engine.run_folder import (
@@ -45,7 +46,6 @@ from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.writing import replacing
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.scene_files import open_scene
-from octasplat.workers.rendering.cameras import light_up
 
 MATERIAL_DEFAULTS = {"texture_side": 1024, "max_triangles": 60_000}
 """With materials, where nothing else is said."""

@@ -1,14 +1,12 @@
 """Cameras as the options of ``octasplat render`` or of a job say: a turntable, or a single one."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
-from octasplat.engine.config import read_config
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.operations.axes import axis_named
 from octasplat.engine.render.cameras import RenderCamera, focal_from_fov
 from octasplat.engine.render.jobs import (
     DEFAULT_FOV_Y_DEGREES,
@@ -19,7 +17,6 @@ from octasplat.engine.render.jobs import (
     turntable_cameras,
 )
 from octasplat.engine.render.paths import Turntable, look_at
-from octasplat.engine.run_folder import CONFIG, is_run
 from octasplat.engine.scene.model import Viewpoints
 
 DEFAULT_FPS = 30.0
@@ -73,24 +70,3 @@ def _table(
     distance = options.get("distance") or float(np.hypot(table.radius, table.height))
     angle = np.arctan2(table.height, table.radius) if elevation is None else np.radians(elevation)
     return replace(table, radius=float(distance * np.cos(angle)), height=float(distance * np.sin(angle)))
-
-
-def light_up(source: Path, name: str | None) -> Float64[np.ndarray, "3"]:
-    """The direction in the world that is up for the light on a scene with materials.
-
-    Args:
-        source: folder of a run, or a file of Gaussians.
-        name: the axis that the user says; None for that of the run, or -y.
-
-    Raises:
-        ConfigError: the run's settings cannot be read.
-    """
-    if name is None and is_run(source) and (source / CONFIG).exists():
-        return np.array(read_config(source / CONFIG).train.materials.up_world, np.float64)
-    return axis_named(name or "-y")
-
-
-def axis_named(name: str) -> Float64[np.ndarray, "3"]:
-    """The unit vector of ``x``, ``-x``, ``y`` and so on."""
-    axis = np.eye(3)["xyz".index(name[-1])]
-    return -axis if name.startswith("-") else axis

@@ -18,6 +18,7 @@ from octasplat.engine.light.environment import EnvironmentMap, environment_frame
 from octasplat.engine.light.relighting import PathRelighter, Relighter, surroundings
 from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
 from octasplat.engine.light.stage import Integrator
+from octasplat.engine.operations.axes import light_up
 from octasplat.engine.render.environment_map import read_environment
 from octasplat.engine.render.identity import identity_of
 from octasplat.engine.render.images import write_exr, write_png
@@ -27,7 +28,7 @@ from octasplat.engine.render.renderer import background_colour
 from octasplat.engine.run_folder import CONFIG, SCENE, is_run
 from octasplat.engine.scene import load_scene
 from octasplat.engine.shading.material_settings import MaterialSettings
-from octasplat.workers.rendering.cameras import DEFAULT_FPS, cameras_of_options, light_up
+from octasplat.workers.rendering.cameras import DEFAULT_FPS, cameras_of_options
 from octasplat.workers.rendering.views import Keeping, Series, Source, check_one_file, read_source, run_shots
 
 _FRESH = Keeping()

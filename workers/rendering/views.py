@@ -18,6 +18,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.light.companions import companions
 from octasplat.engine.light.stage import Stage
 from octasplat.engine.light.stage_file import named_files
+from octasplat.engine.operations.axes import axis_named
 from octasplat.engine.render.identity import identity_of
 from octasplat.engine.render.jobs import (
     Paint,
@@ -40,7 +41,7 @@ from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.stages import counted_stage
 from octasplat.engine.trace.make import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
-from octasplat.workers.rendering.cameras import DEFAULT_FPS, axis_named, cameras_of_options
+from octasplat.workers.rendering.cameras import DEFAULT_FPS, cameras_of_options
 from octasplat.workers.rendering.stages import StagePlace, painted_stage, preview_stage
 from octasplat.workers.telling.losses import open_scene
 

@@ -5,6 +5,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -223,12 +224,16 @@ def run_operation(task: Task) -> None:
     assert isinstance(kind, OperationKind)
     options = kind.resolve(task.options)
     tell = stopping(task.listener, task.should_stop)
-    with counted_stage(kind.stages(options)[0], tell, 0):
+    whole = nullcontext() if kind.tells_stages else counted_stage(kind.stages(options)[0], tell, 0)
+    with whole:
         result = kind.operation.run(
             kind.request(task), progress=tell, should_stop=task.should_stop, threads=task.threads
         )
-        for line in result.lines():
-            tell(Noted(_places(task).named(line)))
+    for path in result.files:
+        if not path.is_relative_to(task.results):
+            _publish(task, path, path.relative_to(result.folder or task.run).as_posix())
+    for line in result.lines():
+        tell(Noted(_places(task).named(line)))
 
 
 def _picture_arguments(task: Task, options: PictureOptions) -> dict[str, Any]:

@@ -131,9 +131,9 @@ def export(
     from octasplat.engine.files import ExportOptions, export_scene, exporter_for, read_facts
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.gaussians.octagon import CHI2_2_99
+    from octasplat.engine.operations.axes import light_up
     from octasplat.workers.cli.scene_files import open_scene, warn_of_losses
     from octasplat.workers.cli.signals import orderly_termination
-    from octasplat.workers.rendering.cameras import light_up
 
     exporter = exporter_for(target, format_name)  # complain before the long work
     if opaque and exporter.name != "glb":

@@ -1,6 +1,7 @@
 """Kinds of jobs that do an operation of the engine."""
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 from octasplat.engine.fields import map_named_files, named_files, takes_files
@@ -21,6 +22,7 @@ class OperationKind(JobKind[Any]):
         source_files: results of the source job that it reads.
         output: name of the file or folder, among the results, that the request calls its output.
         needs: what it works on.
+        tells_stages: whether the operation tells its stages itself.
     """
 
     def __init__(
@@ -32,6 +34,7 @@ class OperationKind(JobKind[Any]):
         output: str = SCENE_FILE,
         needs: Literal["dataset", "result"] = "result",
         program: str = PROGRAM,
+        tells_stages: bool = False,
     ) -> None:
         super().__init__(
             name=operation.name,
@@ -44,6 +47,7 @@ class OperationKind(JobKind[Any]):
         )
         self.operation = operation
         self.takes_files = takes_files(operation.options)
+        self.tells_stages = tells_stages
         self._output = output
 
     def named_files(self, options: Options) -> Iterable[tuple[str, str]]:
@@ -58,6 +62,12 @@ class OperationKind(JobKind[Any]):
         """
         options = self.resolve(task.options)
         values = map_named_files(options, lambda path: task.files / check_name(path.as_posix()))
-        places = {"source": task.source, "output": task.results / self._output}
-        request: Request = self.operation.request.model_validate({**values, **places})
+        request: Request = self.operation.request.model_validate({**values, **self.places(task, options)})
         return request
+
+    def places(self, task: Task, options: Options) -> dict[str, Path]:
+        """Return where a job reads and writes, by the names of the request."""
+        places = {"source": task.source, "output": task.results / self._output}
+        if task.scene is not None and "dataset" in self.operation.request.model_fields:
+            places["dataset"] = task.scene
+        return {name: place for name, place in places.items() if name in self.operation.request.model_fields}

@@ -1,0 +1,33 @@
+"""Axes of the world by name, such as ``-y``."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+
+
+def axis_named(name: str) -> Float64[np.ndarray, "3"]:
+    """Return the unit vector of ``x``, ``-x``, ``y`` and so on."""
+    axis = np.eye(3)["xyz".index(name[-1])]
+    return -axis if name.startswith("-") else axis
+
+
+def light_up(source: Path, name: str | None) -> Float64[np.ndarray, "3"]:
+    """Return the direction in the world that is up for the light on a scene with materials.
+
+    Args:
+        source: folder of a run, or a file of Gaussians.
+        name: the axis that the user says; None for that of the run, or -y.
+
+    Raises:
+        ConfigError: the run's settings cannot be read.
+    """
+    from octasplat.engine.config import read_config
+    from octasplat.engine.run_folder import CONFIG, is_run
+
+    if name is None and is_run(source) and (source / CONFIG).exists():
+        return np.array(read_config(source / CONFIG).train.materials.up_world, np.float64)
+    return axis_named(name or "-y")
