@@ -57,8 +57,6 @@ class Deferred:
         settings: how they are learnt.
         extent_world: the scene's extent.
         sided: whether normals point outwards, so that only one side of each Gaussian is lit.
-        window_rays: rays of a window of the training's batches, see
-            :class:`octasplat.engine.train.batches.BatchSource`; 1 where there are none.
 
     Attributes:
         light: the environment.
@@ -67,9 +65,7 @@ class Deferred:
 
     name = "materials"
 
-    def __init__(
-        self, settings: MaterialSettings, *, extent_world: float, window_rays: int = 1, sided: bool = False
-    ) -> None:
+    def __init__(self, settings: MaterialSettings, *, extent_world: float, sided: bool = False) -> None:
         self.settings = settings
         self._sided = sided
         self.light = LearntLight(settings)
@@ -77,7 +73,6 @@ class Deferred:
         self._gap = settings.start * extent_world
         self._leaving = Leaving(self._gap, settings.leaves * extent_world)
         self._leaving_far = self._leaving._replace(gap_world=2 * self._gap)
-        self._window = window_rays
         self._started_over = np.zeros(1, bool)
         self._features: Float32[np.ndarray, "n f"] = np.empty((0, 5), np.float32)
 
@@ -195,7 +190,7 @@ class Deferred:
         by_normal = np.zeros((len(by_rgb), 3))
         by_features = np.zeros((len(by_rgb), seen.features.shape[1]))
         by_depth = np.zeros(len(by_rgb))
-        neighbour_terms(sight, self._window, settings, by_features, by_alpha, by_normal, by_depth)
+        neighbour_terms(sight, settings, by_features, by_alpha, by_normal, by_depth)
         if kept.shaded == 1 and not settings.is_seed_deferred(sight.progress):
             weight = np.float32(settings.harmonics_weight * 2 / (3 * len(by_rgb)))
             harmonics = weight * (sight.seen.rgb_srgb - developed.rgb_srgb)

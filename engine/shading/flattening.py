@@ -24,14 +24,12 @@ class Flattening(Plain):
 
     Args:
         weight: of the term.
-        window_rays: rays of each window of a batch, in which windows come last.
     """
 
     name = "flattening"
 
-    def __init__(self, weight: float, *, window_rays: int) -> None:
+    def __init__(self, weight: float) -> None:
         self._weight = weight
-        self._window_rays = window_rays
 
     def reverse(
         self,
@@ -44,7 +42,7 @@ class Flattening(Plain):
         plain = super().reverse(sight, developed, by_rgb, by_transmittance)
         count = len(by_rgb)
         by_alpha, by_normal, by_depth = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
-        depth_normal_term(sight, self._window_rays, self._weight, by_alpha, by_normal, by_depth)
+        depth_normal_term(sight, self._weight, by_alpha, by_normal, by_depth)
         seen = replace(
             plain.seen,
             transmittance=(by_transmittance - by_alpha).astype(np.float32),

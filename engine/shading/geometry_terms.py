@@ -1,10 +1,9 @@
 """Terms of the loss that hold normals, depths and materials together, by their gradients alone.
 
-Batches of training rays come in windows: square grids of rays with one random pixel of each cell. Neighbours
-in a window are neighbours on the surface, so that differences between them mean something.
+Batches of training rays come in windows (:mod:`octasplat.engine.shading.ray_windows`): square grids of rays
+with one random pixel of each cell. Neighbours in a window are neighbours on the surface, so that differences
+between them mean something.
 """
-
-import math
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -42,7 +41,6 @@ def spread_term(
 
 def neighbour_terms(
     sight: Sight,
-    window_rays: int,
     settings: MaterialSettings,
     by_features: Float64[np.ndarray, "r f"],
     by_alpha: Float64[np.ndarray, " r"],
@@ -50,48 +48,44 @@ def neighbour_terms(
     by_depth: Float64[np.ndarray, " r"],
 ) -> None:
     """Add the gradients of all terms that hold neighbouring rays together: normals, depths, materials."""
-    if window_rays <= 1:
-        return
     if settings.depth_normal_weight > 0:
-        depth_normal_term(sight, window_rays, settings.depth_normal_weight, by_alpha, by_normal, by_depth)
+        depth_normal_term(sight, settings.depth_normal_weight, by_alpha, by_normal, by_depth)
     if settings.smooth_normal_weight > 0:
-        smooth_normal_term(sight, window_rays, settings.smooth_normal_weight, by_normal)
+        smooth_normal_term(sight, settings.smooth_normal_weight, by_normal)
     if max(settings.smooth_weights) > 0:
-        smoothness_term(
-            sight, window_rays, settings.smooth_weights, settings.smooth_metal, by_features, by_alpha
-        )
+        smoothness_term(sight, settings.smooth_weights, settings.smooth_metal, by_features, by_alpha)
 
 
 def depth_normal_term(
     sight: Sight,
-    window_rays: int,
     weight: float,
     by_alpha: Float64[np.ndarray, " r"],
     by_normal: Float64[np.ndarray, "r 3"],
     by_depth: Float64[np.ndarray, " r"],
 ) -> None:
     """One minus the cosine between the blended normal and that of the points of three neighbouring rays."""
-    side, first = _grid(sight, window_rays)
-    if first is None:
+    windows = sight.windows
+    if windows is None:
         return
+    some = windows.rays
     seen, rays = sight.seen, sight.rays
-    alpha = 1.0 - seen.transmittance[first:].astype(np.float64)
+    alpha = 1.0 - seen.transmittance[some].astype(np.float64)
     solid = np.maximum(alpha, 1e-6)
-    depth = seen.depth_sum[first:] / solid
-    directions = rays.directions_world[first:].astype(np.float64)
-    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[first:]
-    points = (origins + depth[:, None] * directions).reshape(-1, side, side, 3)
+    depth = seen.depth_sum[some] / solid
+    directions = rays.directions_world[some].astype(np.float64)
+    origins = rays.origins_world if len(rays.origins_world) == 1 else rays.origins_world[some]
+    points = windows.grid(origins + depth[:, None] * directions)
     middle, right, below = points[:, :-1, :-1], points[:, :-1, 1:], points[:, 1:, :-1]
     a, b = right - middle, below - middle
     cross = np.cross(a, b)
     length = np.maximum(np.linalg.norm(cross, axis=-1, keepdims=True), 1e-12)
-    towards = -directions.reshape(points.shape)[:, :-1, :-1]
+    towards = -windows.grid(directions)[:, :-1, :-1]
     turned = np.where((cross * towards).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
     spanned = turned * cross / length
-    sums = seen.normal_world[first:].astype(np.float64).reshape(points.shape)[:, :-1, :-1]
+    sums = windows.grid(seen.normal_world[some].astype(np.float64))[:, :-1, :-1]
     normal_length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
     normal = sums / normal_length
-    opaque = alpha.reshape(points.shape[:3]) > OPAQUE
+    opaque = windows.grid(alpha) > OPAQUE
     counted = opaque[:, :-1, :-1] & opaque[:, :-1, 1:] & opaque[:, 1:, :-1]
     counted &= (spanned * towards).sum(axis=-1) > STEEPEST
     share = np.where(counted, weight / len(seen.transmittance), 0.0)[..., None]
@@ -103,28 +97,27 @@ def depth_normal_term(
     by_points[:, :-1, 1:] += by_a
     by_points[:, 1:, :-1] += by_b
     by_points[:, :-1, :-1] -= by_a + by_b
-    along = (by_points.reshape(-1, 3) * directions).sum(axis=1)
-    by_depth[first:] += along / solid
-    by_alpha[first:] -= along * depth / solid
+    along = (windows.flat(by_points) * directions).sum(axis=1)
+    by_depth[some] += along / solid
+    by_alpha[some] -= along * depth / solid
     whole = np.zeros_like(points)
     whole[:, :-1, :-1] = by_sums
-    by_normal[first:] += whole.reshape(-1, 3)
+    by_normal[some] += windows.flat(whole)
 
 
-def smooth_normal_term(
-    sight: Sight, window_rays: int, weight: float, by_normal: Float64[np.ndarray, "r 3"]
-) -> None:
+def smooth_normal_term(sight: Sight, weight: float, by_normal: Float64[np.ndarray, "r 3"]) -> None:
     """One minus the cosine between the normals of neighbouring rays, where these show one smooth surface.
 
     A surface that is bent evenly has no gradient from it.
     """
-    side, first = _grid(sight, window_rays)
-    if first is None:
+    windows = sight.windows
+    if windows is None:
         return
-    sums = sight.seen.normal_world[first:].astype(np.float64).reshape(-1, side, side, 3)
+    some = windows.rays
+    sums = windows.grid(sight.seen.normal_world[some].astype(np.float64))
     length = np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-9)
     normal = sums / length
-    opaque = (sight.seen.transmittance[first:] < 1 - OPAQUE).reshape(-1, side, side)
+    opaque = windows.grid(sight.seen.transmittance[some]) < 1 - OPAQUE
     gradient = np.zeros_like(normal)
     for one, other in _NEIGHBOURS:
         cosine = (normal[one] * normal[other]).sum(axis=-1, keepdims=True)
@@ -132,12 +125,11 @@ def smooth_normal_term(
         share = np.where(counted, weight / len(sight.seen.transmittance), 0.0)
         gradient[one] -= share * (normal[other] - cosine * normal[one])
         gradient[other] -= share * (normal[one] - cosine * normal[other])
-    by_normal[first:] += (gradient / length).reshape(-1, 3)
+    by_normal[some] += windows.flat(gradient / length)
 
 
 def smoothness_term(
     sight: Sight,
-    window_rays: int,
     weights: tuple[float, ...],
     metal: float,
     by_features: Float64[np.ndarray, "r f"],
@@ -149,14 +141,15 @@ def smoothness_term(
     between two metals, in between by the square of the smaller metallic: what reflections do not explain yet
     would else be painted on. Metallic itself gets no gradient from that.
     """
-    side, first = _grid(sight, window_rays)
-    if first is None:
+    windows = sight.windows
+    if windows is None:
         return
-    alpha = 1.0 - sight.seen.transmittance[first:].astype(np.float64)
+    some = windows.rays
+    alpha = 1.0 - sight.seen.transmittance[some].astype(np.float64)
     solid = np.maximum(alpha, 1e-6)[:, None]
-    flat = sight.seen.features[first:, :5] / solid
-    material = flat.reshape(-1, side, side, 5)
-    opaque = (alpha > OPAQUE).reshape(-1, side, side)
+    flat = sight.seen.features[some, :5] / solid
+    material = windows.grid(flat)
+    opaque = windows.grid(alpha) > OPAQUE
     gradient = np.zeros_like(material)
     share = np.array(weights) / len(sight.seen.transmittance)
     for one, other in _NEIGHBOURS:
@@ -167,24 +160,12 @@ def smoothness_term(
         slope[..., :3] *= 1 + metal * both**2
         gradient[one] += slope
         gradient[other] -= slope
-    by_flat = gradient.reshape(-1, 5)
-    by_features[first:, :5] += by_flat / solid
-    by_alpha[first:] -= (by_flat * flat).sum(axis=1) / solid[:, 0]
+    by_flat = windows.flat(gradient)
+    by_features[some, :5] += by_flat / solid
+    by_alpha[some] -= (by_flat * flat).sum(axis=1) / solid[:, 0]
 
 
 def _where(
     mask: Bool[np.ndarray, "*shape"], values: Float64[np.ndarray, "*shape 5"]
 ) -> Float64[np.ndarray, "*shape 5"]:
     return np.where(mask[..., None], values, 0.0)
-
-
-def _grid(sight: Sight, window_rays: int) -> tuple[int, int | None]:
-    """Side of the windows, and the first ray that is in one; None if there are none.
-
-    Windows come last, since patches are not mixed with materials.
-    """
-    side = math.isqrt(window_rays)
-    count = len(sight.seen.transmittance)
-    if sight.view is None or count < window_rays:
-        return side, None
-    return side, count % window_rays

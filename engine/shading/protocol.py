@@ -16,6 +16,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.ray_windows import RayWindows
 from octasplat.engine.trace.protocol import GaussianGradients, Recording, TraceGradients, Tracer, TraceResult
 
 
@@ -31,6 +32,7 @@ class Sight:
         progress: share of the training that is done; 1 for a finished scene.
         dither: two numbers in [0, 1) for each ray, for models that draw anything at random; they are evenly
             spread over the rays of a pixel. None: models find some by themselves.
+        windows: those of the rays that stand in windows of neighbours; None if none do.
     """
 
     rays: RayBatch
@@ -39,6 +41,7 @@ class Sight:
     view: Int64[np.ndarray, " r"] | None = None
     progress: float = 1.0
     dither: Float64[np.ndarray, "2 r"] | None = None
+    windows: RayWindows | None = None
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Batches of rays: random pixels over all training views, mixed with square patches for SSIM."""
 
+import math
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,6 +11,7 @@ from jaxtyping import Float32, Int64
 from octasplat.engine.colour import composited
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.rays import RayBatch
+from octasplat.engine.shading.ray_windows import RayWindows
 from octasplat.engine.train.config import TrainConfig, most_gaussians, window_side_px
 from octasplat.engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
 from octasplat.engine.train.shown import shown_share
@@ -22,7 +24,8 @@ TILE_PX = 8
 class Batch:
     """Rays and what the photographs show there.
 
-    The last ``patches * side * side`` rays are patches, row-major one after another. ``background_srgb`` lies
+    The last ``patches * side * side`` rays are patches, row-major one after another. ``windows`` says
+    which of the others stand in windows. ``background_srgb`` lies
     behind both the Gaussians and photographs with alpha. ``sight_lines`` end before points that views show.
     """
 
@@ -35,6 +38,7 @@ class Batch:
     side: int
     background_srgb: Float32[np.ndarray, "3"]
     sight_lines: RayBatch | None = None
+    windows: RayWindows | None = None
 
     @cached_property
     def target_srgb(self) -> Float32[np.ndarray, "r 3"]:
@@ -85,8 +89,10 @@ class BatchSource:
         config, sampler, side = self._config, self.sampler, self._config.patch_side
         loose = config.rays - self._patches * side**2
         windows = loose // config.window_rays if config.window_rays > 1 else 0
-        drawn = [sampler.pixels(rng, loose - windows * config.window_rays)]
+        single = loose - windows * config.window_rays
+        drawn, grids = [sampler.pixels(rng, single)], None
         if windows:
+            grids = RayWindows(single, windows, math.isqrt(config.window_rays))
             drawn.append(
                 sampler.windows(rng, windows, rays=config.window_rays, side=self._window_side_px, turn=turn)
             )
@@ -99,7 +105,7 @@ class BatchSource:
         lines = None
         if self._lines is not None and len(self._lines):
             lines = self._lines.draw(rng, max(1, round(config.sight_line_share * config.rays)))
-        batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background, lines)
+        batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background, lines, grids)
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch
 

@@ -298,12 +298,8 @@ class TrainConfig(_Frozen):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "TrainConfig":
-        alone = self.window_rays == 1 or self.loss.ssim > 0
-        if self.loss.depth_normal > 0 and not self.materials.learn and alone:
-            raise ValueError(
-                "loss.depth_normal compares neighbouring rays of windows: set window_rays to 64 and "
-                "loss.ssim to 0"
-            )
+        if self.loss.depth_normal > 0 and not self.materials.learn and self.window_rays == 1:
+            raise ValueError("loss.depth_normal compares neighbouring rays of windows: set window_rays to 64")
         if self.background == "learnt" and self.materials.learn:
             raise ValueError(
                 "background=learnt is for scenes without materials, which learn the light around them: leave "

@@ -72,7 +72,7 @@ def differentiate(
     """
     seen = tracer.trace(batch.rays, record=True)
     assert seen.hits is not None
-    sight = Sight(batch.rays, seen, tracer, batch.view, progress)
+    sight = Sight(batch.rays, seen, tracer, batch.view, progress, windows=batch.windows)
     developed = shading.develop(sight)
     render = developed.over(batch.background_srgb)
     loss = batch_loss(render, batch, weights)

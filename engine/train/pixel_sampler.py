@@ -8,6 +8,7 @@ from jaxtyping import Float32, Int64
 
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.scene import View
+from octasplat.engine.shading.ray_windows import z_order
 
 GOLDEN = (math.sqrt(5) - 1) / 2
 """Its multiples fill the unit interval evenly, however many there are."""
@@ -87,7 +88,8 @@ class PixelSampler:
     ) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
         """``rays`` pixels (a square number) in each of ``count`` windows of about ``side`` x ``side`` pixels.
 
-        A window is a grid of cells, one random pixel in each, quarter by quarter. What sticks out of its view
+        A window is a grid of cells, one random pixel in each, in the order of
+        :class:`octasplat.engine.shading.ray_windows.RayWindows`. What sticks out of its view
         is folded back, so that every pixel is about as likely as any other. Windows are spread over views and
         within them, and those of one ``turn`` after the other over what those before have left.
         """
@@ -95,7 +97,7 @@ class PixelSampler:
         cell = max(1, round(side / cells))
         which, x, y = self._spread(rng, count, cell * cells, turn)
         width, height = self._sizes[which].T
-        rows, columns = _in_quarters(cells)
+        rows, columns = z_order(cells)
         left, top = x - cell * cells // 2, y - cell * cells // 2
         y = top[:, None] + rows * cell + rng.integers(0, cell, (count, rays))
         x = left[:, None] + columns * cell + rng.integers(0, cell, (count, rays))
@@ -138,16 +140,6 @@ class PixelSampler:
         y = np.broadcast_to(top[:, None, None] + rows, shape)
         x = np.broadcast_to(left[:, None, None] + columns, shape)
         return view.reshape(-1), y.reshape(-1), x.reshape(-1)
-
-
-def _in_quarters(cells: int) -> tuple[Int64[np.ndarray, " r"], Int64[np.ndarray, " r"]]:
-    """Rows and columns of a square's cells along a Z-order curve: those side by side come close together."""
-    rows, columns = np.divmod(np.arange(cells * cells), cells)
-    place = np.zeros(cells * cells, np.int64)
-    for bit in range(cells.bit_length()):
-        place |= (rows >> bit & 1) << (2 * bit + 1) | (columns >> bit & 1) << (2 * bit)
-    order = np.argsort(place)
-    return rows[order], columns[order]
 
 
 def _fold(position: Int64[np.ndarray, "w r"], size: Int64[np.ndarray, "w 1"]) -> Int64[np.ndarray, "w r"]:

@@ -15,7 +15,7 @@ def make_shading(config: TrainConfig, views: int, extent_world: float) -> Shadin
     if config.materials.learn:  # it holds normals and depths together itself
         inner = make_deferred(config, extent_world)
     elif config.loss.depth_normal > 0:
-        inner = Flattening(config.loss.depth_normal, window_rays=config.window_rays)
+        inner = Flattening(config.loss.depth_normal)
     if config.background == "learnt":
         inner = LearntBackground(
             config.background_height,
@@ -34,7 +34,6 @@ def make_deferred(config: TrainConfig, extent_world: float) -> Deferred:
     return Deferred(
         config.materials,
         extent_world=extent_world,
-        window_rays=config.window_rays,
         sided=config.trace.turned_beyond > 0,
     )
 

@@ -4,13 +4,26 @@ import numpy as np
 import pytest
 
 from octasplat.engine.rays import RayBatch
-from octasplat.engine.shading.geometry_terms import EDGE, smoothness_term
+from octasplat.engine.shading.geometry_terms import EDGE, depth_normal_term, smoothness_term
 from octasplat.engine.shading.protocol import Sight
+from octasplat.engine.shading.ray_windows import RayWindows
 from octasplat.engine.trace.make import make_tracer
 from octasplat.engine.trace.protocol import TraceResult, TraceSettings
+from octasplat.engine.train.pixel_sampler import PixelSampler
 
 SIDE, METAL = 3, 10.0
 WEIGHTS = (0.02, 0.03, 0.04, 0.2, 0.3)
+CELLS = [(0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (1, 2), (2, 0), (2, 1), (2, 2)]
+"""Row and column of each ray of a window: along a Z."""
+MIDDLE = CELLS.index((1, 1))
+
+
+def in_rows(values: np.ndarray) -> np.ndarray:
+    """Values of a window's rays by row and column."""
+    grid = np.empty((SIDE, SIDE, *values.shape[1:]), values.dtype)
+    for cell, value in zip(CELLS, values, strict=True):
+        grid[cell] = value
+    return grid
 
 
 def sight(features: np.ndarray, alpha: np.ndarray) -> Sight:
@@ -26,13 +39,13 @@ def sight(features: np.ndarray, alpha: np.ndarray) -> Sight:
         np.zeros(count, np.int32),
     )
     rays = RayBatch(np.zeros((1, 3)), np.tile([0.0, 0.0, 1.0], (count, 1)))
-    return Sight(rays, seen, make_tracer(TraceSettings(), threads=1), np.zeros(count, np.int64))
+    tracer = make_tracer(TraceSettings(), threads=1)
+    return Sight(rays, seen, tracer, np.zeros(count, np.int64), windows=RayWindows(0, 1, SIDE))
 
 
 def penalty(features: np.ndarray, alpha: np.ndarray, metallic: np.ndarray) -> float:
     """The sum whose gradient is asked for; ``metallic`` weighs the albedo and is held."""
-    material = (features / alpha[:, None]).reshape(SIDE, SIDE, 5)
-    metal = metallic.reshape(SIDE, SIDE)
+    material, metal = in_rows(features / alpha[:, None]), in_rows(metallic)
     total = 0.0
     for (y, x), (v, u) in [
         ((y, x), (y + down, x + 1 - down))
@@ -50,7 +63,7 @@ def test_the_gradient_is_that_of_the_sum_with_the_metals_held() -> None:
     features = (rng.uniform(0, 1, (SIDE**2, 5)) * alpha[:, None]).astype(np.float32).astype(np.float64)
     metallic = features[:, 3] / alpha
     by_features, by_alpha = np.zeros_like(features), np.zeros_like(alpha)
-    smoothness_term(sight(features, alpha), SIDE**2, WEIGHTS, METAL, by_features, by_alpha)
+    smoothness_term(sight(features, alpha), WEIGHTS, METAL, by_features, by_alpha)
     step = 1e-4
     for ray in range(SIDE**2):
         for column in range(5):
@@ -70,16 +83,44 @@ def test_the_gradient_is_that_of_the_sum_with_the_metals_held() -> None:
 def test_the_albedo_of_metals_is_held_more(metallic: float, times: float) -> None:
     features = np.full((SIDE**2, 5), 0.5)
     features[:, 3] = metallic
-    features[4, :3] = 0.7
+    features[MIDDLE, :3] = 0.7
     found = np.zeros_like(features)
-    smoothness_term(sight(features, np.ones(SIDE**2)), SIDE**2, WEIGHTS, METAL, found, np.zeros(SIDE**2))
+    smoothness_term(sight(features, np.ones(SIDE**2)), WEIGHTS, METAL, found, np.zeros(SIDE**2))
     slope = 0.2 / np.hypot(0.2, EDGE) / SIDE**2  # by each of its four neighbours
-    np.testing.assert_allclose(found[4, :3], 4 * times * slope * np.array(WEIGHTS[:3]), rtol=1e-5)
+    np.testing.assert_allclose(found[MIDDLE, :3], 4 * times * slope * np.array(WEIGHTS[:3]), rtol=1e-5)
     assert (found[:, 3:] == 0).all()
 
 
 def test_what_is_half_transparent_is_left_alone() -> None:
     features = np.random.default_rng(1).uniform(0, 0.5, (SIDE**2, 5))
     found, by_alpha = np.zeros_like(features), np.zeros(SIDE**2)
-    smoothness_term(sight(features, np.full(SIDE**2, 0.5)), SIDE**2, WEIGHTS, METAL, found, by_alpha)
+    smoothness_term(sight(features, np.full(SIDE**2, 0.5)), WEIGHTS, METAL, found, by_alpha)
     assert (found == 0).all() and (by_alpha == 0).all()
+
+
+def test_normals_of_a_sphere_are_those_that_neighbouring_depths_span() -> None:
+    """Windows as the training draws them; the gradient says how far the two are apart."""
+    side, windows, focal = 8, 40, 100.0
+    sampler = PixelSampler(np.array([0]), np.array([[100, 100]]))
+    _, y, x = sampler.windows(np.random.default_rng(0), windows, rays=side * side, side=24)
+    directions = np.stack([(x - 49.5) / focal, (y - 49.5) / focal, np.ones(len(x))], axis=1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    along = 3 * directions[:, 2]  # to a sphere of radius 2 around (0, 0, 3)
+    depth = along - np.sqrt(along**2 - 9 + 4)
+    normals = (directions * depth[:, None] - [0, 0, 3]) / 2
+    count = len(depth)
+    numbers = (np.zeros((count, 3)), np.zeros(count), depth, depth, normals, np.zeros((count, 0)))
+    seen = TraceResult(*(number.astype(np.float32) for number in numbers), np.ones(count, np.int32))
+    looked_at = Sight(
+        RayBatch(np.zeros((1, 3)), directions),
+        seen,
+        make_tracer(TraceSettings(), threads=1),
+        np.zeros(count, np.int64),
+        windows=RayWindows(0, windows, side),
+    )
+    by_normal = np.zeros((count, 3))
+    depth_normal_term(looked_at, 1.0, np.zeros(count), by_normal, np.zeros(count))
+    sines = np.linalg.norm(by_normal, axis=1) * count
+    counted = sines[sines > 0]
+    # Cells are 3 pixels, 1.1 degrees of the sphere; in the order of the rays it would be 4 times as much.
+    assert np.degrees(np.arcsin(counted.mean())) < 2.0
