@@ -13,7 +13,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.jobs import view_shots
 from octasplat.engine.render.one_colour import colours_for_cameras, with_colours
-from octasplat.engine.run_folder import CONFIG, run_viewpoints
+from octasplat.engine.run_folder import CONFIG, run_near_world, run_viewpoints
 from octasplat.engine.surface.cameras import cameras_around
 from octasplat.engine.trace.make import make_tracer
 from octasplat.engine.trace.protocol import TraceSettings
@@ -68,7 +68,7 @@ class PlainScene:
 def _of_run(run: Path) -> tuple[TraceSettings, Sequence[Callable[[], ImageRays]]]:
     config = read_config(run / CONFIG)
     viewpoints = run_viewpoints(run, max_side=SIDE_PX)
-    near = config.train.near * viewpoints.extent
+    near = run_near_world(run, viewpoints)
     shots = view_shots(viewpoints, _some(viewpoints.train_indices), near)
     return config.train.trace, [shot.rays for shot in shots]
 

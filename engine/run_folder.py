@@ -9,6 +9,7 @@ import numpy as np
 from octasplat.engine.config import ReconstructionConfig, read_config
 from octasplat.engine.errors import ConfigError, DatasetError
 from octasplat.engine.events import Listener, StageProgress, Warned
+from octasplat.engine.files import read_facts
 from octasplat.engine.render.environment_map import read_background
 from octasplat.engine.scene import Dataset, load_scene
 from octasplat.engine.scene.near import NearZones
@@ -84,6 +85,20 @@ def run_viewpoints(
         photographs_folder(output, scene), max_side=max_side, model_folder=found_model(output)
     )
     return scene_viewpoints(photographs, config.test_every, config.held_out)
+
+
+def run_near_world(output: Path, viewpoints: SplitViewpoints) -> float:
+    """Return the distance from a camera at which anything of a run's scene is seen, as in its training.
+
+    Args:
+        output: folder of the run.
+        viewpoints: of the run; they stand in where its scene does not say, as scenes of old.
+
+    Raises:
+        ConfigError: ``output`` is no run.
+    """
+    noted = read_facts(output / SCENE).near_world if (output / SCENE).exists() else 0.0
+    return noted if noted > 0 else read_config(output / CONFIG).train.near * viewpoints.extent
 
 
 def run_near_zones(output: Path, share: float) -> NearZones | None:

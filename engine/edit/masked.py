@@ -13,7 +13,7 @@ from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.render.images import read_image
 from octasplat.engine.render.jobs import view_shots
 from octasplat.engine.render.renderer import tile_order
-from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
+from octasplat.engine.run_folder import CONFIG, is_run, run_near_world, run_viewpoints
 from octasplat.engine.scene.model import Viewpoints
 from octasplat.engine.trace.make import make_tracer
 from octasplat.engine.trace.protocol import TraceGradients, Tracer
@@ -38,7 +38,7 @@ def under_masks(
     if not is_run(source):
         raise ConfigError(f"{source}: masks need the folder of a run, which knows its cameras.")
     config, viewpoints = read_config(source / CONFIG), run_viewpoints(source)
-    near_world = config.train.near * viewpoints.extent
+    near_world = run_near_world(source, viewpoints)
     tracer = make_tracer(config.train.trace, threads=threads)
     tracer.build(gaussians)
     views = ((_rays(viewpoints, path, near_world), path) for path in masks)

@@ -18,6 +18,7 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.scene.cameras import Camera
 from octasplat.engine.scene.model import PosedView, SceneModel, SparsePoints, Viewpoints, scene_extent
 from octasplat.engine.scene.split import split_views
+from octasplat.engine.scene.training_points import training_points
 from octasplat.engine.writing import write_text
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -223,7 +224,8 @@ def capped_size(width_px: int, height_px: int, max_side: int | None) -> tuple[in
 
 
 def _extent(scene: SceneModel, train_indices: Int64[np.ndarray, " train"]) -> float:
-    return scene_extent(np.stack([scene.views[i].origin_world for i in train_indices]), scene.points)
+    points = training_points(train_indices, scene.points, scene.observations)
+    return scene_extent(np.stack([scene.views[i].origin_world for i in train_indices]), points)
 
 
 def _points_digest(points: SparsePoints) -> str:
