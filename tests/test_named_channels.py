@@ -25,7 +25,13 @@ from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.gaussians.octagon import SIDES, octagon_triangles
 from octasplat.engine.gaussians.order import morton_order
-from octasplat.engine.train.checkpoint import load_best, load_checkpoint, save_best, save_checkpoint
+from octasplat.engine.train.checkpoint import (
+    BestState,
+    load_best,
+    load_checkpoint,
+    save_best,
+    save_checkpoint,
+)
 from octasplat.engine.train.config import McmcConfig, PaperConfig
 from octasplat.engine.train.densify import Mcmc, Paper
 from octasplat.engine.train.optimiser import Adam
@@ -105,8 +111,8 @@ def state_of(g: FlatGaussians) -> TrainState:
 
 
 def best(g: FlatGaussians, folder: Path) -> FlatGaussians:
-    save_best(g, {}, folder)
-    return load_best(folder)[0]
+    save_best(BestState(g, {}), folder)
+    return load_best(folder).gaussians
 
 
 def deformed(g: FlatGaussians, _folder: Path) -> FlatGaussians:

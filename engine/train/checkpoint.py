@@ -5,10 +5,12 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from octasplat.engine.errors import CheckpointError, DamagedCheckpoint
 from octasplat.engine.events import Listener, Warned
@@ -144,15 +146,33 @@ def newest_state(folder: Path, fingerprint: str, tell: Listener) -> TrainState |
     return None
 
 
-def save_best(gaussians: FlatGaussians, shading: Mapping[str, np.ndarray], folder: Path) -> None:
-    """Write the Gaussians that did best so far, and the shading model's state then, to ``best.npz``."""
-    arrays: dict[str, Any] = {f"gaussians.{name}": array for name, array in row_arrays(gaussians).items()}
-    arrays |= {f"shading.{name}": value for name, value in shading.items()}
+@dataclass(frozen=True)
+class BestState:
+    """What did best so far.
+
+    Attributes:
+        gaussians: the Gaussians.
+        shading: state of the shading model then.
+        pose_corrections: of all views then, as in the training's state; no rows where poses are not refined.
+    """
+
+    gaussians: FlatGaussians
+    shading: Mapping[str, np.ndarray]
+    pose_corrections: Float64[np.ndarray, "v 6"] = field(default_factory=lambda: np.zeros((0, 6)))
+
+
+def save_best(best: BestState, folder: Path) -> None:
+    """Write the state that did best so far to ``best.npz``."""
+    arrays: dict[str, Any] = {
+        f"gaussians.{name}": array for name, array in row_arrays(best.gaussians).items()
+    }
+    arrays |= {f"shading.{name}": value for name, value in best.shading.items()}
+    arrays["poses.corrections"] = best.pose_corrections
     with replacing(folder / "best.npz") as temporary:
         np.savez(temporary, **arrays)
 
 
-def load_best(folder: Path) -> tuple[FlatGaussians, dict[str, np.ndarray]]:
+def load_best(folder: Path) -> BestState:
     """Read what :func:`save_best` wrote.
 
     Raises:
@@ -161,7 +181,8 @@ def load_best(folder: Path) -> tuple[FlatGaussians, dict[str, np.ndarray]]:
     path = folder / "best.npz"
     try:
         groups = _grouped(_read_arrays(path))
-        return from_row_arrays(FlatGaussians, groups["gaussians"]), groups["shading"]
+        gaussians = from_row_arrays(FlatGaussians, groups["gaussians"])
+        return BestState(gaussians, groups["shading"], groups["poses"]["corrections"])
     except _DAMAGE as error:
         raise CheckpointError(f"{path} cannot be read ({error}); train again without --resume.") from None
 

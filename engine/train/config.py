@@ -300,6 +300,8 @@ class TrainConfig(_Frozen):
     def _fits_together(self) -> "TrainConfig":
         if self.loss.depth_normal > 0 and not self.materials.learn and self.window_rays == 1:
             raise ValueError("loss.depth_normal compares neighbouring rays of windows: set window_rays to 64")
+        if self.trace.order != "ray":
+            raise ValueError("trace.order is the training's own; one_order says for which share it is packet")
         if self.background == "learnt" and self.materials.learn:
             raise ValueError(
                 "background=learnt is for scenes without materials, which learn the light around them: leave "

@@ -13,7 +13,7 @@ from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.protocol import ShadingModel, Sight
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.batches import still_background
-from octasplat.engine.train.checkpoint import load_best, save_best
+from octasplat.engine.train.checkpoint import BestState, load_best, save_best
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
 from octasplat.engine.train.shading import exposures_of
@@ -114,13 +114,16 @@ class Judge:
         state.probed.append((state.iteration, psnr))
         if psnr > state.best_psnr:
             state.best_psnr, state.best_iteration = psnr, state.iteration
-            save_best(state.gaussians, shading.state(), self._folder)
+            save_best(BestState(state.gaussians, shading.state(), state.pose_corrections), self._folder)
         if self._held_out is not None:
             held_out, _ = measure(self._held_out, self._dataset, tracer, shading)
             self._tell(HeldOutMeasured(state.iteration, held_out, len(state.gaussians), state.seconds))
 
     def choose(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> FlatGaussians:
-        """The last Gaussians, or the best if those are much worse; the shading becomes theirs too."""
+        """Return the last Gaussians, or the best if those are much worse.
+
+        The shading and the pose corrections of ``state`` become theirs, too.
+        """
         last, _ = measure(self._probe, self._dataset, tracer, shading)
         if last >= state.best_psnr - self._config.step_back_db:
             return state.gaussians
@@ -130,6 +133,7 @@ class Judge:
                 f"({state.best_psnr:.1f} dB); the better one is exported."
             )
         )
-        gaussians, parameters = load_best(self._folder)
-        shading.restore(parameters)
-        return gaussians
+        best = load_best(self._folder)
+        shading.restore(best.shading)
+        state.pose_corrections = best.pose_corrections
+        return best.gaussians

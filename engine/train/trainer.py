@@ -196,6 +196,8 @@ class Trainer:
             state.taken_near += int((near & (chosen.opacity_logits > GONE_LOGIT)).sum())
             chosen = chosen.select(np.flatnonzero(~gone))
         if chosen is not state.gaussians:
+            if self._refiner is not None:
+                self._refiner.dataset.put(state.pose_corrections)
             machinery.tracer.build(chosen, machinery.shading.features(chosen))
         guess_exposures(self._dataset, self._config, machinery.tracer, machinery.shading)
         self.views = self._view_judge.conclude(machinery.tracer, machinery.shading, state.left_out)
@@ -358,6 +360,7 @@ class Trainer:
             )
         # Neighbours in space become neighbours in memory, which the tracer's caches like.
         order = morton_order(gaussians.means_world)
+        densifier.reorder(order)
         state.gaussians, state.adam = gaussians.select(order), adam.select(order)
         return True
 

@@ -9,6 +9,7 @@ from flat_world import FlatWorld
 from octasplat.engine.errors import CheckpointError
 from octasplat.engine.gaussians.rows import row_arrays
 from octasplat.engine.train.checkpoint import (
+    BestState,
     latest_checkpoint,
     load_best,
     load_checkpoint,
@@ -102,10 +103,12 @@ def test_missing_file(tmp_path: Path) -> None:
 
 def test_best(tmp_path: Path) -> None:
     gaussians = FlatWorld().start(20)
-    save_best(gaussians, {"toy.light": np.arange(3.0)}, tmp_path)
-    back, shading = load_best(tmp_path)
-    np.testing.assert_array_equal(back.means_world, gaussians.means_world)
-    np.testing.assert_array_equal(shading["toy.light"], np.arange(3.0))
+    corrections = np.random.default_rng(0).normal(size=(5, 6))
+    save_best(BestState(gaussians, {"toy.light": np.arange(3.0)}, corrections), tmp_path)
+    back = load_best(tmp_path)
+    np.testing.assert_array_equal(back.gaussians.means_world, gaussians.means_world)
+    np.testing.assert_array_equal(back.shading["toy.light"], np.arange(3.0))
+    np.testing.assert_array_equal(back.pose_corrections, corrections)
     assert latest_checkpoint(tmp_path) is None
     (tmp_path / "best.npz").write_bytes(b"xx")
     with pytest.raises(CheckpointError, match=r"best\.npz"):

@@ -119,6 +119,18 @@ def test_new_ones_come_where_the_error_is() -> None:
     assert densifier.state()["errors"].sum() == 0
 
 
+def test_errors_stay_with_their_gaussians_in_another_order() -> None:
+    densifier = mcmc(growth=0.5, error_power=1.0)
+    gaussians = make([0.5] * 40)
+    errors = np.zeros(40)
+    errors[7] = 3.0
+    densifier.observe(40, *seen(40, errors))
+    order = np.random.default_rng(1).permutation(40)
+    densifier.reorder(order)
+    after, _ = apply(densifier, gaussians.select(order))
+    np.testing.assert_array_equal(after.sh[40:], np.repeat(gaussians.sh[[7]], 20, axis=0))
+
+
 def test_moments_of_the_untouched_stay() -> None:
     gaussians = make([0.5] * 10)
     adam = Adam.fresh(gaussians)

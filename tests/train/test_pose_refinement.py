@@ -18,7 +18,7 @@ from octasplat.engine.scene import Camera, View
 from octasplat.engine.scene.seen import points_in_cam
 from octasplat.engine.train.alignment import Motion, Rendered, aligned, photograph_of
 from octasplat.engine.train.batches import grid_pixels
-from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint
+from octasplat.engine.train.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
 from octasplat.engine.train.corrected_views import corrected, without_common
 from octasplat.engine.train.pixel_sampler import view_sizes_px
 from octasplat.engine.train.pose_refinement import RefinedPose
@@ -207,6 +207,18 @@ def test_stopped_and_on_other_threads_the_same_bits_come_out(tmp_path: Path) -> 
     assert whole.state.pose_corrections.any()
     for name, values in row_arrays(whole.state.gaussians).items():
         assert values.tobytes() == row_arrays(parts.state.gaussians)[name].tobytes(), name
+
+
+def test_the_best_state_brings_the_poses_that_it_had(tmp_path: Path) -> None:
+    train(tmp_path, refine_poses=True, iterations=80)
+    path = latest_checkpoint(tmp_path)
+    assert path is not None
+    state = load_checkpoint(path, "test")
+    before = np.full_like(state.pose_corrections, 1e-3)
+    save_best(BestState(state.gaussians.copy(), {}, before), tmp_path)
+    state.best_psnr = 90.0
+    trainer, _ = train(tmp_path, state=state, refine_poses=True, iterations=80)
+    np.testing.assert_array_equal(trainer.state.pose_corrections, before)
 
 
 def test_mirrors_and_photographs_without_cameras_are_refused(tmp_path: Path) -> None:

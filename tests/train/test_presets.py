@@ -186,3 +186,8 @@ def test_the_generated_scene_is_learnt_as_well_as_ever(tmp_path: Path) -> None:
 def test_a_photographed_scene_is_learnt_as_well_as_ever(scenes_root: Path, tmp_path: Path) -> None:
     psnr = psnr_of(scenes_root / "fox", tmp_path / "run", "iterations=200", max_side=240)
     assert psnr > 27.7  # 28.1 when this was written
+
+
+def test_the_order_of_a_trace_is_no_setting() -> None:
+    with pytest.raises(ConfigError, match=r"trace\.order.*one_order"):
+        resolve_config("fast", assignments=["trace.order=packet"])

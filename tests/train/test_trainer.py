@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from flat_world import FlatWorld, small_config
 
-from octasplat.engine.errors import Cancelled, TrainingFailure
+from octasplat.engine.errors import Cancelled, DatasetError, TrainingFailure
 from octasplat.engine.events import CheckpointWritten, Event, HeldOutMeasured, TrainingProgress, Warned
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
-from octasplat.engine.train.checkpoint import latest_checkpoint, load_checkpoint, save_best
+from octasplat.engine.train.checkpoint import BestState, latest_checkpoint, load_checkpoint, save_best
 from octasplat.engine.train.config import McmcConfig, PaperConfig, TrainConfig
+from octasplat.engine.train.shown import shown_share
 from octasplat.engine.train.state import TrainState, fresh_state
 from octasplat.engine.train.trainer import Trainer
 
@@ -179,7 +180,7 @@ def test_collapsed_end_gives_the_best_state(tmp_path: Path) -> None:
     assert path is not None
     state = load_checkpoint(path, "test")
     best = FlatWorld().start(50)
-    save_best(best, {}, tmp_path)
+    save_best(BestState(best, {}), tmp_path)
     state.best_psnr = 90.0
     found, events = train(tmp_path, config, state=state)
     assert content(found) == content(best)
@@ -200,3 +201,27 @@ def test_white_background_and_alpha(tmp_path: Path) -> None:
 def test_no_held_out_views(tmp_path: Path) -> None:
     _, events = train(tmp_path, small_config(iterations=20), world=FlatWorld(held_out=0))
     assert not any(isinstance(event, HeldOutMeasured) for event in events)
+
+
+class Masked(FlatWorld):
+    """Nothing counts but, where there is one, the pixel at ``left``."""
+
+    left: tuple[int, int, int] | None = None
+
+    def pixels(
+        self, view: np.ndarray, y: np.ndarray, x: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rgb, alpha, weight = super().pixels(view, y, x)
+        counts = np.zeros(len(x), np.bool_)
+        if self.left is not None:
+            counts = (view == self.left[0]) & (y == self.left[1]) & (x == self.left[2])
+        return rgb, alpha, np.where(counts, weight, 0).astype(np.float32)
+
+
+def test_masks_that_leave_nothing_are_refused_before_the_training(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="masks or alpha leave no pixel"):
+        train(tmp_path, small_config(iterations=40), world=Masked())
+    assert latest_checkpoint(tmp_path) is None
+    world = Masked()
+    world.left = (6, 3, 2)
+    assert shown_share(world) > 0

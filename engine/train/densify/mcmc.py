@@ -154,6 +154,11 @@ class Mcmc:
         made.means_world += np.einsum("nij,nj->ni", made.rotations[:, :, 1:], spread).astype(np.float32)
         return sources, made
 
+    def reorder(self, order: Int64[np.ndarray, " n"]) -> None:
+        """Bring the sums into the new order."""
+        if len(self._errors) == len(order):
+            self._errors, self._weights = self._errors[order], self._weights[order]
+
     def state(self) -> dict[str, np.ndarray]:
         """The sums of errors and weights."""
         return {"errors": self._errors, "weights": self._weights}

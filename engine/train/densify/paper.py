@@ -4,7 +4,7 @@
 """
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 from octasplat.engine.trace.protocol import GaussianGradients
@@ -74,6 +74,11 @@ class Paper:
         keep &= (size >= config.min_scale * extent) & (size <= config.max_scale * extent)
         self._steps = np.zeros((0, 3), np.float32)
         return gaussians.select(np.flatnonzero(keep)), adam.select(np.flatnonzero(keep))
+
+    def reorder(self, order: Int64[np.ndarray, " n"]) -> None:
+        """Bring the last steps into the new order."""
+        if len(self._steps) == len(order):
+            self._steps = self._steps[order]
 
     def state(self) -> dict[str, np.ndarray]:
         """The last steps."""

@@ -10,7 +10,7 @@ chance; the ``seed`` recipe does that.
 """
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 from scipy.spatial import cKDTree
 
 from octasplat.engine.gaussians.frames import quaternions
@@ -75,6 +75,10 @@ class Propagating:
             else:
                 propagate_normals(gaussians)
         return gaussians, adam
+
+    def reorder(self, order: Int64[np.ndarray, " n"]) -> None:
+        """Tell the strategy inside."""
+        self._inner.reorder(order)
 
     def state(self) -> dict[str, np.ndarray]:
         """That of the strategy inside."""

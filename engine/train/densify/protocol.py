@@ -3,7 +3,7 @@
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.trace.protocol import GaussianGradients
@@ -34,6 +34,10 @@ class Densifier(Protocol):
         self, gaussians: FlatGaussians, adam: Adam, rng: np.random.Generator, *, extent: float
     ) -> tuple[FlatGaussians, Adam]:
         """The new set and its optimiser state; may change the old ones in place."""
+        ...
+
+    def reorder(self, order: Int64[np.ndarray, " n"]) -> None:
+        """Take note that the Gaussian at place k is from now on the one that was at ``order[k]``."""
         ...
 
     def state(self) -> dict[str, np.ndarray]:
