@@ -46,6 +46,9 @@ class Group(_InSchema):
         return {"group": self.level}
 
 
+BASIC, ADVANCED, EXPERIMENTAL = Group("basic"), Group("advanced"), Group("experimental")
+
+
 @dataclass(frozen=True)
 class Spelling:
     """How a command spells a field, where it is not ``--name-of-field``.

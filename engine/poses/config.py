@@ -1,8 +1,12 @@
 """The settings of the search for poses, and the names that it goes by."""
 
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from octasplat.engine.fields import ADVANCED, Unit
+from octasplat.engine.settings import Settings
 
 FEATURES, MATCHES, STAGE = "features", "matches", "poses"
 """The stages of the search."""
@@ -15,48 +19,57 @@ RECORD = "poses.json"
 FOUND = "found"
 """The model's folder, while it lies below the one for the work."""
 MIN_PHOTOGRAPHS = 3
+MAX_IMAGE_SIDE_PX = 1600
+"""Size at most to which photographs are shrunk before features are looked for."""
+MAX_FEATURES = 4096
+"""Of a photograph; a second search takes twice as many, and fainter ones."""
+QUICK_FEATURES = 511
+"""Of a photograph, for the quick look that says which pairs are alike."""
+QUICK_MATCHES = 12
+"""By which two photographs are alike."""
+AGAIN_BELOW = 0.9
+"""Share of placed photographs below which a large set, too, is searched a second time."""
+MAX_REPROJECTION_PX = 2.5
+"""Mean error above which the result is not trusted."""
+MIN_POINTS = 100
+"""Sparse points below which it is not either."""
+WITNESSES = 100
+"""Photographs in all that one is matched with where its pose does not fit the first ones."""
+AGREEMENT_PX = 1.5
+"""Distance at which a match agrees with a pose, at the size at which features are looked for."""
 
 
-class PosesConfig(BaseModel):
-    """How poses are found.
+class PosesConfig(Settings):
+    """How poses are found."""
 
-    Attributes:
-        max_image_side_px: features are looked for at most at this size.
-        max_features: of a photograph; a second search takes twice as many, and fainter ones.
-        exhaustive_up_to: up to so many photographs every pair is matched; above, those that a quick look at
-            the largest features finds alike.
-        quick_features: of a photograph, for the quick look.
-        quick_matches: by which two photographs are alike.
-        partners: most photographs that one is matched with for being alike.
-        neighbours: by name on either side, which each photograph is matched with in any case.
-        again_below: share of placed photographs below which a large set, too, is searched a second time.
-        min_share: of the photographs that must get a pose.
-        max_reprojection_px: mean error above which the result is not trusted.
-        min_points: sparse points below which it is not either.
-        first_witnesses: photographs, evenly by name, that one whose pose is in doubt is matched with.
-        witnesses: the same, in all, where its pose does not fit these.
-        agreement_px: distance at which a match agrees with a pose, at the size at which features are looked
-            for.
-        seed: of everything random.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    max_image_side_px: int = Field(1600, ge=64)
-    max_features: int = Field(4096, ge=256)
-    exhaustive_up_to: int = Field(40, ge=2)
-    quick_features: int = Field(511, ge=64)
-    quick_matches: int = Field(12, ge=1)
-    partners: int = Field(40, ge=2)
-    neighbours: int = Field(3, ge=0)
-    again_below: float = Field(0.9, ge=0, le=1)
-    min_share: float = Field(0.5, gt=0, le=1)
-    max_reprojection_px: float = Field(2.5, gt=0)
-    min_points: int = Field(100, ge=10)
-    first_witnesses: int = Field(24, ge=2)
-    witnesses: int = Field(100, ge=2)
-    agreement_px: float = Field(1.5, gt=0)
-    seed: int = Field(0, ge=0)
+    exhaustive_up_to: Annotated[int, Unit("photographs"), ADVANCED] = Field(
+        40,
+        ge=2,
+        description="Up to so many photographs every pair is matched; above, those that a quick look at the "
+        "largest features finds alike. Raise it where views are missed and time does not "
+        "matter.",
+    )
+    partners: Annotated[int, Unit("photographs"), ADVANCED] = Field(
+        40,
+        ge=2,
+        description="Most photographs that one is matched with for being alike. Raise it for scenes that "
+        "look alike everywhere.",
+    )
+    neighbours: Annotated[int, Unit("photographs"), ADVANCED] = Field(
+        3,
+        ge=0,
+        description="Photographs by name on either side that each one is matched with in any case. Raise it "
+        "for frames of a video.",
+    )
+    min_share: Annotated[float, Unit("share of photographs"), ADVANCED] = Field(
+        0.5, gt=0, le=1, description="Share of the photographs that must get a pose; fewer are refused."
+    )
+    first_witnesses: Annotated[int, Unit("photographs"), ADVANCED] = Field(
+        24,
+        ge=2,
+        description="Photographs, evenly by name, that one whose pose is in doubt is matched with at first.",
+    )
+    seed: Annotated[int, ADVANCED] = Field(0, ge=0, description="Seed of everything random in the search.")
 
 
 DEFAULT_CONFIG = PosesConfig()

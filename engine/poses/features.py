@@ -12,7 +12,13 @@ from pathlib import Path
 
 import pycolmap
 
-from octasplat.engine.poses.config import PosesConfig
+from octasplat.engine.poses.config import (
+    MAX_FEATURES,
+    MAX_IMAGE_SIDE_PX,
+    QUICK_FEATURES,
+    QUICK_MATCHES,
+    PosesConfig,
+)
 from octasplat.engine.poses.pairs import (
     Pair,
     all_pairs,
@@ -74,9 +80,9 @@ def find_features(
     """
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
-    options.max_image_size = config.max_image_side_px
+    options.max_image_size = MAX_IMAGE_SIDE_PX
     options.use_gpu = False
-    options.sift.max_num_features = config.max_features * (2 if thorough else 1)
+    options.sift.max_num_features = MAX_FEATURES * (2 if thorough else 1)
     if thorough:
         options.sift.peak_threshold /= 3
     for start in range(0, len(names), _PHOTOGRAPHS_AT_ONCE):
@@ -146,7 +152,7 @@ def quick_pairs(
         counted: hears of pairs that are not alike.
     """
     small = database.with_name("quick.db")
-    _copy_largest_features(database, small, len(names), config.quick_features)
+    _copy_largest_features(database, small, len(names), QUICK_FEATURES)
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -164,13 +170,13 @@ def quick_pairs(
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             alike[first - 1, second - 1] = count
         looked += len(some)
-        unlike = looked - sum(count >= config.quick_matches for count in alike.values())
+        unlike = looked - sum(count >= QUICK_MATCHES for count in alike.values())
         counted(unlike)
     small.unlink()
     return chosen_pairs(
         alike,
         len(names),
-        least=config.quick_matches,
+        least=QUICK_MATCHES,
         partners=config.partners,
         neighbours=config.neighbours,
     )

@@ -8,7 +8,18 @@ import pycolmap
 
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.events import Listener
-from octasplat.engine.poses.config import FEATURES, FOUND, MATCHES, PLACING, RECORD, Given, Request
+from octasplat.engine.poses.config import (
+    AGREEMENT_PX,
+    FEATURES,
+    FOUND,
+    MATCHES,
+    MAX_IMAGE_SIDE_PX,
+    PLACING,
+    RECORD,
+    WITNESSES,
+    Given,
+    Request,
+)
 from octasplat.engine.poses.features import find_features, make_database, match_pairs
 from octasplat.engine.poses.placing import Matches, Pose, fits, matches_of, placed_anew
 from octasplat.engine.poses.workshop import linked_photographs, stage_of
@@ -33,7 +44,7 @@ def place_misplaced(request: Request, given: Given, tell: Listener) -> None:
     asked = _evenly(others, request.config.first_witnesses)
     hearing.ask(given.doubtful, asked)
     left = [k for k in given.doubtful if not hearing.is_cleared(k)]
-    more = _evenly([k for k in others if k not in asked], request.config.witnesses - len(asked))
+    more = _evenly([k for k in others if k not in asked], WITNESSES - len(asked))
     if left and more:
         hearing.ask(left, more)
     moved: dict[int, Pose] = {}
@@ -132,10 +143,8 @@ class _Hearing:
     def _within(self, k: int) -> float:
         """Distance at which a match agrees, in units of the focal length."""
         camera, (width_px, height_px) = self.model.cameras[self.images[k].camera_id], self._sizes_px[k]
-        shrunk = min(1.0, self._config.max_image_side_px / max(width_px, height_px))
-        return float(
-            self._config.agreement_px * camera.width / width_px / shrunk / camera.mean_focal_length()
-        )
+        shrunk = min(1.0, MAX_IMAGE_SIDE_PX / max(width_px, height_px))
+        return float(AGREEMENT_PX * camera.width / width_px / shrunk / camera.mean_focal_length())
 
 
 def _evenly(numbers: Sequence[int], count: int) -> list[int]:

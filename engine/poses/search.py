@@ -9,7 +9,17 @@ import pycolmap
 
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.events import Listener, Warned
-from octasplat.engine.poses.config import FEATURES, MATCHES, MIN_PHOTOGRAPHS, RECORD, STAGE, PosesConfig
+from octasplat.engine.poses.config import (
+    AGAIN_BELOW,
+    FEATURES,
+    MATCHES,
+    MAX_REPROJECTION_PX,
+    MIN_PHOTOGRAPHS,
+    MIN_POINTS,
+    RECORD,
+    STAGE,
+    PosesConfig,
+)
 from octasplat.engine.poses.features import (
     feature_counts,
     find_features,
@@ -74,7 +84,7 @@ class Search:
         count, config = len(self._names), self._config
         best = self._search(thorough=False)
         placed = rank(best)[0]
-        if placed < count and (count <= config.exhaustive_up_to or placed < config.again_below * count):
+        if placed < count and (count <= config.exhaustive_up_to or placed < AGAIN_BELOW * count):
             self._tell(
                 Warned(
                     f"{placed} of {count} photographs could be placed at first; they are searched again with "
@@ -229,7 +239,7 @@ class Search:
         if posed < max(MIN_PHOTOGRAPHS, config.min_share * count):
             raise DatasetError(f"Only {posed} of {count} photographs could be placed; {advice}")
         error_px = float(best.compute_mean_reprojection_error())
-        if points < config.min_points or not error_px <= config.max_reprojection_px:
+        if points < MIN_POINTS or not error_px <= MAX_REPROJECTION_PX:
             raise DatasetError(
                 f"The poses are not to be trusted ({points} points, {error_px:.1f} px mean error); {advice}"
             )

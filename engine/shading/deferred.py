@@ -23,7 +23,7 @@ from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.geometry_terms import neighbour_terms, spread_term
 from octasplat.engine.shading.incoming import ByLobes, ByOneRay, Incoming
 from octasplat.engine.shading.learnt_light import LearntLight
-from octasplat.engine.shading.material_settings import SEED_MATERIAL, MaterialSettings
+from octasplat.engine.shading.material_settings import ENVIRONMENT_RATE, SEED_MATERIAL, MaterialSettings
 from octasplat.engine.shading.parted import Parted, part, whole
 from octasplat.engine.shading.protocol import Developed, Reversed, Sight
 from octasplat.engine.shading.reflections import Follower
@@ -255,9 +255,7 @@ class Deferred:
             self._features[ids, first : first + width] = gaussians.channels[name][ids]
             first += width
         if "materials.texels" in parameters:
-            self.light.step(
-                parameters["materials.texels"], rate=self.settings.environment_rate * 0.1**progress
-            )
+            self.light.step(parameters["materials.texels"], rate=ENVIRONMENT_RATE * 0.1**progress)
 
     def _start_over(self, gaussians: FlatGaussians) -> None:
         """Do as the seed's code does when its second stage begins."""

@@ -7,7 +7,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.shading.environment_levels import LightLevels, prefilter, resampled, solid_angles
 from octasplat.engine.shading.map_steps import adam_change, unevenness
-from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.material_settings import ENVIRONMENT_EVERY, MaterialSettings
 
 FIRST_RADIANCE = 0.5
 _DARKEST, _BRIGHTEST = np.log(1e-4), np.log(1e4)
@@ -71,11 +71,11 @@ class LearntLight:
         """Count an iteration, and take a step if it is time."""
         self.sums += by_texels
         self.steps += 1
-        if self.steps[0] % self._settings.environment_every:
+        if self.steps[0] % ENVIRONMENT_EVERY:
             return
         gradient = self._prefilter.transposed(self.sums) * self.radiance_linear + self._priors()
         self.sums[:] = 0
-        count = self.steps[0] // self._settings.environment_every
+        count = self.steps[0] // ENVIRONMENT_EVERY
         self.first, self.second, change = adam_change(self.first, self.second, gradient, int(count))
         brightest = _BRIGHTEST if self._settings.hdr and self._settings.recipe != "seed" else 0.0
         radiance = np.clip(self.log_radiance - rate * change, _DARKEST, brightest)

@@ -1,8 +1,11 @@
-"""Every knob of learning materials and light from photographs, with its default."""
+"""All settings of learning materials and light from photographs, with their defaults."""
 
-from typing import Any, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field
+
+from octasplat.engine.fields import ADVANCED, BASIC, EXPERIMENTAL, Unit
+from octasplat.engine.settings import FormerSetting, Settings
 
 SEED_SECOND_STAGE = 0.36
 """Share of the training after which the seed's code begins deferred shading, with materials as at first."""
@@ -10,121 +13,216 @@ SEED_REACH = 10.0
 """World units within which the seed's code looks for what hides the environment."""
 SEED_MATERIAL = (0.5, 0.5, 0.5, 0.01, 0.1)
 """Albedo, metallic and roughness that it begins deferred shading with."""
+ENVIRONMENT_EVERY = 4
+"""Iterations between two steps of the environment, for each of which all its levels are filtered."""
+ENVIRONMENT_RATE = 0.03
+"""First size of a step of the environment's log radiance."""
+HAND_OVER = (0.0, 0.02)
+"""Shares of the training when shading begins to replace the harmonics' colours, and when it has."""
+PROPAGATION_EVERY = 0.06
+"""Share of the training between two times that normals are handed on to neighbours."""
+PROPAGATION_UNTIL = 0.4
+"""Share of the training at which that ends."""
+FIRST_ALBEDO, FIRST_METALLIC, FIRST_ROUGHNESS = 0.5, 0.5, 0.3
+"""Materials that all Gaussians begin with: in the middle, and smooth enough to show what they reflect."""
 
 
-class MaterialSettings(BaseModel):
-    """How materials and an environment are learnt; shares of the training are of all its iterations.
+class MaterialSettings(Settings):
+    """How materials and an environment are learnt; shares of the training are of all its iterations."""
 
-    Attributes:
-        learn: whether they are; nothing else here matters if not.
-        recipe: ``split_sum`` is this project's way; ``seed`` does what the code of "Reflective Gaussian
-            Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a colour of its own from the
-            harmonics, the environment stays in [0, 1], everything is in display values, visibility is
-            yes or no, and materials start over when deferred shading begins.
-        up_world: up; with it :func:`octasplat.engine.shading.environment_frame.environment_frame` says which
-            way the environment lies.
-        environment_height: texels of the environment from up to down; it has twice as many around.
-        environment_every: iterations between two steps of the environment.
-        hand_over: when shading begins to replace the harmonics' colours, and when it has.
-        secondary_from: when visibility and indirect light begin.
-        visibility: whether what stands in the way of a reflection hides the environment there.
-        parted: rays whose mean depth is farther from the median than so many times the distance at which
-            reflected rays begin show two surfaces, which are shaded each by itself; 0 shades their mean.
-        reflections: surfaces on the path of a reflected ray.
-        facet_slope: least angle between a normal and the two facets beside it at which rays are reflected, at
-            the beginning and from ``blur_until`` on; the rougher the surface, the larger.
-        widened: share of the points that send a third reflected ray while training, by which roughness
-            learns from how sharply other things are mirrored; 0 leaves that to the environment, which long
-            trainings are better with.
-        indirect: light of what stands there: ``shaded`` by the split sum, from the ``harmonics``, or
-            ``none``.
-        ambient: whether the irradiance is dimmed where other things hide the environment.
-        bounced: whether matt surfaces are lit by what others send, too.
-        ambient_rays: rays from each side of a Gaussian that say how much.
-        ambient_parts: rebuilds of the hierarchy in which all Gaussians have their turn.
-        hdr: whether the environment may be brighter than 1.
-        reflected_gradient: whether normals learn through the reflected direction.
-        normal_clip: gradients by normals through the reflected direction are cut off at so many times their
-            median of a batch; 0 leaves them alone.
-        start: distance from the surface at which reflected rays begin, of the extent.
-        leaves: distance up to which they pass what they would meet from behind, likewise; for normals that
-            point outwards.
-        blur: roughness of the level that leads reflected directions at first, and sees farther than a
-            sharp one; it falls to 0 until ``blur_until``.
-        blur_until: see there.
-        normal_weight: of the spread of the normals along a ray.
-        depth_normal_weight: of the angle between normals and the surface that the depths span.
-        smooth_normal_weight: of the angle between the normals of neighbouring rays.
-        smooth_weight: of differences of albedo between neighbouring rays.
-        smooth_gloss_weight: of differences of metallic and roughness between neighbouring rays, which change
-            less over a thing than its colour does.
-        smooth_metal: so many times more ``smooth_weight`` counts between metals, which are one colour more
-            often and which have what is reflected wrongly painted on.
-        only_seen: whether Gaussians that lie in no photograph are taken away; reflected rays alone see those,
-            so that they would become lamps.
-        white_weight: of the environment's colours; of their logarithms.
-        even_weight: of differences between neighbouring texels; of their logarithms.
-        harmonics_weight: of the harmonics' distance to what was shaded, once they are no longer seen.
-        propagation: whether normals are handed on to neighbours now and then.
-        propagation_every: share of the training between two times.
-        propagation_until: share of the training at which it ends.
-        environment_rate: size of a step of the environment's log radiance.
-        first_albedo: what materials begin with.
-        first_metallic: likewise.
-        first_roughness: likewise.
-    """
+    learn: Annotated[bool, BASIC] = Field(
+        False,
+        description="Learn materials and the light around the scene; nothing else of materials matters if "
+        "not. For scenes that reflect; it takes longer and brings settings of its own.",
+    )
+    recipe: Annotated[Literal["split_sum", "seed"], EXPERIMENTAL] = Field(
+        "split_sum",
+        description='split_sum is the way of octasplat; seed does what the code of "Reflective Gaussian '
+        'Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a colour of its '
+        "own from the harmonics, the environment stays in [0, 1], everything is in display "
+        "values, visibility is yes or no, and materials start over when deferred shading "
+        "begins.",
+    )
+    up_world: Annotated[tuple[float, float, float], Unit("world direction"), BASIC] = Field(
+        (0.0, 0.0, 1.0),
+        description="Direction that is up in the world; it says which way the environment lies. Set it "
+        "where the model of the cameras is turned.",
+    )
+    environment_height: Annotated[int, Unit("texels"), ADVANCED] = Field(
+        128,
+        ge=16,
+        le=512,
+        multiple_of=8,
+        description="Texels of the environment from up to down; it has twice as many around. Raise it for "
+        "mirrors.",
+    )
+    secondary_from: Annotated[float, Unit("share of iterations"), ADVANCED] = Field(
+        0.05, ge=0, le=1, description="Share of the training at which visibility and indirect light begin."
+    )
+    visibility: Annotated[bool, ADVANCED] = Field(
+        True,
+        description="Let what stands in the way of a reflection hide the environment there. Turning it off "
+        "is faster, for single convex objects.",
+    )
+    parted: Annotated[float, Unit("ray starts"), ADVANCED] = Field(
+        2.0,
+        ge=0,
+        description="Rays whose mean depth is farther from the median than so many times the distance at "
+        "which reflected rays begin show two surfaces, which are shaded each by itself; 0 "
+        "shades their mean.",
+    )
+    reflections: Annotated[int, Unit("surfaces"), ADVANCED] = Field(
+        3,
+        ge=1,
+        le=8,
+        description="Surfaces on the path of a reflected ray. Raise it for mirrors that face each other.",
+    )
+    facet_slope: Annotated[tuple[float, float], Unit("tangent"), ADVANCED] = Field(
+        (0.1, 0.01),
+        description="Tangent of the least angle between a normal and the two facets beside it at which rays "
+        "are reflected, at the beginning and from blur_until on; the rougher the surface, the "
+        "larger.",
+    )
+    widened: Annotated[float, Unit("share of points"), EXPERIMENTAL] = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="Share of the points that send a third reflected ray while training, by which roughness "
+        "learns from how sharply other things are mirrored; 0 leaves that to the environment, "
+        "which long trainings are better with.",
+    )
+    indirect: Annotated[Literal["shaded", "harmonics", "none"], ADVANCED] = Field(
+        "shaded",
+        description="Light of what stands in the way of a reflection: shaded by the split sum, from the "
+        "harmonics, or none. harmonics is faster and less right.",
+    )
+    ambient: Annotated[bool, ADVANCED] = Field(
+        True, description="Dim the irradiance where other things hide the environment."
+    )
+    bounced: Annotated[bool, ADVANCED] = Field(
+        True, description="Light matt surfaces by what other surfaces send, too."
+    )
+    ambient_rays: Annotated[int, Unit("rays"), ADVANCED] = Field(
+        16,
+        ge=4,
+        description="Rays from each side of a Gaussian that say how much of the environment is hidden. More "
+        "are slower and less noisy.",
+    )
+    ambient_parts: Annotated[int, Unit("rebuilds"), ADVANCED] = Field(
+        20,
+        ge=1,
+        description="Rebuilds of the hierarchy in which all Gaussians have their turn of ambient_rays. "
+        "Fewer are slower and follow changes sooner.",
+    )
+    hdr: Annotated[bool, ADVANCED] = Field(
+        True, description="Let the environment be brighter than 1, as lamps and the sun are."
+    )
+    reflected_gradient: Annotated[bool, ADVANCED] = Field(
+        True,
+        description="Let normals learn through the reflected direction. Turning it off keeps normals to "
+        "what depths say.",
+    )
+    normal_clip: Annotated[float, Unit("medians"), ADVANCED] = Field(
+        2.0,
+        ge=0,
+        description="Gradients by normals through the reflected direction are cut off at so many times "
+        "their median of a batch; 0 leaves them alone.",
+    )
+    start: Annotated[float, Unit("extent"), ADVANCED] = Field(
+        0.004,
+        gt=0,
+        description="Distance from the surface at which reflected rays begin, of the extent. Raise it where "
+        "surfaces shade themselves in spots.",
+    )
+    leaves: Annotated[float, Unit("extent"), ADVANCED] = Field(
+        0.0,
+        ge=0,
+        description="Distance up to which reflected rays pass what they would meet from behind, of the "
+        "extent; for normals that point outwards.",
+    )
+    blur: Annotated[float, Unit("roughness"), ADVANCED] = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="Roughness of the level of the environment that leads reflected directions at first, "
+        "and sees farther than a sharp one; it falls to 0 until blur_until.",
+    )
+    blur_until: Annotated[float, Unit("share of iterations"), ADVANCED] = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="Share of the training at which blur and facet_slope have reached their last values.",
+    )
+    normal_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.1, ge=0, description="Weight of the spread of the normals along a ray in the loss."
+    )
+    depth_normal_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.1,
+        ge=0,
+        description="Weight of the angle between normals and the surface that the depths span. Raise it "
+        "where surfaces are bumpy.",
+    )
+    smooth_normal_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.1,
+        ge=0,
+        description="Weight of the angle between the normals of neighbouring rays. Raise it for smooth "
+        "things, lower it where edges are rounded off.",
+    )
+    smooth_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.01,
+        ge=0,
+        description="Weight of differences of albedo between neighbouring rays. Raise it where reflections "
+        "are painted on.",
+    )
+    smooth_gloss_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.08,
+        ge=0,
+        description="Weight of differences of metallic and roughness between neighbouring rays, which "
+        "change less over a thing than its colour does.",
+    )
+    smooth_metal: Annotated[float, Unit("factor"), ADVANCED] = Field(
+        10.0,
+        ge=0,
+        description="So many times more smooth_weight counts between metals, which are one colour more "
+        "often and which have what is reflected wrongly painted on.",
+    )
+    only_seen: Annotated[bool, ADVANCED] = Field(
+        True,
+        description="Take away Gaussians that lie in no photograph; reflected rays alone see those, so that "
+        "they would become lamps.",
+    )
+    white_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.01,
+        ge=0,
+        description="Weight of the logarithms of the colours of the environment, which keeps it grey where "
+        "nothing else is known.",
+    )
+    even_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.03,
+        ge=0,
+        description="Weight of differences between the logarithms of neighbouring texels of the "
+        "environment. Raise it where it is noisy.",
+    )
+    harmonics_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.01,
+        ge=0,
+        description="Weight of the harmonics' distance to what was shaded, once they are no longer seen.",
+    )
+    propagation: Annotated[bool, EXPERIMENTAL] = Field(
+        False, description="Hand normals on to neighbours now and then, those of what reflects best first."
+    )
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    learn: bool = False
-    recipe: Literal["split_sum", "seed"] = "split_sum"
-    up_world: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    environment_height: int = Field(128, ge=16, le=512, multiple_of=8)
-    environment_every: int = Field(4, ge=1)
-    hand_over: tuple[float, float] = (0.0, 0.02)
-    secondary_from: float = Field(0.05, ge=0, le=1)
-    visibility: bool = True
-    parted: float = Field(2.0, ge=0)
-    reflections: int = Field(3, ge=1, le=8)
-    facet_slope: tuple[float, float] = (0.1, 0.01)
-    widened: float = Field(0.0, ge=0, le=1)
-    indirect: Literal["shaded", "harmonics", "none"] = "shaded"
-    ambient: bool = True
-    bounced: bool = True
-    ambient_rays: int = Field(16, ge=4)
-    ambient_parts: int = Field(20, ge=1)
-    hdr: bool = True
-    reflected_gradient: bool = True
-    normal_clip: float = Field(2.0, ge=0)
-    start: float = Field(0.004, gt=0)
-    leaves: float = Field(0.0, ge=0)
-    blur: float = Field(0.5, ge=0, le=1)
-    blur_until: float = Field(0.3, ge=0, le=1)
-    normal_weight: float = Field(0.1, ge=0)
-    depth_normal_weight: float = Field(0.1, ge=0)
-    smooth_normal_weight: float = Field(0.1, ge=0)
-    smooth_weight: float = Field(0.01, ge=0)
-    smooth_gloss_weight: float = Field(0.08, ge=0)
-    smooth_metal: float = Field(10.0, ge=0)
-    only_seen: bool = True
-    white_weight: float = Field(0.01, ge=0)
-    even_weight: float = Field(0.03, ge=0)
-    harmonics_weight: float = Field(0.01, ge=0)
-    propagation: bool = False
-    propagation_every: float = Field(0.06, gt=0, le=1)
-    propagation_until: float = Field(0.4, ge=0, le=1)
-    environment_rate: float = Field(0.03, ge=0)
-    first_albedo: float = Field(0.5, gt=0, lt=1)
-    first_metallic: float = Field(0.5, gt=0, lt=1)
-    first_roughness: float = Field(0.3, gt=0, lt=1)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_secondary_share(cls, given: Any) -> Any:
-        """Runs of earlier versions list a ``secondary_share``; 1 meant all pixels, as now."""
-        if isinstance(given, dict) and given.get("secondary_share") == 1:
-            given = {name: value for name, value in given.items() if name != "secondary_share"}
-        return given
+    former_settings: ClassVar = {
+        "secondary_share": FormerSetting(1),
+        "environment_every": FormerSetting(ENVIRONMENT_EVERY, after="environment_height"),
+        "hand_over": FormerSetting(list(HAND_OVER), after="environment_every"),
+        "propagation_every": FormerSetting(PROPAGATION_EVERY, after="propagation"),
+        "propagation_until": FormerSetting(PROPAGATION_UNTIL, after="propagation_every"),
+        "environment_rate": FormerSetting(ENVIRONMENT_RATE, after="propagation_until"),
+        "first_albedo": FormerSetting(FIRST_ALBEDO, after="environment_rate"),
+        "first_metallic": FormerSetting(FIRST_METALLIC, after="first_albedo"),
+        "first_roughness": FormerSetting(FIRST_ROUGHNESS, after="first_metallic"),
+    }
 
     @property
     def clears_unseen(self) -> bool:
@@ -142,7 +240,7 @@ class MaterialSettings(BaseModel):
 
     def handed_over(self, progress: float) -> float:
         """Share of the picture that is shaded, not taken from the harmonics."""
-        begin, end = self.hand_over
+        begin, end = HAND_OVER
         if progress >= end:
             return 1.0
         return max(progress - begin, 0.0) / (end - begin)

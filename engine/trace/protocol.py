@@ -1,53 +1,78 @@
 """What a tracer is: settings, what it returns, and the small protocol that every tracer follows."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Annotated, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Int32
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field
 
+from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_2_99
 from octasplat.engine.rays import RayBatch
+from octasplat.engine.settings import FormerSetting, Settings
 
 
-class TraceSettings(BaseModel):
-    """Which tracer, and how it cuts rays off. Where a ray begins is a matter of the ray.
+class TraceSettings(Settings):
+    """Which tracer, and how it cuts rays off. Where a ray begins is a matter of the ray."""
 
-    Attributes:
-        tracer: ``cpu``, or ``reference``: its slow twin, for a few hundred rays and Gaussians.
-        q: squared radius of an opaque octagon in standard deviations; Q of RaySplats, Eq. 6.
-        transmittance_min: a ray ends behind the Gaussian that takes its transmittance below this (eps1).
-        second_phase_min: None for that single threshold. Otherwise Algorithm 1's eps2: behind eps1 a second
-            transmittance starts at 1 and the ray goes on until it falls below this, so that the Gaussians
-            just behind the visible ones still receive a gradient.
-        max_hits: most Gaussians on a ray.
-        alpha_max: alpha is clamped to this, with zero gradient above it, so that 1/(1 - alpha) stays finite.
-        turned_beyond: a normal that points away from the viewer is turned towards it if its cosine to the
-            direction from the ray's origin to the mean is larger than this: 0 turns all, which suits normals
-            without a side. Where they point outwards, those just behind an outline had better stay: turned,
-            they would cancel the ones just before it.
-    """
+    tracer: Annotated[Literal["cpu", "reference"], EXPERIMENTAL] = Field(
+        "cpu",
+        description="Tracer: cpu, or reference, a slow one in plain Python for a few hundred rays and "
+        "Gaussians.",
+    )
+    q: Annotated[float, Unit("squared standard deviations"), ADVANCED] = Field(
+        CHI2_2_99,
+        gt=0,
+        le=30,
+        description="Squared radius of an opaque octagon in standard deviations; Q of RaySplats, Eq. 6. "
+        "Larger ones fall off farther and are hit by more rays.",
+    )
+    transmittance_min: Annotated[float, Unit("transmittance"), ADVANCED] = Field(
+        1e-3,
+        gt=0,
+        lt=1,
+        description="A ray ends behind the Gaussian that takes its transmittance below this (eps1). Larger "
+        "ones are faster and leave a little of what lies behind out.",
+    )
+    second_phase_min: Annotated[float | None, Unit("transmittance"), ADVANCED] = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="None for that single threshold. Otherwise Algorithm 1's eps2: behind eps1 a second "
+        "transmittance starts at 1 and the ray goes on until it falls below this, so that the "
+        "Gaussians just behind the visible ones still receive a gradient.",
+    )
+    max_hits: Annotated[int, Unit("Gaussians per ray"), ADVANCED] = Field(
+        512,
+        ge=1,
+        le=4096,
+        description="Most Gaussians on a ray; it ends there. Raise it for very transparent scenes.",
+    )
+    alpha_max: Annotated[float, Unit("opacity"), ADVANCED] = Field(
+        0.999,
+        gt=0,
+        le=0.9999,
+        description="Alpha is clamped to this, with zero gradient above it, so that 1/(1 - alpha) stays "
+        "finite.",
+    )
+    turned_beyond: Annotated[float, Unit("cosine"), ADVANCED] = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="A normal that points away from the viewer is turned towards it if its cosine to the "
+        "direction from the ray's origin to the mean is larger than this: 0 turns all, which "
+        "suits normals without a side. Where they point outwards, those just behind an outline "
+        "had better stay: turned, they would cancel the ones just before it.",
+    )
+    order: Annotated[Literal["ray", "packet"], ADVANCED] = Field(
+        "ray",
+        description="Order in which Gaussians are composited: that of each ray, or one for all rays of a "
+        "packet, which is faster and a little wrong. A training decides it by one_order.",
+    )
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    tracer: Literal["cpu", "reference"] = "cpu"
-    q: float = Field(CHI2_2_99, gt=0, le=30)
-    transmittance_min: float = Field(1e-3, gt=0, lt=1)
-    second_phase_min: float | None = Field(None, gt=0, lt=1)
-    max_hits: int = Field(512, ge=1, le=4096)
-    alpha_max: float = Field(0.999, gt=0, le=0.9999)
-    turned_beyond: float = Field(0.0, ge=0, le=1)
-    order: Literal["ray", "packet"] = "ray"
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_near_distance(cls, given: Any) -> Any:
-        """Runs of earlier versions list a ``t_min`` that was always overwritten; 0 is what they all say."""
-        if isinstance(given, dict) and given.get("t_min") == 0:
-            given = {name: value for name, value in given.items() if name != "t_min"}
-        return given
+    former_settings: ClassVar = {"t_min": FormerSetting(0)}
 
 
 @dataclass

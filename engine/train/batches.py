@@ -12,7 +12,7 @@ from octasplat.engine.colour import composited
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.ray_windows import RayWindows
-from octasplat.engine.train.config import TrainConfig, most_gaussians, window_side_px
+from octasplat.engine.train.config import SIGHT_LINE_MARGIN, TrainConfig, most_gaussians, window_side_px
 from octasplat.engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
 from octasplat.engine.train.shown import shown_share
 from octasplat.engine.train.sight_lines import PhotographsOfPoints, SightLines
@@ -75,7 +75,7 @@ class BatchSource:
         self._patches = self._patch_count()
         self._lines: SightLines | None = None
         if config.loss.blocked > 0 and isinstance(dataset, PhotographsOfPoints) and len(dataset.points):
-            self._lines = SightLines.of(dataset, config.sight_line_margin)
+            self._lines = SightLines.of(dataset, SIGHT_LINE_MARGIN)
 
     def leave_out(self, views: Int64[np.ndarray, " m"]) -> None:
         """Draw nothing of these views any more."""

@@ -4,10 +4,11 @@ import hashlib
 import json
 
 from octasplat.engine.scene import Dataset
+from octasplat.engine.settings import dump_with_former_settings
 from octasplat.engine.train.config import TrainConfig
 
 
 def run_fingerprint(dataset: Dataset, config: TrainConfig) -> str:
-    """Names the settings and the photographs that decide every byte of a training."""
-    text = json.dumps([config.model_dump(mode="json"), dataset.record.fingerprint()])
+    """Return a digest of the settings and the photographs that decide every byte of a training."""
+    text = json.dumps([dump_with_former_settings(config), dataset.record.fingerprint()])
     return hashlib.sha256(text.encode()).hexdigest()

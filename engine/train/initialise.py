@@ -14,7 +14,12 @@ from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
 from octasplat.engine.gaussians.materials import AMBIENT, BOUNCED, MATERIAL_WIDTHS
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.scene import Dataset
-from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.material_settings import (
+    FIRST_ALBEDO,
+    FIRST_METALLIC,
+    FIRST_ROUGHNESS,
+    MaterialSettings,
+)
 from octasplat.engine.train.config import TrainConfig, most_gaussians
 from octasplat.engine.train.dense_points import dense_points
 from octasplat.engine.train.exposure_changes import evening_gains
@@ -82,7 +87,7 @@ def initial_gaussians(
 
 def with_first_materials(gaussians: FlatGaussians, settings: MaterialSettings) -> FlatGaussians:
     """The same Gaussians with the materials that a training begins with, all alike."""
-    values = (settings.first_albedo,) * 3, (settings.first_metallic,), (settings.first_roughness,)
+    values = (FIRST_ALBEDO,) * 3, (FIRST_METALLIC,), (FIRST_ROUGHNESS,)
     first = dict(zip(MATERIAL_WIDTHS, values, strict=True)) | {AMBIENT: (1.0,)}
     if settings.recipe == "split_sum" and settings.bounced:
         first[BOUNCED] = (0.0,) * 3

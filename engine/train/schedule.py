@@ -6,7 +6,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from octasplat.engine.train.averaging import AVERAGE_EVERY
-from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, rebuild_interval
+from octasplat.engine.train.config import (
+    MISFITS_AFTER,
+    TrainConfig,
+    in_one_order,
+    iteration_count,
+    rebuild_interval,
+)
 from octasplat.engine.train.early_end import last_iteration
 
 EVENT_EVERY = 10
@@ -58,7 +64,7 @@ class Schedule:
 
     def judges_views(self, done: int) -> bool:
         """Whether views that do not fit are looked for after ``done`` iterations, for the rest of the run."""
-        since = self.config.misfits_after * self.iterations
+        since = MISFITS_AFTER * self.iterations
         return self.measures(done) and since <= done < self.iterations
 
     def refines_poses(self, done: int) -> bool:

@@ -6,7 +6,7 @@ from octasplat.engine.shading.flattening import Flattening
 from octasplat.engine.shading.learnt_background import LearntBackground
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import ShadingModel
-from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.config import BACKGROUND_SMOOTHNESS, TrainConfig
 
 
 def make_shading(config: TrainConfig, views: int, extent_world: float) -> ShadingModel:
@@ -21,7 +21,7 @@ def make_shading(config: TrainConfig, views: int, extent_world: float) -> Shadin
             config.background_height,
             rate=config.rates.background,
             decay=config.rates.decay,
-            even_weight=config.background_even,
+            even_weight=BACKGROUND_SMOOTHNESS,
             inner=inner,
         )
     if config.exposure is True:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from octasplat.engine.gaussians.frames import quaternions
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.shading.material_settings import PROPAGATION_EVERY, PROPAGATION_UNTIL, MaterialSettings
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.densify.protocol import Densifier
 from octasplat.engine.train.optimiser import Adam
@@ -46,8 +46,8 @@ class Propagating:
         self.wants_errors = inner.wants_errors
         self._inner = inner
         self._settings = settings
-        self._every = max(1, round(settings.propagation_every * iterations))
-        self._until = settings.propagation_until * iterations
+        self._every = max(1, round(PROPAGATION_EVERY * iterations))
+        self._until = PROPAGATION_UNTIL * iterations
         self._total = iterations
         self._iteration = 0
 

@@ -1,0 +1,77 @@
+"""What settings that are left to the photographs come to."""
+
+import math
+
+from octasplat.engine.train.config.train import TrainConfig
+
+MOST_PLANNED_ITERATIONS = 70_000
+"""Where a time decides their number, see :mod:`octasplat.engine.train.within`."""
+LEAST_THOUSANDS = 5
+"""Of iterations, where the photographs decide their number."""
+OWN_ORDER = 3 / 7
+"""Share of the rays that a training has time for where each ray has an order of its own."""
+
+
+def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
+    """``config.iterations``, or where that is 0 so many rays for each pixel, in whole thousands.
+
+    Large scenes learn as long as there is something to see; small ones are done after 7,000 with 7 rays a
+    pixel. Rays that have an order of their own take longer, so that there are fewer of them. Where only a
+    share of the pixels shows anything (see :mod:`octasplat.engine.train.shown`), the rays of the others teach
+    little and cost little, and it takes as many more; not with materials.
+    """
+    each = config.rays_a_pixel
+    if in_one_order(config):
+        least = max(LEAST_THOUSANDS, each)
+    else:
+        if not config.materials.learn:  # which have a number of their own
+            each = max(1, round(OWN_ORDER * each))
+        least = LEAST_THOUSANDS * max(1, each // 3)
+    wanted = max(round(each * training_pixels / config.rays / 1000), least)
+    if not config.materials.learn:
+        wanted = round(wanted / shown)
+    return config.iterations or min(wanted, 10 * each // 3) * 1000
+
+
+def most_gaussians(config: TrainConfig, training_pixels: int, shown: float = 1.0) -> int:
+    """``config.max_gaussians``, or where that is 0 what so many pixels of training views can hold down.
+
+    Of those only the share counts that shows anything. More than one for each 10 pixels learn the noise of
+    the training views instead of the scene.
+    """
+    if config.max_gaussians:
+        return config.max_gaussians
+    training_pixels = round(training_pixels * shown)
+    wanted = max(training_pixels // config.pixels_a_gaussian, min(training_pixels // 10, 10_000), 1)
+    return min(wanted, config.max_gaussians_auto)
+
+
+def in_one_order(config: TrainConfig) -> bool:
+    """Whether the rays of a window composite in one order for a part of the training.
+
+    Gradients by depths and normals, and a second phase, want each ray's own.
+    """
+    by_geometry = config.materials.learn or config.loss.depth_normal > 0
+    return config.one_order > 0 and not by_geometry and config.trace.second_phase_min is None
+
+
+def window_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian: float) -> int:
+    """``config.window_side``, or where that is 0 what suits the Gaussians or the views.
+
+    A window is to cover a small angle, so that its rays meet the same Gaussians: what these cost once for all
+    rays is most of what rays in one order cost. But rays that are too close learn the same.
+    """
+    if config.window_side:
+        return config.window_side
+    widest = max(1, round(longest_side_px / 15))
+    if not in_one_order(config):
+        return widest
+    return min(widest, max(1, round(math.sqrt(6 * pixels_a_gaussian))))
+
+
+def rebuild_interval(config: TrainConfig, gaussians: int) -> int:
+    """Iterations between rebuilds of the hierarchy: ``rebuild_every``, as much again for each half million.
+
+    A rebuild takes time for every Gaussian, an iteration only for those that its rays meet.
+    """
+    return config.rebuild_every * (1 + gaussians // 500_000)

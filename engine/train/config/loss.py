@@ -1,0 +1,64 @@
+"""Weights of the terms of the loss."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
+from octasplat.engine.settings import Settings
+
+FOR_SURFACE = 0.05
+"""Weight of ``loss.depth_normal`` for scenes of which a surface is to be made, see ``docs/surface.md``."""
+
+
+class LossWeights(Settings):
+    """Weights of the loss terms; means over the batch's valid rays and channels.
+
+    The families of the field: 0.8 L1 + 0.2 (1 - SSIM), as in "3D Gaussian Ray Tracing: Fast Tracing of
+    Particle Scenes" (https://arxiv.org/abs/2407.07090), is l1 = 0.8, ssim = 0.2; the authors of REdiSplats
+    (https://arxiv.org/abs/2503.12284) use 0.8 MSE + 0.2 (1 - SSIM)/2: l2 = 0.8, ssim = 0.1.
+    """
+
+    l1: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.8,
+        ge=0,
+        description="Weight of the mean absolute difference of display colours. Raise it against l2 where a "
+        "few wrong pixels, such as passers-by, matter too much.",
+    )
+    l2: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        1.0,
+        ge=0,
+        description="Weight of the mean squared difference of display colours. Raise it against l1 for "
+        "higher PSNR, lower it for sharper pictures.",
+    )
+    ssim: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.0,
+        ge=0,
+        description="Weight of 1 - SSIM; more than 0 makes patch_fraction of the rays whole patches, which "
+        "is slower. Use it to repeat published recipes.",
+    )
+    opacity: Annotated[float, Unit("weight"), EXPERIMENTAL] = Field(
+        0.0,
+        ge=0,
+        description="Weight of the mean opacity of the Gaussians that were hit, which makes unneeded ones "
+        "fade. Try it where a scene has too many floaters.",
+    )
+    scale: Annotated[float, Unit("weight per extent"), EXPERIMENTAL] = Field(
+        0.0,
+        ge=0,
+        description="Weight of the mean in-plane scale of the Gaussians that were hit, of the extent, which "
+        "shrinks them. Try it where large ones blur the scene.",
+    )
+    blocked: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.0,
+        ge=0,
+        description="Weight of what hides the sparse points from views that show them: free space along "
+        "their lines of sight. Raise it where something floats before the cameras; materials use 0.05.",
+    )
+    depth_normal: Annotated[float, Unit("weight"), ADVANCED] = Field(
+        0.0,
+        ge=0,
+        description="Weight of one minus the cosine between normals and what depths span; not with "
+        f"materials. Set it to {FOR_SURFACE} for scenes of which a surface is to be made; it takes about "
+        "twice as long.",
+    )

@@ -1,0 +1,72 @@
+"""What is believed of the photographs: background, exposure, poses."""
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from octasplat.engine.fields import ADVANCED, BASIC, Unit
+from octasplat.engine.settings import FormerSetting, Settings
+
+BACKGROUND_SMOOTHNESS = 0.1
+"""Weight of the differences between neighbouring texels of a learnt background."""
+MISFITS_AFTER = 0.3
+"""Share of the iterations after which checkpoints look for views that do not fit: earlier, all misfit."""
+SIGHT_LINE_MARGIN = 0.003
+"""Distance before its sparse point at which a line of sight ends, of its length."""
+
+
+class PhotographSettings(Settings):
+    """Background, exposure, and views that do not fit the others."""
+
+    background: Annotated[Literal["auto", "black", "white", "random", "learnt"], BASIC] = Field(
+        "auto",
+        description="What is behind everything: auto is random for photographs with alpha, else black; "
+        "learnt is a map of what is infinitely far away, such as the sky, for captures outdoors.",
+    )
+    background_height: Annotated[int, Unit("texels"), ADVANCED] = Field(
+        256,
+        ge=16,
+        le=2048,
+        multiple_of=2,
+        description="Texels of a learnt background from up to down; it has twice as many around. Raise it "
+        "for detailed skylines.",
+    )
+    exposure: Annotated[bool | Literal["auto"], BASIC] = Field(
+        "auto",
+        description="Learn a gain and an offset for each channel of each training view; auto does so where "
+        "the photographs show that the exposure changes.",
+    )
+    leave_out_misfits: Annotated[bool, BASIC] = Field(
+        False,
+        description="Train without the views that do not fit the others, as it becomes clear which. Use it "
+        "where a few photographs show something else or have wrong poses.",
+    )
+    place_misfits: Annotated[bool, ADVANCED] = Field(
+        True,
+        description="Look for photographs of a given model that stand in the wrong place, and place them "
+        "anew before the training; not before one of less than 1,000 iterations or 10 minutes.",
+    )
+    free_lenses: Annotated[bool, ADVANCED] = Field(
+        True,
+        description="Let each photograph of a model have a principal point of its own, where the sparse "
+        "points show that the lens moved, as stabilised ones do; not before a training of less than 1,000 "
+        "iterations or 10 minutes.",
+    )
+    refine_poses: Annotated[bool, BASIC] = Field(
+        False,
+        description="Learn a small correction of the pose of each training view; not with materials. Use it "
+        "where poses come from a tracker rather than from COLMAP.",
+    )
+    sight_line_share: Annotated[float, Unit("share of rays"), ADVANCED] = Field(
+        0.02,
+        gt=0,
+        le=1,
+        description="Lines of sight of sparse points beside each batch, of its rays, where loss.blocked is "
+        "more than 0.",
+    )
+
+    former_settings: ClassVar = {
+        "background_even": FormerSetting(BACKGROUND_SMOOTHNESS, after="background_height"),
+        "misfits_after": FormerSetting(MISFITS_AFTER, after="free_lenses"),
+        "sight_line_margin": FormerSetting(SIGHT_LINE_MARGIN, after="sight_line_share"),
+    }

@@ -1,0 +1,108 @@
+"""The presets: named starting points of the settings of a training."""
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.gaussians.octagon import CHI2_3_99
+from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.engine.train.config.densify import McmcConfig, PaperConfig
+from octasplat.engine.train.config.loss import LossWeights
+from octasplat.engine.train.config.rates import LearningRates
+from octasplat.engine.train.config.train import TrainConfig
+from octasplat.engine.train.preset_names import PRESETS
+
+TURNED_BEYOND = 0.5
+"""Cosine beyond which normals that point away are turned, where materials are learnt."""
+
+
+def with_materials(config: TrainConfig) -> TrainConfig:
+    """A configuration for shiny things: materials are learnt, and geometry keeps still enough for mirrors.
+
+    Reflections ask for normals to within a degree, so steps are small. Points lifted from photographs that
+    show reflections lie behind the surface, so there are none.
+    """
+    rates = {
+        "quat": 1e-3,
+        "mean": 0.016,
+        "mean_final": 1e-3,
+        "log_scale": 0.02,
+        "opacity": 0.1,
+        "sh_rest_ratio": 0.05,
+        "calm_after": 0,
+    }
+    return config.model_copy(
+        update={
+            # Rays may begin so near to a surface as they pass it, which normals with a side allow.
+            "materials": config.materials.model_copy(
+                update={"learn": True, "start": 1e-3, "leaves": 1e-2, "parted": 8.0}
+            ),
+            "rates": config.rates.model_copy(update=rates),
+            # Gaps under things that stand on a mirror would be filled with what looks like the reflection.
+            "loss": config.loss.model_copy(update={"blocked": 0.05}),
+            "lift_pixels": False,
+            "plane_points": 10,
+            "sh_degree": min(config.sh_degree, 1),
+            "sh_every": 400,
+            "rays": 8192,
+            "iterations": config.iterations * 14 // 25,  # which take longer by ray, and longer with light
+            "rays_a_pixel": 8,
+            "pixels_a_gaussian": 50,
+            "step_back_db": 0.3,
+            "average_after": 0.8,
+            "least_weight": 0.0,
+            "near_share": 0.0,
+            "one_order": 0.0,
+            "stop_early": 0.0,
+            "densify": McmcConfig(copies="area", stop_fraction=0.4, idle_weight=0.0),
+            "initial_opacity": 0.8,
+            "trace": config.trace.model_copy(update={"turned_beyond": TURNED_BEYOND}),
+            "max_gaussians_auto": min(config.max_gaussians_auto * 4 // 5, 80_000),
+        }
+    )
+
+
+def preset(name: str) -> TrainConfig:
+    """The named preset.
+
+    Raises:
+        ConfigError: there is no such preset.
+    """
+    if name == "fast":
+        return TrainConfig(iterations=2500, max_gaussians_auto=50_000)
+    if name == "standard":
+        return TrainConfig()
+    if name == "high":
+        return TrainConfig(rays_a_pixel=21, max_gaussians_auto=600_000)
+    if name == "paper":
+        return TrainConfig(
+            iterations=10_000,
+            sh_degree=0,
+            rays=8192,
+            least_weight=0.0,
+            near_share=0.0,
+            one_order=0.0,
+            stop_early=0.0,
+            place_misfits=False,
+            free_lenses=False,
+            window_rays=1,
+            pixels_a_gaussian=50,
+            max_gaussians_auto=350_000,
+            initial_points=30_000,
+            lift_pixels=False,
+            initial_opacity=0.1,
+            rates=LearningRates(
+                mean=5e-4,
+                mean_final=3e-6,
+                mean_of="extent",
+                axes="world",
+                quat=0.01,
+                log_scale=5e-3,
+                opacity=0.05,
+                colour=1.4e-3,
+                decay=0.1,
+                calm_after=0,
+            ),
+            loss=LossWeights(l1=0.0, l2=0.8, ssim=0.1),
+            trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),
+            densify=PaperConfig(),
+        )
+    listed = ", ".join(PRESETS)
+    raise ConfigError(f"There is no preset called {name!r}; choose {listed}.")
