@@ -3,6 +3,7 @@
 import json
 from itertools import chain
 
+from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.preset_names import PRESETS
 from octasplat.service.web.forms import Field, OptionsForm, options_form
 from octasplat.workers.work.kinds import job_kinds, kind_named
@@ -45,7 +46,7 @@ def test_limits_choices_and_words() -> None:
     assert [choice.value for choice in fields["poses"].choices] == ["given", "auto", "missing"]
     assert fields["held_out"].control == "list"
     assert "hold out" in fields["held_out"].help.lower()  # from the docstring
-    assert fields["train.rays"].help == "Rays of one iteration"  # from the field
+    assert fields["train.rays"].help == TrainConfig.model_fields["rays"].description
     assert fields["train.densify.growth"].help.startswith("Only for mcmc")
     assert not fields["train.densify.start"].help.startswith("Only for")
 
