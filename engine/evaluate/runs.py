@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -58,6 +59,7 @@ def evaluate(
     *,
     scene: Path | None = None,
     on: Path | None = None,
+    background: Literal["black", "white"] | None = None,
     threads: int = 0,
     listener: Listener = lambda _event: None,
 ) -> Path:
@@ -69,6 +71,7 @@ def evaluate(
         on: other photographs of the same scene in the same world, with a COLMAP model of their own; all of
             them are measured, into a folder of their name in ``output / "on"``, and the run's own results
             stay as they are.
+        background: behind the scene; None takes that of the run.
         threads: for everything; 0 means all cores.
         listener: hears the progress.
 
@@ -81,7 +84,7 @@ def evaluate(
         OutputError: there is no scene yet, or other photographs of that name were measured before.
     """
     use_threads(threads)
-    config = _finished(output)
+    config = _finished(output, background)
     if on is not None:
         return _evaluate_on(on, output, config, threads, listener)
     dataset = _photographs(output, config, scene, threads, listener)
@@ -99,6 +102,7 @@ def evaluate_scales(
     scales: Sequence[int],
     *,
     scene: Path | None = None,
+    background: Literal["black", "white"] | None = None,
     threads: int = 0,
     listener: Listener = lambda _event: None,
 ) -> dict[str, dict[str, float]]:
@@ -110,6 +114,7 @@ def evaluate_scales(
         output: folder of the run.
         scales: by how much pixels are larger than those of the training.
         scene: where the photographs are now; None takes the folder that the run was made from.
+        background: behind the scene; None takes that of the run.
         threads: for everything; 0 means all cores.
         listener: hears the progress.
 
@@ -122,7 +127,7 @@ def evaluate_scales(
         OutputError: there is no scene yet.
     """
     use_threads(threads)
-    config = _finished(output)
+    config = _finished(output, background)
     dataset = _photographs(output, config, scene, threads, listener)
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
@@ -143,9 +148,11 @@ def evaluate_scales(
     return found
 
 
-def _finished(output: Path) -> ReconstructionConfig:
-    """The settings of a run that has a scene."""
+def _finished(output: Path, background: Literal["black", "white"] | None) -> ReconstructionConfig:
+    """Return the settings of a run that has a scene, to be measured with that background."""
     config = read_config(output / CONFIG)
+    if background is not None:
+        config = config.model_copy(update={"evaluate_background": background})
     if not (output / SCENE).exists():
         raise OutputError(
             f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."

@@ -8,6 +8,7 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.operations.base import Operation
 
 _MODULES = {
+    "evaluate": "evaluate",
     "crop": "crop",
 }
 """Module of each verb, in the order in which users meet them."""

@@ -9,7 +9,7 @@ import pytest
 
 from octasplat.engine.render.images import read_image
 from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import evaluate
+from octasplat.workers.work.programs import run_operation
 from octasplat.workers.work.task import Task
 
 
@@ -53,8 +53,9 @@ def test_views_of_another_folder_are_measured_as_the_run_measures_its_own(run, o
     # The same as a job: its results are those figures.
     kind = kind_named("evaluate")
     shutil.copytree(run.output, tmp_path / "attempt" / "run", ignore=shutil.ignore_patterns("on", "cache"))
-    options = kind.on_others(kind.resolve({}))
-    evaluate(Task(tmp_path / "attempt", options.model_dump(mode="json"), scene=others, threads=1))
+    options = kind.on_other_photographs(kind.resolve({}))
+    dumped = options.model_dump(mode="json")
+    run_operation(Task(tmp_path / "attempt", dumped, scene=others, threads=1, kind="evaluate"))
     results = tmp_path / "attempt" / "results"
     assert json.loads((results / "metrics.json").read_text())["views"] == metrics["views"]
     assert sorted(path.name for path in results.iterdir()) == ["metrics.json", "renders", "report.html"]

@@ -7,6 +7,7 @@ import time
 import pytest
 from rich.console import Console
 
+from octasplat.engine.durations import clock, duration
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import (
     HeldOutMeasured,
@@ -19,7 +20,7 @@ from octasplat.engine.events import (
 from octasplat.engine.stages import stopping
 from octasplat.workers.cli.progress import Bars, show_progress
 from octasplat.workers.telling.lines import PlainLines
-from octasplat.workers.telling.wording import clock, duration, rate
+from octasplat.workers.telling.wording import rate
 
 TRAINING = TrainingProgress(
     iteration=310, total_iterations=1500, loss=0.1, psnr=24.13, gaussians=32000, rays_per_second=310_400,

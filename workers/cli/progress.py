@@ -9,6 +9,7 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
+from octasplat.engine.durations import clock
 from octasplat.engine.events import (
     Event,
     Listener,
@@ -21,7 +22,7 @@ from octasplat.engine.events import (
 )
 from octasplat.engine.stages import DOING
 from octasplat.workers.telling.lines import PlainLines, StageState
-from octasplat.workers.telling.wording import clock, training_state
+from octasplat.workers.telling.wording import training_state
 
 _STOPPING = "Stopping at the next safe point; press Ctrl-C again to stop at once."
 

@@ -6,11 +6,11 @@ import click
 
 from octasplat.engine.config import ReconstructionConfig
 from octasplat.engine.errors import Cancelled, ExportFailed, NoSpaceLeft
+from octasplat.engine.evaluate.summary import run_summary
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.stages import stopping
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import Stopped, stop_on_signals
-from octasplat.workers.telling.wording import run_summary
 
 
 def run_reconstruction(

@@ -5,11 +5,11 @@ from typing import Any
 
 import click
 
+from octasplat.engine.evaluate.summary import run_summary
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.client import submission
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.submission import Derivation, JobFailed, Submission
-from octasplat.workers.telling.wording import run_summary
 
 DEMO_OUTPUT = Path("octasplat-demo")
 

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 
+from octasplat.engine.durations import clock, duration
 from octasplat.engine.events import (
     Event,
     HeldOutMeasured,
@@ -15,7 +16,7 @@ from octasplat.engine.events import (
 )
 from octasplat.engine.stages import DOING
 from octasplat.workers.telling.pace import Pace
-from octasplat.workers.telling.wording import clock, duration, training_state
+from octasplat.workers.telling.wording import training_state
 
 SECONDS_BETWEEN_LINES = 5.0
 # What a finished stage did, and what its steps are; "" where nobody would want them counted.

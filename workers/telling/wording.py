@@ -1,45 +1,6 @@
 """Numbers and results in the words in which they are shown."""
 
-import json
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
-
 from octasplat.engine.events import HeldOutMeasured, TrainingProgress
-
-_METRICS = (
-    ("psnr", "PSNR {:.2f} dB"),
-    ("ssim", "SSIM {:.3f}"),
-    ("ms_ssim", "MS-SSIM {:.3f}"),
-    ("flip", "FLIP {:.3f}"),
-    ("psnr_foreground", "PSNR of the foreground {:.2f} dB"),
-)
-
-_TRUTH = (
-    ("normal_mae", "normals {:.2f} degrees off"),
-    ("albedo_psnr_scaled", "albedo {:.2f} dB (one scale)"),
-    ("roughness_mae", "roughness {:.3f} off"),
-    ("metallic_mae", "metallic {:.3f} off"),
-    ("environment_psnr_scaled", "environment {:.2f} dB (one scale)"),
-    ("relight_psnr", "relit {:.2f} dB"),
-    ("relight_psnr_scaled", "{:.2f} dB with one scale"),
-)
-
-
-def clock(seconds: float) -> str:
-    """A duration as ``1:23`` or ``1:02:03``."""
-    minutes, rest = divmod(max(0, round(seconds)), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
-def duration(seconds: float) -> str:
-    """A duration in words: ``0.8 s``, ``42 s``, ``3:05 min``, ``1:02:03 h``."""
-    if seconds < 9.95:
-        return f"{seconds:.1f} s"
-    if seconds < 59.5:
-        return f"{seconds:.0f} s"
-    return f"{clock(seconds)} {'h' if seconds >= 3599.5 else 'min'}"
 
 
 def rate(per_second: float) -> str:
@@ -56,55 +17,3 @@ def training_state(event: TrainingProgress, held_out: HeldOutMeasured | None) ->
         parts.append(f"held out {held_out.psnr:.1f} dB")
     parts += [f"{event.gaussians:,} Gaussians", f"{rate(event.rays_per_second)} rays/s"]
     return ", ".join(parts)
-
-
-def mean_metrics(metrics: dict[str, Any]) -> str:
-    """One line on the held-out views from the content of ``metrics.json``."""
-    count = len(metrics["views"])
-    if count == 0:
-        return "No views were held out, so nothing was measured."
-    mean = metrics["mean"]
-    known = [form.format(mean[key]) for key, form in _METRICS if mean.get(key) is not None]
-    return f"Mean over {count} held-out view{'s' if count > 1 else ''}: {', '.join(known)}"
-
-
-def measured_summary(path: Path) -> list[str]:
-    """What was measured on other photographs into ``path``, and where it is shown."""
-    metrics: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    known = metrics.get("truth", {}).get("mean", {})
-    told = [form.format(known[key]) for key, form in _TRUTH if known.get(key) is not None]
-    return [
-        mean_metrics(metrics),
-        *([f"Against the truth: {', '.join(told)}"] if told else []),
-        f"{'Report:':8}{path.with_name('report.html')}",
-    ]
-
-
-def run_summary(output: Path, exports: Iterable[str]) -> list[str]:
-    """What a finished run in ``output`` reached and where its files are."""
-    metrics: dict[str, Any] = json.loads((output / "metrics.json").read_text(encoding="utf-8"))
-    files = [("Report", "report.html"), ("Scene", "scene.ply"), *(("Mesh", name) for name in exports)]
-    poses = metrics.get("poses", {})
-    placed, moved = poses.get("placed"), len(poses.get("moved", ()))
-    return [
-        *([f"Poses found for {placed} of {poses['photographs']} photographs"] if placed else []),
-        *([f"Placed {moved} photograph{'s' if moved > 1 else ''} anew"] if moved else []),
-        *(["Adjusted the lens of each photograph"] if poses.get("lenses") else []),
-        mean_metrics(metrics),
-        *_training_views(metrics.get("training_views") or {}),
-        f"{metrics['gaussians']:,} Gaussians after {metrics['iterations']:,} iterations, "
-        f"trained in {duration(metrics['seconds'])}",
-        *(f"{label + ':':8}{output / name}" for label, name in files if (output / name).exists()),
-    ]
-
-
-def _training_views(known: dict[str, Any]) -> list[str]:
-    """How well the views that were trained on are shown, in a line."""
-    if known.get("psnr") is None:
-        return []
-    count, left = len(known["views"]), len(known["left_out"])
-    without = f", {left} left out" if left else ""
-    return [
-        f"Mean over {count} training views: PSNR {known['psnr']:.2f} dB, "
-        f"{known['worst_psnr']:.2f} dB the worst ({known['worst']}){without}"
-    ]

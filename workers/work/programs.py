@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from octasplat.engine.config import read_config
 from octasplat.engine.errors import Cancelled, CheckpointError, ConfigError, ExportFailed
-from octasplat.engine.evaluate.runs import evaluate as evaluate_run
 from octasplat.engine.events import (
     CheckpointWritten,
     Event,
@@ -35,7 +34,6 @@ from octasplat.workers.store.names import check_name
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
-    EvaluateOptions,
     ExportJobOptions,
     MaterialJobOptions,
     PictureOptions,
@@ -107,22 +105,6 @@ def _publish_run(task: Task) -> None:
         hidden = any(part.startswith(".") for part in name.parts)
         if path.is_file() and not hidden and name.parts[0] not in (CHECKPOINTS, CACHE):
             _publish(task, path, name.as_posix())
-
-
-def evaluate(task: Task) -> None:
-    """The held-out views of a finished reconstruction measured again, or all views of these photographs."""
-    all_views = EvaluateOptions.model_validate(task.options).all_views
-    metrics = evaluate_run(
-        task.run,
-        scene=None if all_views else task.scene,
-        on=task.scene if all_views else None,
-        threads=task.threads,
-        listener=stopping(task.listener, task.should_stop),
-    )
-    folder = metrics.parent
-    pictures = [path for part in ("renders", "layers") for path in sorted((folder / part).rglob("*.png"))]
-    for path in (metrics, folder / REPORT, *pictures):
-        _publish(task, path, path.relative_to(folder).as_posix())
 
 
 def export(task: Task) -> None:

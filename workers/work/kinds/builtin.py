@@ -4,7 +4,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from octasplat.engine.light.stage_file import named_files
+from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.crop import OPERATION as CROP
+from octasplat.engine.operations.evaluate import OPERATION as EVALUATE
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
@@ -20,7 +22,6 @@ from octasplat.workers.work.kinds.estimates import (
 )
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
-    EvaluateOptions,
     ExportJobOptions,
     MaterialJobOptions,
     ReconstructOptions,
@@ -97,16 +98,16 @@ class Reconstruct(JobKind[ReconstructOptions]):
         return estimate_reconstruction(options, sizes, cores)
 
 
-class Evaluate(JobKind[EvaluateOptions]):
+class Evaluate(OperationKind):
     """Views measured."""
 
     takes_other_photographs = True
 
-    def needs_photographs(self, options: EvaluateOptions) -> bool:
+    def needs_photographs(self, options: Options) -> bool:
         """Return True: views are compared with photographs."""
         return True
 
-    def on_other_photographs(self, options: EvaluateOptions) -> EvaluateOptions:
+    def on_other_photographs(self, options: Options) -> Options:
         """Return the options for photographs of which none was trained on."""
         return options.model_copy(update={"all_views": True})
 
@@ -194,13 +195,11 @@ def register_all() -> None:
     )
     register(
         Evaluate(
-            name="evaluate",
+            EVALUATE,
             title="Measure views of a reconstruction: those held out again, or other photographs",
-            needs="result",
-            options=EvaluateOptions,
-            program="octasplat.workers.work.programs:evaluate",
             stages=("evaluate",),
             source_files=(*_RUN_FILES, _LIGHT, _BACKGROUND, "edits.json"),
+            tells_stages=True,
         )
     )
     register(

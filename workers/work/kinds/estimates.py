@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, computed_field
 
+from octasplat.engine.durations import duration
 from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
-from octasplat.workers.telling.wording import duration
 from octasplat.workers.work.kinds.options import (
     PictureOptions,
     ReconstructOptions,

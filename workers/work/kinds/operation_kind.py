@@ -18,6 +18,7 @@ class OperationKind(JobKind[Any]):
 
     Args:
         operation: what it does.
+        title: one line for people; None takes that of the operation.
         stages: names of its stages.
         source_files: results of the source job that it reads.
         output: name of the file or folder, among the results, that the request calls its output.
@@ -29,6 +30,7 @@ class OperationKind(JobKind[Any]):
         self,
         operation: Operation[Any, Any],
         *,
+        title: str | None = None,
         stages: Sequence[str],
         source_files: Sequence[str] = (SCENE_FILE, "config.json"),
         output: str = SCENE_FILE,
@@ -38,7 +40,7 @@ class OperationKind(JobKind[Any]):
     ) -> None:
         super().__init__(
             name=operation.name,
-            title=operation.title.removesuffix("."),
+            title=title or operation.title.removesuffix("."),
             needs=needs,
             options=operation.options,
             program=program,

@@ -63,19 +63,6 @@ class ReconstructOptions(ReconstructionConfig):
         return ReconstructionConfig.model_validate(self.model_dump(mode="json"))
 
 
-class EvaluateOptions(BaseModel):
-    """Options of ``evaluate``: views of a finished reconstruction are measured.
-
-    Attributes:
-        all_views: all photographs, not only those that were held out; so it is with the photographs of
-            another dataset, in the same world, which the job names as 'dataset_id'.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    all_views: bool = False
-
-
 class ExportJobOptions(BaseModel):
     """Options of ``export``.
 

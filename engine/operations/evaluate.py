@@ -1,0 +1,211 @@
+"""``evaluate``: measure a finished run again, or on other photographs."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import DatasetFolder, Positional, Spelling
+from octasplat.engine.operations.base import Operation, Options, Request, Result, never
+
+_METRICS, _REPORT, _PICTURES = "metrics.json", "report.html", ("renders", "layers")
+
+
+def _read_scales(value: object) -> object:
+    """Return the numbers of a text such as ``2,4,8``, or of several, in order and each once."""
+    parts = value.split(",") if isinstance(value, str) else value
+    if not isinstance(parts, list | tuple | set):
+        return value
+    try:
+        numbers = sorted({int(part) for part in parts})
+    except (TypeError, ValueError):
+        numbers = [0]
+    if numbers and numbers[0] < 1:
+        raise ValueError("scales are whole numbers from 1 on, such as 2,4,8")
+    return tuple(numbers)
+
+
+class EvaluateOptions(Options):
+    """Which views of a finished reconstruction are measured, and how."""
+
+    all_views: bool = Field(
+        False,
+        description="Measure all photographs, not only those that were held out, into on/<name of their "
+        "folder>; so it is with photographs of another dataset, which a job names as 'dataset_id'.",
+    )
+    scales: Annotated[
+        tuple[int, ...],
+        Spelling(metavar="N,N..."),
+        BeforeValidator(_read_scales, json_schema_input_type=tuple[int, ...] | str),
+    ] = Field(
+        (),
+        max_length=20,
+        exclude_if=lambda scales: not scales,
+        description="Measure smaller sizes instead, such as 2,4,8: renders at 1/2, 1/4 and 1/8 of the size "
+        "against photographs made as small, with 1, 4 and 16 rays per pixel; into scales.json.",
+    )
+    background: Literal["black", "white"] | None = Field(
+        None,
+        exclude_if=lambda background: background is None,
+        description="Colour behind the scene and behind what masks leave out.  [default: the run's]",
+    )
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "EvaluateOptions":
+        if self.scales and self.all_views:
+            raise ValueError("scales are measured on the views that were held out; leave out all_views")
+        return self
+
+
+class EvaluateRequest(EvaluateOptions, Request):
+    """Measure the run in the folder OUT again: metrics.json, report.html and renders/ are written anew."""
+
+    source: Annotated[Path, Positional("OUT")] = Field(description="The folder of a finished run.")
+    dataset: DatasetFolder = Field(
+        None,
+        description="Where the run's photographs are now, if they were moved or the run was downloaded.",
+    )
+    on: Annotated[Path | None, Spelling(metavar="FOLDER")] = Field(
+        None,
+        description="Measure all photographs of another folder instead (images/ and sparse/0 in the same "
+        "world as the run's); the results go to OUT/on/<its name>.",
+    )
+
+    @model_validator(mode="after")
+    def _one_folder(self) -> "EvaluateRequest":
+        if self.on is not None and self.dataset is not None:
+            raise ValueError("choose one of dataset (the run's own photographs) and on (others)")
+        if self.on is not None and self.scales:
+            raise ValueError("scales are measured on the run's own photographs; leave out on")
+        return self
+
+
+class EvaluateResult(Result):
+    """Figures of merit of the measured views.
+
+    Attributes:
+        metrics: all figures by name, as ``metrics.json`` holds them; empty where ``scales`` were measured.
+        scales: mean PSNR in dB, by scale and by number of rays per pixel; empty where views were measured.
+        report: the page that shows them.
+        summary: sentences about them.
+    """
+
+    metrics: Mapping[str, Any] = {}
+    scales: Mapping[str, Mapping[str, float]] = {}
+    report: Path | None = None
+    summary: tuple[str, ...] = ()
+
+    @property
+    def psnr(self) -> float | None:
+        """Mean PSNR of the views in dB; None where there were none."""
+        return self._mean("psnr")
+
+    @property
+    def ssim(self) -> float | None:
+        """Mean structural similarity of the views."""
+        return self._mean("ssim")
+
+    @property
+    def ms_ssim(self) -> float | None:
+        """Mean structural similarity at several scales; None for images that are too small for it."""
+        return self._mean("ms_ssim")
+
+    @property
+    def flip(self) -> float | None:
+        """Mean perceived difference (FLIP); lower is better."""
+        return self._mean("flip")
+
+    @property
+    def views(self) -> Mapping[str, Mapping[str, float | None]]:
+        """The figures of each view, by the name of its photograph."""
+        found: Mapping[str, Mapping[str, float | None]] = self.metrics.get("views", {})
+        return found
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what was measured and where it is shown."""
+        return self.summary
+
+    def _mean(self, name: str) -> float | None:
+        value = self.metrics.get("mean", {}).get(name)
+        return None if value is None else float(value)
+
+
+def run(
+    request: EvaluateRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> EvaluateResult:
+    """Measure a finished run; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        ConfigError: the source is no run.
+        DatasetError: the photographs cannot be used.
+        OutputError: there is no scene yet, or other photographs of that name were measured before.
+    """
+    from octasplat.engine.evaluate import runs
+    from octasplat.engine.evaluate.summary import measured_summary, run_summary
+    from octasplat.engine.run_folder import photographs_folder
+    from octasplat.engine.stages import stopping
+
+    listener = stopping(progress, should_stop, "Stopped while evaluating.")
+    if request.scales:
+        return _measure_scales(request, listener, threads)
+    on, dataset = request.on, request.dataset
+    if request.all_views and on is None:
+        on, dataset = photographs_folder(request.source, dataset), None
+    metrics = runs.evaluate(
+        request.source,
+        scene=dataset,
+        on=on,
+        background=request.background,
+        threads=threads,
+        listener=listener,
+    )
+    folder = metrics.parent
+    summary = measured_summary(metrics) if on is not None else run_summary(folder, _exports(folder))
+    pictures = [path for name in _PICTURES for path in sorted((folder / name).rglob("*.png"))]
+    return EvaluateResult(
+        files=(metrics, folder / _REPORT, *pictures),
+        folder=folder,
+        metrics=json.loads(metrics.read_text(encoding="utf-8")),
+        report=folder / _REPORT,
+        summary=tuple(summary),
+    )
+
+
+def _measure_scales(request: EvaluateRequest, listener: Listener, threads: int) -> EvaluateResult:
+    from octasplat.engine.evaluate.runs import SCALES, evaluate_scales
+
+    found = evaluate_scales(
+        request.source,
+        request.scales,
+        scene=request.dataset,
+        background=request.background,
+        threads=threads,
+        listener=listener,
+    )
+    told = {
+        scale: ", ".join(f"{psnr:.2f} dB with {rays}" for rays, psnr in row.items())
+        for scale, row in found.items()
+    }
+    return EvaluateResult(
+        files=(request.source / SCALES,),
+        folder=request.source,
+        scales=found,
+        summary=tuple(f"{scale} of the size: {figures} ray(s) a pixel" for scale, figures in told.items()),
+    )
+
+
+def _exports(run: Path) -> tuple[str, ...]:
+    from octasplat.engine.config import read_config
+    from octasplat.engine.run_folder import CONFIG
+
+    return read_config(run / CONFIG).exports
+
+
+OPERATION = Operation("evaluate", "Measure a finished run again.", EvaluateRequest, EvaluateOptions, run)
