@@ -1,4 +1,4 @@
-"""The settings of a reconstruction, shared by the command line, ``config.json`` and later the API.
+"""The settings of a reconstruction, shared by the command line, ``config.json`` and the API.
 
 Imports neither torch nor numba.
 """
@@ -6,45 +6,68 @@ Imports neither torch nor numba.
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.fields import ADVANCED, BASIC, Unit
+from octasplat.engine.nearest_names import did_you_mean
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
 from octasplat.engine.train.preset_names import PresetName
 
 
 class ReconstructionConfig(BaseModel):
-    """Everything that decides what a reconstruction gives; the number of threads does not.
+    """Everything that decides what a reconstruction gives; the number of threads does not."""
 
-    Attributes:
-        preset: where the training defaults come from.
-        max_side: cap on the longer side of the photographs, px; None keeps their size.
-        test_every: every how-manieth view by name is held out; 0 holds out none.
-        held_out: names of the views to hold out instead.
-        poses: ``given`` takes the COLMAP model of the scene; ``auto`` finds the poses first, by COLMAP's
-            features, matching and mapping; ``missing`` does so only where the scene holds no model.
-        masks: ``ignore`` leaves masked pixels out of the loss, ``alpha`` takes the mask as the alpha.
-        evaluate_background: what lies behind renders and photographs with alpha when they are compared.
-        minutes: the training is to end within so many, which decides its iterations and Gaussians by the pace
-            of the machine that begins it; None leaves them to ``train``.
-        exports: files to write besides ``scene.ply``; their names say the format.
-        train: the training, fully resolved.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    preset: PresetName = "standard"
-    max_side: int | None = Field(None, ge=16)
-    test_every: int = Field(8, ge=0)
-    held_out: tuple[str, ...] | None = None
-    poses: Literal["given", "auto", "missing"] = "given"
-    masks: Literal["ignore", "alpha"] = "ignore"
-    evaluate_background: Literal["black", "white"] = "black"
-    minutes: float | None = Field(None, ge=0.1, le=100_000)
-    exports: tuple[str, ...] = ("mesh.ply", "mesh.obj", "mesh.glb")
-    train: TrainConfig = TrainConfig()
+    preset: Annotated[PresetName, BASIC] = Field(
+        "standard",
+        description="Where the settings of the training come from: fast is a first look, standard is "
+        "better, high is better yet and takes about three times as many iterations, paper has the published "
+        "settings.",
+    )
+    max_side: Annotated[int | None, Unit("px"), BASIC] = Field(
+        None,
+        ge=16,
+        description="Longest side to which photographs are shrunk; None keeps their size. Set it for a quick "
+        "try, or where memory is short.",
+    )
+    test_every: Annotated[int, Unit("views"), BASIC] = Field(
+        8,
+        ge=0,
+        description="Every how-manieth view by name is held out to be measured; 0 holds out none, so that "
+        "all are trained on.",
+    )
+    held_out: Annotated[tuple[str, ...] | None, ADVANCED] = Field(
+        None, description="Names of the views to hold out instead."
+    )
+    poses: Annotated[Literal["given", "auto", "missing"], BASIC] = Field(
+        "given",
+        description="Where the poses of the cameras come from: given takes the COLMAP model of the dataset; "
+        "auto finds the poses first, by COLMAP's features, matching and mapping; missing does so only where "
+        "the dataset holds no model.",
+    )
+    masks: Annotated[Literal["ignore", "alpha"], ADVANCED] = Field(
+        "ignore",
+        description="What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as "
+        "the alpha, for objects that are cut out.",
+    )
+    evaluate_background: Annotated[Literal["black", "white"], ADVANCED] = Field(
+        "black",
+        description="What lies behind renders and photographs with alpha when they are compared.",
+    )
+    minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
+        None,
+        ge=0.1,
+        le=100_000,
+        description="Time in which the training is to end, which decides its iterations and Gaussians by the "
+        "pace of the machine that begins it; None leaves them to the other settings.",
+    )
+    exports: Annotated[tuple[str, ...], BASIC] = Field(
+        ("mesh.ply", "mesh.obj", "mesh.glb"),
+        description="Files to write besides scene.ply; their names say the format.",
+    )
+    train: TrainConfig = Field(TrainConfig(), description="The settings of the training.")
 
 
 def resolve_config(
@@ -57,7 +80,7 @@ def resolve_config(
     """A configuration from a preset, top-level settings, and ``section.name=value`` assignments.
 
     Args:
-        preset_name: ``fast``, ``standard`` or ``paper``.
+        preset_name: one of :data:`octasplat.engine.train.preset_names.PRESETS`.
         materials: learn materials and the environment too, see
             :func:`octasplat.engine.train.config.with_materials`.
         settings: fields of :class:`ReconstructionConfig`; None values are left at their defaults.
@@ -119,14 +142,24 @@ def _assign(target: dict[str, Any], name: str, text: str) -> None:
     for key in path:
         section = section.get(key) if isinstance(section, dict) else None
     if not isinstance(section, dict) or (last not in section and last != "kind"):
+        known = [*_names(target, ""), *(set(ReconstructionConfig.model_fields) - {"preset", "train"})]
         raise ConfigError(
-            f"--set {name}: there is no such setting; see config.json of any run for all names."
+            f"--set {name}: there is no such setting.{did_you_mean(name.removeprefix('train.'), known)} "
+            "octasplat config list --all lists them."
         )
     value = _value(text)
     if path == ["densify"] and last == "kind" and section.get("kind") != value:
         # Another strategy has other settings: begin from its defaults.
         section.clear()
     section[last] = value
+
+
+def _names(values: Mapping[str, Any], prefix: str) -> list[str]:
+    """The names of all settings in nested values, with dots."""
+    names: list[str] = []
+    for name, value in values.items():
+        names += _names(value, f"{prefix}{name}.") if isinstance(value, Mapping) else [f"{prefix}{name}"]
+    return names
 
 
 def _value(text: str) -> Any:

@@ -28,6 +28,7 @@ _COMMANDS = {
     "reconstruct": ("reconstruct", "Photographs to a scene, its meshes, and measurements."),
     "evaluate": ("evaluate", "Measure a finished run again."),
     "info": ("info", "What is in a scene: counts, bounds, sizes, cost."),
+    "config": ("config", "The settings of a reconstruction: list, explain, compare."),
     "export": ("export", "Gaussians to meshes and other formats."),
     "import": ("import_", "Splats of any format to a scene of flat Gaussians."),
     "render": ("render", "New views of a scene as images or a video."),

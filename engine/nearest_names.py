@@ -1,0 +1,30 @@
+"""The known name that a mistyped one probably means."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name nearest to ``name``; None where none is near.
+
+    Names with dots are also found by their last part.
+
+    >>> nearest_name("window_ray", ["window_rays", "rates.quat"])
+    'window_rays'
+    >>> nearest_name("quats", ["window_rays", "rates.quat"])
+    'rates.quat'
+    """
+    names = list(known)
+    if whole := get_close_matches(name, names, n=1, cutoff=0.75):
+        return whole[0]
+    by_last_part: dict[str, str] = {}
+    for full in names:
+        by_last_part.setdefault(full.rpartition(".")[2], full)
+    last = get_close_matches(name.rpartition(".")[2], list(by_last_part), n=1, cutoff=0.75)
+    return by_last_part[last[0]] if last else None
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return " Did you mean NAME?" with the nearest known name; empty where none is near."""
+    nearest = nearest_name(name, known)
+    return f" Did you mean {nearest}?" if nearest else ""

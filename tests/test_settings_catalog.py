@@ -1,0 +1,144 @@
+"""The catalog of settings, its page and the command that lists and explains them."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from pydantic import BaseModel
+
+from octasplat.engine.config import ReconstructionConfig, resolve_config
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.fields import Group, Unit
+from octasplat.engine.nearest_names import nearest_name
+from octasplat.engine.poses import PosesConfig
+from octasplat.engine.settings_catalog import (
+    Difference,
+    defaults_of,
+    differences,
+    setting_named,
+    settings,
+)
+from octasplat.engine.settings_page import settings_page
+from octasplat.engine.shading.material_settings import MaterialSettings
+from octasplat.engine.trace.protocol import TraceSettings
+from octasplat.engine.train.config import LearningRates, LossWeights, McmcConfig, PaperConfig, TrainConfig
+from octasplat.workers.cli.main import cli
+
+MODELS = (
+    ReconstructionConfig,
+    TrainConfig,
+    LearningRates,
+    LossWeights,
+    McmcConfig,
+    PaperConfig,
+    TraceSettings,
+    MaterialSettings,
+    PosesConfig,
+)
+NO_QUANTITIES = ("seed",)
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def config_command(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["config", *arguments])
+
+
+def write_run(folder: Path, *assignments: str) -> Path:
+    config = resolve_config("fast", assignments=assignments)
+    folder.mkdir()
+    content = {"scene": "photographs", "reconstruction": config.model_dump(mode="json"), "versions": {}}
+    (folder / "config.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_setting_has_description_unit_and_group(model: type[BaseModel]) -> None:
+    for name, info in model.model_fields.items():
+        assert info.description and info.description.endswith("."), name
+        if isinstance(info.default, BaseModel):
+            continue
+        assert any(isinstance(mark, Group) for mark in info.metadata), name
+        numeric = any(kind in str(info.annotation) for kind in ("int", "float"))
+        if numeric and name not in NO_QUANTITIES:
+            assert any(isinstance(mark, Unit) for mark in info.metadata), name
+
+
+def test_units_and_groups_are_in_the_schema() -> None:
+    side = ReconstructionConfig.model_json_schema()["properties"]["max_side"]
+    assert side["unit"] == "px" and side["group"] == "basic"
+
+
+def test_catalog_entry_of_a_setting_with_a_known_answer() -> None:
+    entry = setting_named("train.trace.max_hits")
+    assert (entry.name, entry.type, entry.unit) == ("trace.max_hits", "whole number", "Gaussians per ray")
+    assert entry.range == "at least 1, at most 4096"
+    assert entry.default == 512 and not entry.exceptions
+
+
+def test_catalog_has_defaults_by_preset_and_with_materials() -> None:
+    exceptions = setting_named("rays").exceptions
+    assert setting_named("rays").default == 16_384
+    assert exceptions["paper"] == 8192 and exceptions["standard+materials"] == 8192
+    assert setting_named("densify.split_scale").defaults == {"paper": 0.005}
+
+
+def test_catalog_has_every_setting_once() -> None:
+    names = [entry.name for entry in settings()]
+    assert len(names) == len(set(names))
+    assert {"seed", "materials.learn", "densify.kind", "test_every"} <= set(names)
+    assert not any(name.startswith("train") for name in names)
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"), [("window_ray", "window_rays"), ("quats", "rates.quat"), ("rate.mean", "rates.mean")]
+)
+def test_unknown_setting_is_refused_and_the_nearest_one_offered(name: str, nearest: str) -> None:
+    with pytest.raises(ConfigError, match=f"Did you mean {nearest}"):
+        setting_named(name)
+    with pytest.raises(ConfigError, match=f"Did you mean {nearest}"):
+        resolve_config(assignments=[f"{name}=1"])
+    assert nearest_name("zzz", [entry.name for entry in settings()]) is None
+
+
+def test_differences_are_those_that_were_set() -> None:
+    changed = resolve_config("fast", assignments=["rates.quat=0.5", "test_every=4"])
+    assert differences(defaults_of(changed), changed) == (
+        Difference("test_every", 8, 4),
+        Difference("rates.quat", 0.015, 0.5),
+    )
+    assert differences(changed, changed) == ()
+
+
+def test_differences_name_settings_that_one_side_alone_has() -> None:
+    found = differences(resolve_config("standard"), resolve_config("paper"))
+    assert Difference("densify.split_scale", None, 0.005) in found
+    assert Difference("densify.growth", 0.2, None) in found
+
+
+def test_page_of_settings_is_up_to_date() -> None:
+    assert (ROOT / "docs" / "settings.md").read_text(encoding="utf-8") == settings_page()
+
+
+def test_config_list_shows_the_basic_settings_and_all_on_request() -> None:
+    basic = json.loads(config_command("list", "--json").stdout)
+    assert {entry["group"] for entry in basic} == {"basic"}
+    everything = json.loads(config_command("list", "--all", "--json").stdout)
+    assert len(everything) == len(settings()) > len(basic)
+    assert "error_power" in config_command("list", "--group", "experimental").stdout
+
+
+def test_config_explain_tells_what_is_known() -> None:
+    text = config_command("explain", "rates.decay").stdout
+    assert "Unit: share" in text and "Default: 0.3" in text and "With paper: 0.1" in text
+    refused = config_command("explain", "rates.decai")
+    assert refused.exit_code == 1 and "Did you mean rates.decay?" in refused.stderr
+
+
+def test_config_diff_tells_what_runs_had_changed(tmp_path: Path) -> None:
+    first = write_run(tmp_path / "first", "iterations=300")
+    second = write_run(tmp_path / "second", "iterations=300", "loss.l1=0.5")
+    assert config_command("diff", str(first)).stdout == "iterations: 2500 -> 300\n"
+    between = config_command("diff", str(first), str(second), "--json").stdout
+    assert json.loads(between) == [{"name": "loss.l1", "before": 0.8, "after": 0.5}]
+    assert "No setting differs" in config_command("diff", str(first), str(first)).stdout

@@ -1,0 +1,106 @@
+"""``octasplat config``: the settings of a reconstruction."""
+
+import json
+import textwrap
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from octasplat.engine.fields import Level
+
+_json_option = click.option("--json", "as_json", is_flag=True, help="Write JSON.")
+
+
+@click.group(short_help="The settings of a reconstruction: list, explain, compare.")
+def config() -> None:
+    """List and explain the settings of a reconstruction, and tell which ones a run had changed."""
+
+
+@config.command("list", short_help="List the settings.")
+@click.option("--all", "everything", is_flag=True, help="List all settings, not only the basic ones.")
+@click.option("--group", type=click.Choice(get_args(Level)), help="List the settings of this group.")
+@click.option("--markdown", is_flag=True, help="Write the page docs/settings.md.")
+@_json_option
+def list_settings(everything: bool, group: str | None, markdown: bool, as_json: bool) -> None:
+    """List the settings, those that most people need unless asked for others."""
+    from octasplat.engine.settings_catalog import settings, value_text
+    from octasplat.engine.settings_page import settings_page
+
+    if markdown:
+        click.echo(settings_page(), nl=False)
+        return
+    wanted = group or ("" if everything else "basic")
+    entries = [entry for entry in settings() if not wanted or entry.group == wanted]
+    if as_json:
+        _write_json([_entry(entry) for entry in entries])
+        return
+    width = max(len(entry.name) for entry in entries)
+    for entry in entries:
+        value = " ".join((value_text(entry.default), entry.unit)).strip()
+        click.echo(f"{entry.name:{width}}  {value:<24}  {_first_sentence(entry.description)}")
+    if len(entries) < len(settings()):
+        click.echo(f"{len(entries)} of {len(settings())} settings; --all lists the others, too.", err=True)
+
+
+@config.command(short_help="Explain a setting.")
+@click.argument("name", metavar="NAME")
+@_json_option
+def explain(name: str, as_json: bool) -> None:
+    """Explain the setting NAME, such as rates.mean: what it does, its unit, range and defaults."""
+    from octasplat.engine.settings_catalog import setting_named, value_text
+
+    entry = setting_named(name)
+    if as_json:
+        _write_json(_entry(entry))
+        return
+    click.echo(f"{entry.name} ({entry.group})")
+    for line in textwrap.wrap(entry.description, 92):
+        click.echo(f"  {line}")
+    facts = {
+        "Type": entry.type,
+        "Unit": entry.unit,
+        "Range": entry.range,
+        "Default": value_text(entry.default),
+        **{f"With {preset}": value_text(value) for preset, value in entry.exceptions.items()},
+    }
+    for label, text in facts.items():
+        if text:
+            click.echo(f"  {label}: {text}")
+
+
+@config.command(short_help="Tell which settings a run had changed.")
+@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.argument("other", metavar="[RUN2]", required=False, type=click.Path(path_type=Path))
+@_json_option
+def diff(run: Path, other: Path | None, as_json: bool) -> None:
+    """Tell in which settings RUN differs from the defaults of its preset, or RUN2 from RUN."""
+    from octasplat.engine.config import read_config
+    from octasplat.engine.run_folder import CONFIG
+    from octasplat.engine.settings_catalog import defaults_of, differences, value_text
+
+    first = read_config(run / CONFIG)
+    before, after = (defaults_of(first), first) if other is None else (first, read_config(other / CONFIG))
+    found = differences(before, after)
+    if as_json:
+        _write_json([asdict(difference) for difference in found])
+        return
+    for difference in found:
+        old, new = value_text(difference.before), value_text(difference.after)
+        click.echo(f"{difference.name}: {old} -> {new}")
+    if not found:
+        what = f"the defaults of {first.preset}" if other is None else str(run)
+        click.echo(f"No setting differs from {what}.")
+
+
+def _entry(entry: Any) -> dict[str, Any]:
+    return {**asdict(entry), "default": entry.default}
+
+
+def _first_sentence(text: str) -> str:
+    return text.split(". ")[0].split("; ")[0].rstrip(".")
+
+
+def _write_json(content: object) -> None:
+    click.echo(json.dumps(content, indent=2))
