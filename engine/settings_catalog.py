@@ -150,7 +150,7 @@ def _walk(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, FieldInfo]
 
 
 def _setting(name: str, info: FieldInfo, defaults: Mapping[str, object]) -> Setting:
-    group = next((mark.level for mark in info.metadata if isinstance(mark, Group)), "advanced")
+    group: Level = next((mark.level for mark in info.metadata if isinstance(mark, Group)), "advanced")
     unit = next((mark.symbol for mark in info.metadata if isinstance(mark, Unit)), "")
     kind = _type_text(info.annotation)
     if name == "densify.kind":
