@@ -1,6 +1,7 @@
 """What may be asked of an edit: which Gaussians are meant, and what becomes of their materials."""
 
 import re
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
@@ -10,9 +11,11 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
+    ValidationError,
     field_validator,
     model_validator,
 )
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.edit.where import MAX_LENGTH, check_where
@@ -82,8 +85,43 @@ _Colour = Annotated[
 ]
 
 
+def read_assignments(value: object) -> object:
+    """Return the values of texts such as ``roughness=0.3`` by name; anything else as it is.
+
+    Raises:
+        ValueError: a text is no assignment.
+    """
+    texts = [value] if isinstance(value, str) else value
+    if not isinstance(texts, list | tuple):
+        return value
+    found: dict[str, object] = {}
+    for text in texts:
+        name, equals, assigned = str(text).partition("=")
+        if not equals:
+            raise ValueError(f"write {str(text)!r} as NAME=VALUE, as in roughness=0.3")
+        found[name.strip()] = assigned.strip()
+    return found
+
+
 class _Given(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _names_materials(cls, value: object, handler: Callable[[object], Any]) -> Any:
+        try:
+            return handler(value)
+        except ValidationError as error:
+            unknown = [found for found in error.errors() if found["type"] == "extra_forbidden"]
+            if not unknown:
+                raise
+            told = PydanticCustomError(
+                "no_material",
+                "there is no such material; choose {names}",
+                {"names": ", ".join(MATERIAL_WIDTHS)},
+            )
+            lines = [InitErrorDetails(type=told, loc=found["loc"], input=value) for found in unknown]
+            raise ValidationError.from_exception_data(cls.__name__, lines) from None
 
     def given(self) -> dict[str, Any]:
         """What is not left as it is, by channel."""
@@ -91,45 +129,42 @@ class _Given(BaseModel):
 
 
 class MaterialValues(_Given):
-    """Values of a material.
+    """Values that materials get."""
 
-    Attributes:
-        albedo: base colour: r,g,b from 0 to 1, linear, or a text such as '#ff8000', display values.
-        metallic: 0 is matt or glazed, 1 is metal.
-        roughness: 0 is a mirror, 1 is as rough as can be.
-    """
-
-    albedo: _Colour | None = None
-    metallic: _Share | None = None
-    roughness: _Share | None = None
+    albedo: _Colour | None = Field(
+        None,
+        description="Base colour: r,g,b from 0 to 1, linear, or a text such as '#ff8000', display values.",
+    )
+    metallic: _Share | None = Field(None, description="0 is matt or glazed, 1 is metal.")
+    roughness: _Share | None = Field(None, description="0 is a mirror, 1 is as rough as can be.")
 
 
 class MaterialFactors(_Given):
-    """Factors of a material; what comes out is kept within 0 and 1.
+    """Factors that materials are multiplied by; what comes out is kept within 0 and 1."""
 
-    Attributes:
-        albedo: of the linear base colour.
-        metallic: from 0, below 1 less metallic.
-        roughness: from 0, below 1 smoother.
-    """
-
-    albedo: _Factor | None = None
-    metallic: _Factor | None = None
-    roughness: _Factor | None = None
+    albedo: _Factor | None = Field(None, description="Of the linear base colour.")
+    metallic: _Factor | None = Field(None, description="From 0, below 1 less metallic.")
+    roughness: _Factor | None = Field(None, description="From 0, below 1 smoother.")
 
 
 class MaterialChange(BaseModel):
-    """What becomes of materials.
-
-    Attributes:
-        set: values that they get.
-        scale: factors that they are multiplied by.
-    """
+    """What becomes of materials."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    set: MaterialValues = MaterialValues()
-    scale: MaterialFactors = MaterialFactors()
+    set: Annotated[
+        MaterialValues, BeforeValidator(read_assignments), Spelling(metavar="NAME=VALUE", repeated=True)
+    ] = Field(
+        MaterialValues(),
+        description="Values to set: albedo=R,G,B (linear, 0 to 1), albedo=#rrggbb (display), "
+        "metallic=0..1 or roughness=0..1.",
+    )
+    scale: Annotated[
+        MaterialFactors, BeforeValidator(read_assignments), Spelling(metavar="NAME=FACTOR", repeated=True)
+    ] = Field(
+        MaterialFactors(),
+        description="Factors to multiply albedo, metallic or roughness by; the result is at most 1.",
+    )
 
     @model_validator(mode="after")
     def _says_something_once(self) -> "MaterialChange":
@@ -137,5 +172,7 @@ class MaterialChange(BaseModel):
         if both:
             raise ValueError(f"{sorted(both)[0]} is set and scaled; choose one")
         if not self.set.given() and not self.scale.given():
-            raise ValueError("nothing is changed; set or scale albedo, metallic or roughness")
+            raise ValueError(
+                "Say what to change: nothing is changed unless albedo, metallic or roughness is set or scaled"
+            )
         return self

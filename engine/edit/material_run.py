@@ -79,10 +79,11 @@ def follows(source: Path) -> bool:
 def edit_note(
     change: MaterialChange, selection: Selection, chosen: Bool[np.ndarray, " n"]
 ) -> dict[str, object]:
-    """A change in a few words of JSON, for ``edits.json``."""
+    """Return a change in a few words of JSON, for ``edits.json``."""
+    asked, where = set(MaterialChange.model_fields), set(Selection.model_fields)
     return {
-        **change.model_dump(mode="json", exclude_defaults=True),
-        **selection.model_dump(mode="json", exclude_defaults=True),
+        **change.model_dump(mode="json", exclude_defaults=True, include=asked),
+        **selection.model_dump(mode="json", exclude_defaults=True, include=where),
         "gaussians": int(chosen.sum()),
     }
 

@@ -9,6 +9,7 @@ from octasplat.engine.operations.base import Operation
 
 _MODULES = {
     "evaluate": "evaluate",
+    "material": "material",
     "crop": "crop",
 }
 """Module of each verb, in the order in which users meet them."""

@@ -203,7 +203,7 @@ def _walk(
     for name, raw in schema["properties"].items():
         given = _resolved(root, raw)
         path = f"{prefix}{name}"
-        if path in _FORMS_OF_THEIR_OWN:
+        if path in _FORMS_OF_THEIR_OWN or _is_file(given):
             continue
         if "oneOf" in given:  # one of several sections, told apart by their kind
             yield from _variants(root, given, path, presets)
@@ -212,6 +212,11 @@ def _walk(
         elif "const" not in given:
             text = given.get("description") or helps.get(name, "")
             yield _field(path, given, raw.get("default"), text, presets, name in required)
+
+
+def _is_file(schema: Mapping[str, Any]) -> bool:
+    """Return whether a field names files that are sent along, which no form here asks for."""
+    return schema.get("items", schema).get("format") == "octasplat-file"
 
 
 def _variants(

@@ -15,7 +15,7 @@ from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussia
 from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.render.images import read_image
 from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import material
+from octasplat.workers.work.programs import run_operation
 from octasplat.workers.work.task import Task
 
 VIEW = "view_000"
@@ -82,7 +82,8 @@ def test_a_job_gives_the_bytes_of_the_command(shiny_run, changed, tmp_path):
         "where": "x > 0 and roughness < 0.6",
     }  # fmt: skip
     options = kind_named("material").resolve(asked)
-    material(Task(tmp_path / "attempt", options.model_dump(mode="json"), title="a thing", threads=1))
+    dumped = options.model_dump(mode="json")
+    run_operation(Task(tmp_path / "attempt", dumped, title="a thing", threads=1, kind="material"))
     results = tmp_path / "attempt" / "results"
     assert (results / "scene.ply").read_bytes() == (changed / "scene.ply").read_bytes()
     assert (results / "edits.json").read_bytes() == (changed / "edits.json").read_bytes()

@@ -33,32 +33,6 @@ def quiet_option(command: F) -> F:
     return click.option("--quiet", "-q", is_flag=True, help="Show warnings and errors only.")(command)
 
 
-def selection_options(command: F) -> F:
-    """The fields of :class:`octasplat.engine.edit.selection.Selection`."""
-    for option in reversed(_SELECTION):
-        command = option(command)
-    return command
-
-
-_SELECTION = (
-    click.option(
-        "--where",
-        metavar="EXPRESSION",
-        help="What comparisons joined by and, or, not hold for, of x, y, z, opacity and channels such as "
-        "metallic, roughness and albedo.r: 'metallic > 0.5 and z < 0'.",
-    ),
-    click.option(
-        "--box",
-        nargs=6,
-        type=float,
-        metavar="X0 Y0 Z0 X1 Y1 Z1",
-        help="What lies between two corners, smallest coordinates first.",
-    ),
-    click.option("--sphere", nargs=4, type=float, metavar="X Y Z R", help="What lies in a sphere."),
-    click.option("--inverse", is_flag=True, help="The rest instead."),
-)
-
-
 def scenes_output_option(command: F) -> F:
     """``--output`` of what writes one scene, or a sequence of them."""
     return click.option(

@@ -35,7 +35,6 @@ from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
     ExportJobOptions,
-    MaterialJobOptions,
     PictureOptions,
     ReconstructOptions,
     RelightJobOptions,
@@ -181,23 +180,6 @@ def relight(task: Task) -> None:
         return relight_files(options.mode, arguments, tell, say, keeping)
 
     _make_pictures(task, options, work)
-
-
-def material(task: Task) -> None:
-    """The scene of a reconstruction with other materials: results like those of a run."""
-    from octasplat.engine.edit.material_run import change_materials, edit_note, write_changed_run
-    from octasplat.engine.edit.selection import chosen_by
-
-    options = MaterialJobOptions.model_validate(task.options)
-    tell = stopping(task.listener, task.should_stop)
-    with counted_stage("edit", tell, 0):
-        gaussians, _ = read_gaussian_ply(task.run / SCENE)
-        chosen = chosen_by(gaussians, options)
-        changed = change_materials(task.run, gaussians, chosen, options)
-        folder = task.folder / "changed"
-        write_changed_run(task.run, changed, folder, edit_note(options, options, chosen))
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        _publish(task, path, path.relative_to(folder).as_posix())
 
 
 def run_operation(task: Task) -> None:

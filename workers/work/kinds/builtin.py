@@ -1,12 +1,14 @@
 """The kinds that octasplat brings."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from octasplat.engine.light.stage_file import named_files
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.crop import OPERATION as CROP
 from octasplat.engine.operations.evaluate import OPERATION as EVALUATE
+from octasplat.engine.operations.material import OPERATION as MATERIAL
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
@@ -23,7 +25,6 @@ from octasplat.workers.work.kinds.estimates import (
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
     ExportJobOptions,
-    MaterialJobOptions,
     ReconstructOptions,
     RelightJobOptions,
     RenderJobOptions,
@@ -31,6 +32,7 @@ from octasplat.workers.work.kinds.options import (
     revise_reconstruction,
 )
 from octasplat.workers.work.kinds.table import JobKind, register
+from octasplat.workers.work.task import Task
 
 _RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl")
 _LIGHT = "environment.hdr"
@@ -178,8 +180,12 @@ class Relight(JobKind[RelightJobOptions]):
         return estimate_relight(options, sizes, cores)
 
 
-class Material(JobKind[MaterialJobOptions]):
+class Material(OperationKind):
     """Other materials."""
+
+    def places(self, task: Task, options: Options) -> dict[str, Path]:
+        """Return the run, and the folder of the run that comes of it, which is published file by file."""
+        return {"source": task.run, "output": task.folder / "changed"}
 
 
 def register_all() -> None:
@@ -237,11 +243,8 @@ def register_all() -> None:
     )
     register(
         Material(
-            name="material",
+            MATERIAL,
             title="The scene of a reconstruction with other materials",
-            needs="result",
-            options=MaterialJobOptions,
-            program="octasplat.workers.work.programs:material",
             stages=("edit",),
             source_files=(_LIGHT, *_RUN_FILES, "edits.json"),
         )

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from octasplat.engine.config import ReconstructionConfig
-from octasplat.engine.edit.choices import MaterialChange, Selection
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import exporter_for
 from octasplat.engine.light.stage import Stage
@@ -170,10 +169,6 @@ class RelightJobOptions(PictureOptions):
     def rays(self) -> int:
         """Rays or paths a pixel, under all environments together."""
         return len(self.environments) * (self.samples or (64 if self.by == "path" else 4))
-
-
-class MaterialJobOptions(Selection, MaterialChange):
-    """Options of ``material``: what becomes of the materials of which Gaussians."""
 
 
 def _learns_materials(train: object) -> bool:

@@ -1,0 +1,121 @@
+"""``material``: other materials for chosen Gaussians."""
+
+from collections.abc import Callable
+from typing import Annotated
+
+from pydantic import Field
+
+from octasplat.engine.edit.choices import MaterialChange, Selection
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import InputFile, Output, Spelling
+from octasplat.engine.operations.base import Operation, Options, SceneRequest, ScenesWritten, never
+
+
+class MaterialOptions(Selection, MaterialChange, Options):
+    """What becomes of the materials of which Gaussians: those for which all that is given holds."""
+
+    mesh: Annotated[InputFile | None, Spelling(metavar="MESH")] = Field(
+        None,
+        exclude_if=lambda mesh: mesh is None,
+        description="Those whose octagons are in this mesh: IN's mesh.ply after the rest was deleted in an "
+        "editor.",
+    )
+    masks: Annotated[tuple[InputFile, ...], Spelling(("--mask",), metavar="IMAGE")] = Field(
+        (),
+        max_length=1000,
+        exclude_if=lambda masks: not masks,
+        description="Those that show where this image is white; it has the name of one of the run's "
+        "photographs. Several say together what is meant.",
+    )
+
+
+class MaterialRequest(MaterialOptions, SceneRequest):
+    """Change the materials of IN, the folder of a run with materials or a file of Gaussians that has them.
+
+    Without a choice all Gaussians are changed; of several choices all must hold. For example:
+    octasplat material OUT --set roughness=0.3 --where "metallic > 0.5" -o OUT2
+    """
+
+    output: Output = Field(
+        description="A folder for all of the run with its new scene, or a file for the scene alone."
+    )
+
+
+class MaterialResult(ScenesWritten):
+    """The scene with other materials.
+
+    Attributes:
+        changed: number of Gaussians that were changed.
+        count: number of all Gaussians.
+    """
+
+    changed: int
+    count: int
+
+
+def run(
+    request: MaterialRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> MaterialResult:
+    """Change the materials of a scene; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        ConfigError: the scene has no materials, or nothing is chosen.
+        OutputError: the folder is taken or cannot be written.
+        SceneFileError: the scene or the mesh cannot be read, or the scene not be written.
+    """
+    from octasplat.engine.edit.masked import under_masks
+    from octasplat.engine.edit.material_run import (
+        change_materials,
+        check_new_run,
+        edit_note,
+        follows,
+        write_changed_run,
+    )
+    from octasplat.engine.edit.selection import chosen_by, in_mesh
+    from octasplat.engine.files import read_facts, read_mesh
+    from octasplat.engine.gaussians.materials import require_materials
+    from octasplat.engine.operations.scenes import check_target, open_scene, write_scene
+    from octasplat.engine.run_folder import SCENE, is_run
+
+    source, output = request.source, request.output
+    is_folder = is_run(source) and not output.suffix
+    if is_folder:
+        check_new_run(output)
+    else:
+        check_target(output, [source])
+    gaussians = open_scene(source, progress)
+    require_materials(gaussians, source / SCENE if is_run(source) else source)
+    chosen = chosen_by(gaussians, request.model_copy(update={"inverse": False}))
+    if request.mesh is not None:
+        chosen &= in_mesh(gaussians, read_mesh(request.mesh), request.mesh)
+    if request.masks:
+        chosen &= under_masks(source, gaussians, request.masks)
+    if request.inverse:
+        chosen = ~chosen
+    changed = change_materials(source, gaussians, chosen, request)
+    count = int(chosen.sum())
+    notes = [f"{source}: {count:,} of {len(chosen):,} Gaussians changed."]
+    if not follows(source):
+        notes.append(
+            "Viewers and octasplat render show their harmonics, which are as before; relight shows it."
+        )
+    if not is_folder:
+        notes.append(write_scene(changed, read_facts(source), output, progress))
+        return MaterialResult(files=(output,), notes=tuple(notes), changed=count, count=len(chosen))
+    mesh = {"mesh": request.mesh.name} if request.mesh is not None else {}
+    masks = {"masks": [path.name for path in request.masks]} if request.masks else {}
+    write_changed_run(source, changed, output, edit_note(request, request, chosen) | mesh | masks)
+    return MaterialResult(
+        files=tuple(sorted(path for path in output.rglob("*") if path.is_file())),
+        folder=output,
+        notes=(*notes, f"Wrote {output}."),
+        changed=count,
+        count=len(chosen),
+    )
+
+
+OPERATION = Operation("material", "Change the materials of a scene.", MaterialRequest, MaterialOptions, run)
