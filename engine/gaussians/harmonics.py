@@ -48,6 +48,29 @@ def sh_basis(directions: Float[np.ndarray, "*n 3"], degree: int) -> Float[np.nda
     return np.stack(functions[: (degree + 1) ** 2], axis=-1)
 
 
+def sh_basis_slopes(directions: Float[np.ndarray, "*n 3"], degree: int) -> Float[np.ndarray, "*n k 3"]:
+    """Derivatives of the polynomials of :func:`sh_basis` by x, y and z, at unit directions.
+
+    They are those of a function in space: on the sphere, only what is tangential to it counts.
+    """
+    x, y, z = np.moveaxis(directions, -1, 0)
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    none, one = np.zeros_like(x), np.ones_like(x)
+    rows = [
+        (SH_C0, (none, none, none)),
+        (-SH_C1, (none, one, none)), (SH_C1, (none, none, one)), (-SH_C1, (one, none, none)),
+        (SH_C2[0], (y, x, none)), (SH_C2[1], (none, z, y)), (SH_C2[2], (-2 * x, -2 * y, 4 * z)),
+        (SH_C2[3], (z, none, x)), (SH_C2[4], (2 * x, -2 * y, none)),
+        (SH_C3[0], (6 * xy, 3 * (xx - yy), none)), (SH_C3[1], (yz, xz, xy)),
+        (SH_C3[2], (-2 * xy, 4 * zz - xx - 3 * yy, 8 * yz)),
+        (SH_C3[3], (-6 * xz, -6 * yz, 6 * zz - 3 * (xx + yy))),
+        (SH_C3[4], (4 * zz - 3 * xx - yy, -2 * xy, 8 * xz)), (SH_C3[5], (2 * xz, -2 * yz, xx - yy)),
+        (SH_C3[6], (3 * (xx - yy), -6 * xy, none)),
+    ]  # fmt: skip
+    slopes = [factor * np.stack(parts, axis=-1) for factor, parts in rows[: (degree + 1) ** 2]]
+    return np.stack(slopes, axis=-2)
+
+
 def rotate_sh(
     sh: Float32[np.ndarray, "n k 3"], turns: Float[np.ndarray, "n 3 3"]
 ) -> Float32[np.ndarray, "n k 3"]:

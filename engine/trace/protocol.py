@@ -124,6 +124,10 @@ class Recording(Protocol):
         """Ids of the Gaussians of one ray, front to back."""
         ...
 
+    def by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
+        """Hits of each ray, and the ids of all hits, ray by ray and front to back."""
+        ...
+
 
 @dataclass
 class TraceGradients:

@@ -37,6 +37,11 @@ class ReferenceRecording:
         """Ids of the Gaussians of one ray, front to back."""
         return self.ids[ray].astype(np.int32)
 
+    def by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
+        """Hits of each ray, and the ids of all hits, ray by ray and front to back."""
+        counts = np.array([len(ids) for ids in self.ids], np.int32)
+        return counts, np.concatenate([np.empty(0, np.int32), *self.ids]).astype(np.int32)
+
 
 class ReferenceTracer:
     """The reference implementation behind the tracer protocol.

@@ -50,3 +50,21 @@ class CpuRecording:
             return self.kept.ids[place][(self.kept.bits[place] >> bit & np.uint64(1)).astype(bool)]
         first = first_place.py_func(int(self.packets[packet, 0]), self.limits)
         return self.kept.slot_ids[first + self.kept.slots[self.place(ray)]]
+
+    def by_ray(self) -> tuple[Int32[np.ndarray, " r"], Int32[np.ndarray, " h"]]:
+        """Hits of each ray, and the ids of all hits, ray by ray and front to back."""
+        if isinstance(self.kept, OneOrderHits):
+            rows = [self.of_ray(ray) for ray in range(len(self.counts))]
+            return self.counts, np.concatenate([np.empty(0, np.int32), *rows])
+        firsts = np.cumsum(self.counts, dtype=np.int64) - self.counts
+        places = np.arange(int(self.counts.sum())) + np.repeat(self.hits.starts - firsts, self.counts)
+        leads = np.full(len(self.counts), -1, np.int64)  # first ray of each ray's packet
+        for first, last in self.packets.tolist():
+            leads[first:last] = first
+        lead = np.repeat(leads, self.counts)
+        ids = np.empty(len(places), np.int32)
+        alone = lead < 0
+        ids[alone] = self.hits.ids[places[alone]]
+        slots = first_place.py_func(lead[~alone], self.limits) + self.kept.slots[places[~alone]]
+        ids[~alone] = self.kept.slot_ids[slots]
+        return self.counts, ids

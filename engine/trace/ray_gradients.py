@@ -1,0 +1,138 @@
+"""Gradients of what rays see by their origins and directions, in closed form from the recorded hits.
+
+A ray o + t d meets the plane of a Gaussian with mean m and normal r1 at t = <m - o, r1> / <d, r1>. The hit
+p = o + t d moves with o and d directly and through t, with dt/do = -r1 / <d, r1> and dt/dd = t dt/do. So the
+gradient by d is t times that by o, but for the direction in which the Gaussian's colour is seen.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from octasplat.engine.gaussians.harmonics import sh_basis, sh_basis_slopes
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.trace.protocol import Recording, TraceGradients, TraceSettings
+from octasplat.engine.trace.ray_hits import RayHits, hits_by_pieces
+
+
+@dataclass(frozen=True)
+class RayGradients:
+    """Gradients of a loss by rays, a row each, also where one origin stands for all rays."""
+
+    origins_world: Float32[np.ndarray, "r 3"]
+    directions_world: Float32[np.ndarray, "r 3"]
+
+
+def ray_gradients(
+    gaussians: FlatGaussians,
+    rays: RayBatch,
+    recording: Recording,
+    gradients: TraceGradients,
+    settings: TraceSettings,
+    features: Float32[np.ndarray, "n f"] | None = None,
+) -> RayGradients:
+    """Return the gradients of a loss by the origins and directions of recorded rays.
+
+    As for the parameters, there is none through the edges of octagons, visibility, or the limits of rays.
+
+    Args:
+        gaussians: with the parameters that the recording was made with.
+        rays: those of the recording.
+        recording: which Gaussians each ray met.
+        gradients: of the loss by the outputs of the trace.
+        settings: of its tracer.
+        features: those that the tracer was built with.
+    """
+    origins, directions = np.zeros((len(rays), 3), np.float32), np.zeros((len(rays), 3), np.float32)
+    for part, hits in hits_by_pieces(gaussians, rays, recording, settings):
+        given = _Given.of(gradients, part)
+        by_origin, by_direction = _of_hits(gaussians, rays[part], hits, given, settings, features)
+        for axis in range(3):
+            origins[part, axis] = hits.sums(by_origin[:, axis])
+            directions[part, axis] = hits.sums(by_direction[:, axis])
+    return RayGradients(origins, directions)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """Gradients by the outputs of some rays, zero where nothing was given."""
+
+    rgb: Float64[np.ndarray, "r 3"]
+    transmittance: Float64[np.ndarray, " r"]
+    depth_sum: Float64[np.ndarray, " r"]
+    depth_median: Float64[np.ndarray, " r"]
+    normal: Float64[np.ndarray, "r 3"]
+    features: Float64[np.ndarray, "r f"] | None
+
+    @classmethod
+    def of(cls, gradients: TraceGradients, part: slice) -> "_Given":
+        rgb = gradients.rgb_srgb[part].astype(np.float64)
+
+        def scalar(values: np.ndarray | None) -> Float64[np.ndarray, " r"]:
+            return np.zeros(len(rgb)) if values is None else values[part].astype(np.float64)
+
+        normal, features = gradients.normal_world, gradients.features
+        return cls(
+            rgb,
+            scalar(gradients.transmittance),
+            scalar(gradients.depth_sum),
+            scalar(gradients.depth_median),
+            np.zeros_like(rgb) if normal is None else normal[part].astype(np.float64),
+            None if features is None else features[part].astype(np.float64),
+        )
+
+
+def _of_hits(
+    gaussians: FlatGaussians,
+    rays: RayBatch,
+    hits: RayHits,
+    given: _Given,
+    settings: TraceSettings,
+    features: Float32[np.ndarray, "n f"] | None,
+) -> tuple[Float64[np.ndarray, "h 3"], Float64[np.ndarray, "h 3"]]:
+    """Gradients by the origin and direction of each hit's ray, of this hit alone."""
+    ray, ids = hits.ray, hits.ids
+    directions = rays.directions_world.astype(np.float64)[ray]
+    normals, weight = hits.frames[:, :, 0], hits.weight
+
+    # --- colour, and the direction in which it is seen ---
+    viewers = np.broadcast_to(rays.t_viewer, len(rays)).astype(np.float64)[ray]
+    is_near = np.isfinite(viewers)
+    to_viewer = np.where(is_near, viewers, 0.0)[:, None]
+    view = np.where(is_near[:, None], hits.to_mean - to_viewer * directions, directions)
+    length = np.linalg.norm(view, axis=1, keepdims=True)
+    view /= length
+    sh = gaussians.sh[ids].astype(np.float64)
+    colour = 0.5 + np.einsum("hk,hkc->hc", sh_basis(view, gaussians.sh_degree), sh)
+    by_colour = np.where(colour > 0, weight[:, None] * given.rgb[ray], 0.0)
+    slopes = np.einsum("hki,hkc,hc->hi", sh_basis_slopes(view, gaussians.sh_degree), sh, by_colour)
+    by_view = (slopes - (slopes * view).sum(axis=1, keepdims=True) * view) / length
+
+    # --- what a hit brings for each unit of its weight ---
+    cosine_to_mean = np.einsum("hi,hi->h", hits.to_mean, normals) / np.linalg.norm(hits.to_mean, axis=1)
+    facing = np.where(cosine_to_mean > settings.turned_beyond, -1.0, 1.0)
+    value = np.einsum("hc,hc->h", np.maximum(colour, 0), given.rgb[ray])
+    value += hits.t * given.depth_sum[ray]
+    value += facing * np.einsum("hi,hi->h", normals, given.normal[ray])
+    if features is not None and given.features is not None:
+        value += np.einsum("hf,hf->h", features[ids].astype(np.float64), given.features[ray])
+
+    # --- alpha: what it adds here, less what it hides behind ---
+    shares = weight * value
+    behind = hits.sums(shares)[ray] - hits.before(shares) - shares
+    left = np.exp(hits.sums(np.log1p(-hits.alpha)))[ray]
+    by_alpha = hits.through * value - (behind + left * given.transmittance[ray]) / (1 - hits.alpha)
+    by_uv = np.where(hits.clamped, 0.0, -by_alpha * hits.alpha)[:, None] * hits.uv
+
+    # --- the hit in its plane, and its distance ---
+    by_hit = np.einsum("hik,hk->hi", hits.frames[:, :, 1:], by_uv / hits.scales)
+    is_median = (hits.through > 0.5) & (hits.through * (1 - hits.alpha) <= 0.5)
+    by_t = weight * given.depth_sum[ray] + np.where(is_median, given.depth_median[ray], 0.0)
+    by_t += np.einsum("hi,hi->h", by_hit, directions)
+    by_position = by_hit - (by_t / hits.cosine)[:, None] * normals
+    by_origin = by_position - np.where(is_near[:, None], by_view, 0.0)
+    by_direction = hits.t[:, None] * by_position
+    by_direction += np.where(is_near[:, None], -to_viewer * by_view, by_view)
+    return by_origin, by_direction
