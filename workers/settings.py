@@ -1,34 +1,20 @@
 """Settings of everything that talks to the database, from the environment; the service adds its own."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, TypeVar
 from urllib.parse import urlsplit
 
-import platformdirs
 from pydantic import AliasChoices, Field, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from octasplat.engine.errors import ConfigError
+from octasplat.workers.data_folder import default_data_folder
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 
 PREFIX = "OCTASPLAT_"
-ADDRESS_FILE = "serve.json"
-"""In the data folder while ``octasplat serve`` runs: where the service is."""
-TOKEN_FILE = "token"  # noqa: S105 - a name
-"""In the data folder: the token that ``octasplat serve`` made for itself, readable by its user only."""
-
-
 S = TypeVar("S", bound="WorkerSettings")
-
-
-def default_data_folder() -> Path:
-    """Where one machine keeps everything; root's home is shut to the database's user, so root has another."""
-    if os.geteuid() == 0:
-        return Path("/var/lib/octasplat")
-    return platformdirs.user_data_path("octasplat")
 
 
 @dataclass(frozen=True)

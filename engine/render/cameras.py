@@ -1,6 +1,7 @@
 """Pinhole cameras for new views, and the rays through their pixels."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,33 @@ class RenderCamera:
             rotation_cam_from_world=np.ascontiguousarray(rotation),
             translation_cam_from_world=-rotation @ world_from_cam[:3, 3],
         )
+
+    @classmethod
+    def looking_at(
+        cls,
+        position_world: Sequence[float],
+        target_world: Sequence[float],
+        width_px: int = 640,
+        height_px: int = 480,
+        *,
+        fov_y_degrees: float = 50.0,
+        up_world: Sequence[float] = (0.0, -1.0, 0.0),
+    ) -> "RenderCamera":
+        """Return a camera that looks at a point and holds ``up_world`` upright in its image.
+
+        Raises:
+            ConfigError: it stands in its target, or looks along the up direction.
+
+        >>> RenderCamera.looking_at((0, 0, -4), (0, 0, 0), 96, 64).centre_world
+        array([ 0.,  0., -4.])
+        """
+        from octasplat.engine.render.paths import look_at
+
+        position, target, up = (
+            np.array(vector, np.float64) for vector in (position_world, target_world, up_world)
+        )
+        focal_px = focal_from_fov(fov_y_degrees, height_px)
+        return cls.from_pose(look_at(position, target, up), width_px, height_px, fy_px=focal_px)
 
     @property
     def centre_world(self) -> Float64[np.ndarray, "3"]:

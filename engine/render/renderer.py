@@ -4,16 +4,20 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int32, Int64
 
+from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.hashing import unit_numbers
 from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import ShadingModel, Sight
 from octasplat.engine.trace.facing import faced
 from octasplat.engine.trace.protocol import Tracer
+from octasplat.engine.trace.ray_hits import heaviest_gaussians
 
 RAYS_AT_ONCE = 1 << 18
+RECORDED_AT_ONCE = 1 << 15
+"""Rays at once where their hits are kept: each has room for all that it could meet."""
 FRONT = 0.005
 """What lies farther behind the median depth than this share of it is another surface."""
 STEPS = np.array([0.7548776662466927, 0.5698402909980532])
@@ -135,10 +139,29 @@ def front_normals(
     return out
 
 
-def _bands(image: ImageRays) -> Iterator[tuple[slice, Int64[np.ndarray, " r"], RayBatch]]:
+def heaviest_by_pixel(tracer: Tracer, gaussians: FlatGaussians, image: ImageRays) -> Int32[np.ndarray, "h w"]:
+    """Return the number of the Gaussian that weighs most on the ray of each pixel, -1 where it met none.
+
+    Args:
+        tracer: built around ``gaussians``.
+        gaussians: the scene.
+        image: the rays, with unit directions.
+    """
+    out = np.empty((image.height_px, image.width_px), np.int32)
+    for band, order, rays in _bands(image, RECORDED_AT_ONCE):
+        seen = tracer.trace(rays, record=True)
+        assert seen.hits is not None
+        found = heaviest_gaussians(gaussians, rays, seen.hits, tracer.settings)
+        out[band].reshape(-1)[order] = found
+    return out
+
+
+def _bands(
+    image: ImageRays, rays_at_once: int = RAYS_AT_ONCE
+) -> Iterator[tuple[slice, Int64[np.ndarray, " r"], RayBatch]]:
     """The rows of an image a band at a time, the numbers of the band's pixels in tiles, and their rays."""
     height, width = image.height_px, image.width_px
-    rows = max(1, RAYS_AT_ONCE // (width * TILE)) * TILE
+    rows = max(1, rays_at_once // (width * TILE)) * TILE
     for top in range(0, height, rows):
         count = min(rows, height - top)
         order = tile_order(count, width)

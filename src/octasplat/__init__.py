@@ -1,5 +1,83 @@
-"""Photographs to scenes of flat Gaussians, by ray tracing on an ordinary CPU."""
+"""Photographs to scenes of flat Gaussians, by ray tracing on an ordinary CPU.
+
+>>> import octasplat as osp
+>>> scene = osp.load("scene.ply")
+>>> scene
+Scene(1,200 Gaussians, harmonics of degree 1)
+>>> image = osp.render(scene, scene.camera(width=96, height=64))
+>>> image.rgb.shape
+(64, 96, 3)
+
+What is named here is loaded when it is first used, so that the import is quick: neither torch nor numba, nor
+anything of the service, comes with it. Nothing is printed; progress and warnings go to the logger
+``octasplat``, and in a notebook to its output.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from octasplat.engine import __version__
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from octasplat.client import Client, Job
+    from octasplat.engine.errors import Cancelled, ConfigError, OctasplatError
+    from octasplat.engine.render.cameras import RenderCamera as Camera
+    from octasplat.engine.trace.protocol import TraceSettings
+    from octasplat.images import Image, render
+    from octasplat.scenes import Scene, load, save
+    from octasplat.tracing import GaussianTensors, Rays, TracedRays, trace
+
+_SOURCES = {
+    "Camera": ("engine.render.cameras", "RenderCamera"),
+    "Cancelled": ("engine.errors", "Cancelled"),
+    "Client": ("client", "Client"),
+    "ConfigError": ("engine.errors", "ConfigError"),
+    "GaussianTensors": ("tracing", "GaussianTensors"),
+    "Image": ("images", "Image"),
+    "Job": ("client", "Job"),
+    "OctasplatError": ("engine.errors", "OctasplatError"),
+    "Rays": ("tracing", "Rays"),
+    "Scene": ("scenes", "Scene"),
+    "TraceSettings": ("engine.trace.protocol", "TraceSettings"),
+    "TracedRays": ("tracing", "TracedRays"),
+    "load": ("scenes", "load"),
+    "render": ("images", "render"),
+    "save": ("scenes", "save"),
+    "trace": ("tracing", "trace"),
+}
+"""Module below this one, and the name in it, of everything public."""
+
+__all__ = [
+    "Camera",
+    "Cancelled",
+    "Client",
+    "ConfigError",
+    "GaussianTensors",
+    "Image",
+    "Job",
+    "OctasplatError",
+    "Rays",
+    "Scene",
+    "TraceSettings",
+    "TracedRays",
+    "__version__",
+    "load",
+    "render",
+    "save",
+    "trace",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Import what is public when it is first used."""
+    if name not in _SOURCES:
+        raise AttributeError(f"module 'octasplat' has no attribute '{name}'")
+    module, attribute = _SOURCES[name]
+    value: object = getattr(import_module(f"octasplat.{module}"), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted(__all__)

@@ -44,7 +44,9 @@ def moved_losses(
                 result = trace_reference(parameters, replace(rays, **{name: array}), settings)
                 losses.append(
                     sum(
-                        (getattr(result, out).numpy() * getattr(given, out)).reshape(len(rays), -1).sum(axis=1)
+                        (getattr(result, out).numpy() * getattr(given, out))
+                        .reshape(len(rays), -1)
+                        .sum(axis=1)
                         for out in OUTPUTS
                         if getattr(given, out) is not None
                     )
@@ -127,5 +129,3 @@ def test_heaviest_gaussian_of_each_ray_has_the_largest_weight(rng: np.random.Gen
     assert met.any() and not met.all()
     assert (found[met] == weights[met].argmax(axis=1)).all()
     assert (found[~met] == -1).all()
-
-

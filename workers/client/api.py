@@ -11,7 +11,7 @@ from typing import Any, Self
 import httpx
 
 from octasplat.engine.errors import OctasplatError
-from octasplat.workers.settings import ADDRESS_FILE, TOKEN_FILE, default_data_folder
+from octasplat.workers.data_folder import ADDRESS_FILE, TOKEN_FILE, default_data_folder
 
 DEFAULT_ADDRESS = "http://127.0.0.1:8642"
 SERVER, TOKEN, DATA = "OCTASPLAT_SERVER", "OCTASPLAT_TOKEN", "OCTASPLAT_DATA"
@@ -104,6 +104,10 @@ class Api:
     def __exit__(
         self, _type: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
         self._http.close()
 
     def get(self, path: str, **query: Any) -> Any:

@@ -14,6 +14,7 @@ from octasplat.engine.errors import OctasplatError, OutputError
 from octasplat.engine.files.splat_transform import VARIABLE as SPLAT_TRANSFORM
 from octasplat.engine.isolated_python import python_command
 from octasplat.engine.writing import write_json
+from octasplat.workers.data_folder import ADDRESS_FILE, TOKEN_FILE
 from octasplat.workers.ending import end
 from octasplat.workers.isolation.abilities import tell_what_lacks
 from octasplat.workers.isolation.hiding import hide_memory
@@ -21,7 +22,7 @@ from octasplat.workers.postgres.embedded import LEAST_CONNECTIONS, EmbeddedPostg
 from octasplat.workers.records.migrate import migrate
 from octasplat.workers.serve.children import KeptChild, kill_late
 from octasplat.workers.serve.own_token import keep_own_token
-from octasplat.workers.settings import ADDRESS_FILE, PREFIX, TOKEN_FILE, WorkerSettings, worker_connections
+from octasplat.workers.settings import PREFIX, WorkerSettings, worker_connections
 
 logger = logging.getLogger(__name__)
 

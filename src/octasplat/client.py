@@ -1,0 +1,271 @@
+"""A service from Python: photographs sent, jobs queued and followed, results saved. Needs no engine."""
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, cast
+
+from octasplat.engine.events import Listener
+from octasplat.notebook import default_listener, table_html
+from octasplat.places import PathLike
+from octasplat.workers.client import submission
+from octasplat.workers.client.api import Api, ServiceError, Unreachable, find_address, find_token
+from octasplat.workers.client.submission import Derivation, JobFailed, Submission
+
+JobState = Literal["queued", "running", "canceling", "succeeded", "failed", "canceled"]
+
+__all__ = ["Client", "Job", "JobFailed", "JobState", "Result", "ServiceError", "Unreachable"]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A file that a job has made: its name in the job's folder and its size."""
+
+    name: str
+    size_bytes: int
+
+
+class Client:
+    """A service, such as ``octasplat serve`` runs.
+
+    Args:
+        url: where it is; by default as ``OCTASPLAT_SERVER`` says, or that of this machine.
+        token: what to show it; by default as ``OCTASPLAT_TOKEN`` says, or that of this machine's service.
+
+    >>> import octasplat as osp
+    >>> with osp.Client(url, token) as client:
+    ...     job = client.submit("photos/", preset="fast", label="a trial")
+    ...     job.wait().state
+    'succeeded'
+    >>> files = job.download("out/")
+    >>> osp.Run("out/").psnr > 20
+    True
+    """
+
+    def __init__(self, url: str | None = None, token: str | None = None) -> None:
+        address = url or find_address(os.environ)
+        self._api = Api(address, token or find_token(os.environ, address))
+
+    def __enter__(self) -> "Client":
+        self._api.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections; jobs go on."""
+        self._api.close()
+
+    @property
+    def url(self) -> str:
+        """Where the service is."""
+        return self._api.address
+
+    def submit(
+        self,
+        photographs: PathLike,
+        *,
+        label: str | None = None,
+        queue: str = "cpu",
+        priority: int = 0,
+        progress: Listener | None = None,
+        **options: Any,
+    ) -> "Job":
+        """Send photographs and queue their reconstruction; photographs that are there are not sent again.
+
+        Args:
+            photographs: a folder, a ZIP file, or the id of a dataset.
+            label: what to call the job.
+            queue: which workers.
+            priority: higher goes first.
+            progress: told the events of the upload; by default they are logged, or shown in a notebook.
+            options: of the reconstruction, as ``GET /v1/options/reconstruct`` lists them.
+
+        Raises:
+            DatasetError: there are no photographs.
+            ServiceError: the service refuses the photographs or the options.
+            Unreachable: nobody answers.
+        """
+        what = Submission(Path(photographs), options, label, queue, priority)
+        return Job(self._api, submission.submit(self._api, what, progress or default_listener()))
+
+    def derive(
+        self,
+        source: "Job | str",
+        kind: str,
+        *,
+        files: Mapping[str, PathLike] | Sequence[PathLike] = (),
+        photographs: PathLike | None = None,
+        label: str | None = None,
+        queue: str = "cpu",
+        priority: int = 0,
+        progress: Listener | None = None,
+        **options: Any,
+    ) -> "Job":
+        """Queue a job on the results of a finished one, such as a render.
+
+        Args:
+            source: the finished job, or its id.
+            kind: of the new one; ``GET /v1/options`` lists them.
+            files: files that the options name, by these names, or by their own.
+            photographs: a folder, a ZIP file, or the id of a dataset to work on in the place of the job's.
+            label: what to call the job.
+            queue: which workers.
+            priority: higher goes first.
+            progress: as for :meth:`submit`.
+            options: of the kind.
+
+        Raises:
+            ServiceError: the service refuses something.
+            Unreachable: nobody answers.
+        """
+        named = files if isinstance(files, Mapping) else {Path(path).name: path for path in files}
+        what = Derivation(
+            source.id if isinstance(source, Job) else source,
+            kind,
+            options,
+            {name: Path(path) for name, path in named.items()},
+            None if photographs is None else Path(photographs),
+            label,
+            queue,
+            priority,
+        )
+        return Job(self._api, submission.derive(self._api, what, progress or default_listener()))
+
+    def job(self, job_id: str) -> "Job":
+        """Return the job with an id.
+
+        Raises:
+            ServiceError: there is none.
+        """
+        return Job(self._api, self._api.get(f"/v1/jobs/{job_id}"))
+
+    def jobs(self) -> Iterator["Job"]:
+        """Yield all jobs, the newest first."""
+        return (Job(self._api, content) for content in self._api.pages("/v1/jobs", "jobs"))
+
+    def __repr__(self) -> str:
+        return f"Client({self.url!r})"
+
+
+class Job:
+    """A job of a service; what is known of it is what the last request told, see :meth:`refresh`."""
+
+    def __init__(self, api: Api, content: Mapping[str, Any]) -> None:
+        """Take over what the service says; :meth:`Client.job` returns the job with an id."""
+        self._api = api
+        self.content = content
+
+    @property
+    def id(self) -> str:
+        """The id."""
+        return str(self.content["id"])
+
+    @property
+    def kind(self) -> str:
+        """The kind, such as ``reconstruct``."""
+        return str(self.content["kind"])
+
+    @property
+    def label(self) -> str | None:
+        """What it is called."""
+        return cast("str | None", self.content["label"])
+
+    @property
+    def state(self) -> JobState:
+        """The state, when it was last asked for."""
+        return cast(JobState, self.content["state"])
+
+    @property
+    def psnr(self) -> float | None:
+        """PSNR of the held-out views in dB, once it is known."""
+        return cast("float | None", self.content.get("psnr"))
+
+    @property
+    def error(self) -> str | None:
+        """Why it failed."""
+        error = self.content.get("error")
+        return None if error is None else str(error["message"])
+
+    @property
+    def options(self) -> Mapping[str, Any]:
+        """All of its options."""
+        return cast("Mapping[str, Any]", self.content["options"])
+
+    def refresh(self) -> "Job":
+        """Ask how it fares, and return the job itself."""
+        self.content = self._api.get(f"/v1/jobs/{self.id}")
+        return self
+
+    def wait(
+        self, *, progress: Listener | None = None, on_note: Callable[[str], None] = lambda _note: None
+    ) -> "Job":
+        """Wait until the job is over, and return the job itself.
+
+        Args:
+            progress: told the events of the job; by default they are logged, or shown in a notebook.
+            on_note: told in a sentence when another worker takes the job over.
+
+        Raises:
+            JobFailed: it failed or was cancelled.
+            Unreachable: the service was away for two minutes.
+        """
+        try:
+            self.content = submission.wait_for(self._api, self.id, progress or default_listener(), on_note)
+        except JobFailed:
+            self.refresh()
+            raise
+        return self
+
+    def cancel(self) -> "Job":
+        """Stop the job, which keeps its last checkpoint; returns the job itself."""
+        self.content = self._api.post(f"/v1/jobs/{self.id}/cancel")
+        return self
+
+    def retry(self, *, from_start: bool = False, **options: Any) -> "Job":
+        """Queue a job that failed or was cancelled again; returns the job itself.
+
+        Args:
+            from_start: begin anew, rather than at the last checkpoint.
+            options: in the place of the job's own.
+
+        Raises:
+            ServiceError: it is not over, or an option cannot change.
+        """
+        body = {"from": "start" if from_start else "checkpoint", "options": options}
+        self.content = self._api.post(f"/v1/jobs/{self.id}/retry", body)
+        return self
+
+    def results(self) -> tuple[Result, ...]:
+        """Return the files that the job has made."""
+        found = self._api.get(f"/v1/jobs/{self.id}/artifacts")["artifacts"]
+        return tuple(Result(artifact["name"], artifact["size_bytes"]) for artifact in found)
+
+    def download(self, folder: PathLike, *names: str, progress: Listener | None = None) -> tuple[Path, ...]:
+        """Save the results in a folder and return the files; files that are there are not sent again.
+
+        Args:
+            folder: where to.
+            names: only these results.
+            progress: told the events of the download; by default they are logged, or shown in a notebook.
+
+        Raises:
+            ServiceError: there are no such results.
+            OutputError: a file cannot be written.
+        """
+        return submission.fetch(self._api, self.id, Path(folder), names, progress or default_listener())
+
+    def __repr__(self) -> str:
+        return f"Job({self.id!r}, {self.kind}, {self.state})"
+
+    def _repr_html_(self) -> str:
+        told = {"kind": self.kind, "label": self.label, "state": self.state, "psnr": self.psnr}
+        told["error"] = self.error
+        return table_html(
+            f"Job {self.id}", {name: value for name, value in told.items() if value is not None}
+        )

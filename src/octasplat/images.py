@@ -1,0 +1,138 @@
+"""Pictures of scenes in memory."""
+
+import base64
+import html
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.places import PathLike
+from octasplat.scenes import Scene
+
+if TYPE_CHECKING:
+    from octasplat.engine.trace.protocol import Tracer
+
+Background = Literal["black", "white"] | tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Image:
+    """What a camera sees of a scene.
+
+    Attributes:
+        rgb: display values in [0, 1] over the background.
+        depth: mean distance along the ray, world units; 0 where nothing was met.
+        normal: mean normal in the world, towards the viewer, of unit length; 0 where nothing was met.
+        alpha: share of the pixel that the scene covers.
+
+    >>> import octasplat as osp
+    >>> scene = osp.load("scene.ply")
+    >>> image = osp.render(scene, scene.camera(width=96, height=64))
+    >>> image.rgb.shape, image.depth.shape, image.normal.shape, image.alpha.shape
+    ((64, 96, 3), (64, 96), (64, 96, 3), (64, 96))
+    >>> image.gaussian.shape, int(image.gaussian.max()) < len(scene)
+    ((64, 96), True)
+    """
+
+    rgb: Float32[np.ndarray, "h w 3"]
+    depth: Float32[np.ndarray, "h w"]
+    normal: Float32[np.ndarray, "h w 3"]
+    alpha: Float32[np.ndarray, "h w"]
+    _scene: Scene = field(repr=False)
+    _rays: ImageRays = field(repr=False)
+    _threads: int = field(repr=False)
+
+    @cached_property
+    def gaussian(self) -> Int32[np.ndarray, "h w"]:
+        """Number of the Gaussian that weighs most in the middle of each pixel, -1 where there is none.
+
+        It is found when it is first asked for, in the scene as it then is.
+        """
+        from octasplat.engine.render.renderer import heaviest_by_pixel
+
+        return heaviest_by_pixel(_tracer(self._scene, self._threads), self._scene.gaussians, self._rays)
+
+    def save(self, path: PathLike) -> Path:
+        """Write an 8-bit PNG of the colours, or an OpenEXR with linear colours, alpha, depth and normals.
+
+        Raises:
+            OutputError: the file cannot be written.
+
+        >>> import octasplat as osp
+        >>> scene = osp.load("scene.ply")
+        >>> osp.render(scene, scene.camera(width=96, height=64)).save("view.png").name
+        'view.png'
+        """
+        from octasplat.engine.render.images import exr_layers, write_exr, write_png
+
+        target = Path(path)
+        if target.suffix.lower() == ".exr":
+            layers = exr_layers(self.rgb, alpha=self.alpha, depth=self.depth, normals_world=self.normal)
+            write_exr(target, layers)
+        else:
+            write_png(target, self.rgb)
+        return target
+
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        return f"Image({width} x {height})"
+
+    def _repr_png_(self) -> bytes:
+        from io import BytesIO
+
+        from PIL import Image as Picture
+
+        from octasplat.engine.colour import to_bytes
+
+        memory = BytesIO()
+        Picture.fromarray(to_bytes(self.rgb)).save(memory, "PNG")
+        return memory.getvalue()
+
+    def _repr_html_(self) -> str:
+        source = base64.b64encode(self._repr_png_()).decode("ascii")
+        return f'<img src="data:image/png;base64,{source}" alt="{html.escape(repr(self))}">'
+
+
+def render(
+    scene: Scene, camera: RenderCamera, *, background: Background = "black", threads: int = 0
+) -> Image:
+    """Return what a camera sees of a scene in memory.
+
+    Args:
+        scene: the scene.
+        camera: where from; :meth:`Scene.camera` and :meth:`Camera.looking_at` make some.
+        background: what lies behind, by name or as display values in [0, 1].
+        threads: 0 takes all cores; the result does not depend on it.
+
+    >>> import octasplat as osp
+    >>> scene = osp.load("scene.ply")
+    >>> camera = osp.Camera.looking_at((0, 0, -4), (0, 0, 0), 96, 64)
+    >>> osp.render(scene, camera, background="white")
+    Image(96 x 64)
+    """
+    from octasplat.engine.render.oversampling import rays_across, render_averaged
+    from octasplat.engine.render.renderer import background_colour
+    from octasplat.engine.shading.plain import PLAIN
+
+    behind = (
+        background_colour(background) if isinstance(background, str) else np.array(background, np.float32)
+    )
+    rays = camera.rays()
+    tracer = _tracer(scene, threads)
+    seen = render_averaged(tracer, rays, behind, PLAIN, rays_across(rays, scene.facts.pixel_rad))
+    return Image(seen.rgb_srgb, seen.depth, seen.normal_world, seen.alpha, scene, rays, threads)
+
+
+def _tracer(scene: Scene, threads: int) -> "Tracer":
+    from octasplat.engine.trace.make import make_tracer
+    from octasplat.engine.trace.protocol import TraceSettings
+
+    tracer = make_tracer(TraceSettings(turned_beyond=scene.facts.turned_beyond), threads=threads)
+    tracer.build(scene.gaussians)
+    return tracer

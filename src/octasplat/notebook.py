@@ -1,0 +1,112 @@
+"""What notebooks show: progress while work goes on, and results as small tables. Elsewhere, a log."""
+
+import html
+import logging
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from octasplat.engine.events import (
+    Event,
+    Listener,
+    Noted,
+    StageFinished,
+    StageProgress,
+    TrainingProgress,
+    Warned,
+)
+from octasplat.workers.telling.lines import PlainLines
+
+LOGGER = logging.getLogger("octasplat")
+SECONDS_BETWEEN_UPDATES = 0.5
+_KEPT_LINES = 12
+
+
+def log_event(event: Event) -> None:
+    """Log an event of quick work: warnings as such, notes as information, anything else for debugging."""
+    if isinstance(event, Warned):
+        LOGGER.warning("%s", event.message)
+    elif isinstance(event, Noted):
+        LOGGER.info("%s", event.message)
+    else:
+        LOGGER.debug("%s", event)
+
+
+def default_listener() -> Listener:
+    """Return what shows events where nobody says how: in the cell of a notebook, or else in the log."""
+    return NotebookProgress() if in_notebook() else EventLog()
+
+
+class EventLog:
+    """Logs events as lines: stages as they begin and end, and every few seconds how far they are."""
+
+    def __init__(self) -> None:
+        self._lines = PlainLines(LOGGER.info, warn=_log_warning)
+
+    def __call__(self, event: Event) -> None:
+        """Log ``event``."""
+        self._lines(event)
+
+
+def _log_warning(text: str) -> None:
+    LOGGER.warning("%s", text.removeprefix("Warning: "))
+
+
+def in_notebook() -> bool:
+    """Return whether a notebook's kernel runs this process."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return getattr(shell, "kernel", None) is not None
+
+
+class NotebookProgress:
+    """Shows events in the output of a notebook's cell: finished stages as lines, the running one with a bar.
+
+    It may be called from another thread than the cell's.
+    """
+
+    def __init__(self) -> None:
+        self._lines: list[str] = []
+        self._stage = PlainLines(self._lines.append, every_seconds=float("inf"))
+        self._share: float | None = None
+        self._next = 0.0
+        self._handle: Any = None
+
+    def __call__(self, event: Event) -> None:
+        """Show ``event``."""
+        self._stage(event)
+        if isinstance(event, StageProgress):
+            self._share = (event.step + event.part) / event.total_steps if event.total_steps else None
+        elif isinstance(event, TrainingProgress):
+            self._share = event.iteration / event.total_iterations
+        elif isinstance(event, StageFinished):
+            self._share = None
+        now = time.monotonic()
+        if now >= self._next or isinstance(event, StageFinished | Warned):
+            self._next = now + SECONDS_BETWEEN_UPDATES
+            self._update()
+
+    def _update(self) -> None:
+        from IPython.display import HTML, display
+
+        shown = HTML(self.html())
+        if self._handle is None:
+            self._handle = display(shown, display_id=True)
+        else:
+            self._handle.update(shown)
+
+    def html(self) -> str:
+        """Return what is shown."""
+        bar = "" if self._share is None else f'<progress value="{self._share:.4f}" max="1"></progress>'
+        lines = "<br>".join(html.escape(line) for line in self._lines[-_KEPT_LINES:])
+        return f"<div>{lines}<br>{bar}</div>"
+
+
+def table_html(title: str, rows: Mapping[str, object]) -> str:
+    """Return a small table with a row for each entry; values are escaped."""
+    body = "".join(
+        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td>{html.escape(str(value))}</td></tr>"
+        for name, value in rows.items()
+    )
+    return f"<table><caption>{html.escape(title)}</caption>{body}</table>"

@@ -1,0 +1,260 @@
+"""Scenes in memory: their parameters as arrays, read from and written to files of any format."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.rows import Index
+from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
+from octasplat.notebook import log_event, table_html
+from octasplat.places import PathLike
+
+if TYPE_CHECKING:
+    from octasplat.engine.render.cameras import RenderCamera
+
+
+class Scene:
+    """Flat Gaussians, and what a file says of them as a whole.
+
+    >>> import numpy as np
+    >>> import octasplat as osp
+    >>> scene = osp.load("scene.ply")
+    >>> len(scene), scene.means.shape, scene.quats.shape, scene.scales.shape, scene.opacities.shape
+    (1200, (1200, 3), (1200, 4), (1200, 2), (1200,))
+    >>> scene.sh.shape, scene.sh_degree
+    ((1200, 4, 3), 1)
+
+    ``means``, ``quats``, ``log_scales``, ``opacity_logits`` and ``sh`` are views: what is written to them
+    changes the scene.
+
+    >>> scene.means += np.float32([0, 0, 1])
+    """
+
+    def __init__(self, gaussians: FlatGaussians, facts: SceneFacts = NOTHING_KNOWN) -> None:
+        """Take over the engine's Gaussians; :meth:`from_arrays` makes a scene of plain arrays."""
+        self.gaussians = gaussians
+        self.facts = facts
+
+    @classmethod
+    def from_arrays(
+        cls,
+        means: Float[np.ndarray, "n 3"],
+        quats: Float[np.ndarray, "n 4"],
+        scales: Float[np.ndarray, "n 2"],
+        opacities: Float[np.ndarray, " n"],
+        sh: Float[np.ndarray, "n k 3"],
+        channels: Mapping[str, Float[np.ndarray, "n f"]] | None = None,
+    ) -> "Scene":
+        """Return a scene of these parameters, which are copied.
+
+        Args:
+            means: centres, world units.
+            quats: rotations (w, x, y, z) of any length; the columns of the matrix are the normal and the two
+                axes in the plane.
+            scales: standard deviations along these axes, world units.
+            opacities: in (0, 1).
+            sh: spherical harmonics of the display colour, 1, 4, 9 or 16 coefficients a Gaussian.
+            channels: further numbers of each Gaussian, by name.
+
+        >>> import numpy as np
+        >>> import octasplat as osp
+        >>> osp.Scene.from_arrays(
+        ...     means=np.zeros((1, 3)),
+        ...     quats=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        ...     scales=np.ones((1, 2)),
+        ...     opacities=np.array([0.9]),
+        ...     sh=np.ones((1, 1, 3)),
+        ... )
+        Scene(1 Gaussian, harmonics of degree 0)
+        """
+        opacity = np.asarray(opacities, np.float64)
+        return cls(
+            FlatGaussians(
+                np.array(means, np.float32),
+                np.array(quats, np.float32),
+                np.log(np.asarray(scales, np.float64)).astype(np.float32),
+                np.log(opacity / (1 - opacity)).astype(np.float32),
+                np.array(sh, np.float32),
+                Channels({name: np.array(rows, np.float32) for name, rows in (channels or {}).items()}),
+            )
+        )
+
+    @property
+    def means(self) -> Float32[np.ndarray, "n 3"]:
+        """Centres, world units."""
+        return self.gaussians.means_world
+
+    @means.setter
+    def means(self, values: Float[np.ndarray, "n 3"]) -> None:
+        self.gaussians.means_world[...] = values
+
+    @property
+    def quats(self) -> Float32[np.ndarray, "n 4"]:
+        """Rotations (w, x, y, z), of any length; the first column of the matrix is the normal."""
+        return self.gaussians.quats_wxyz
+
+    @quats.setter
+    def quats(self, values: Float[np.ndarray, "n 4"]) -> None:
+        self.gaussians.quats_wxyz[...] = values
+
+    @property
+    def log_scales(self) -> Float32[np.ndarray, "n 2"]:
+        """Natural logarithms of :attr:`scales`."""
+        return self.gaussians.log_scales
+
+    @property
+    def scales(self) -> Float32[np.ndarray, "n 2"]:
+        """Standard deviations along the two axes in the plane, world units; a copy, but it can be set."""
+        return self.gaussians.scales
+
+    @scales.setter
+    def scales(self, values: Float[np.ndarray, "n 2"]) -> None:
+        self.gaussians.log_scales[...] = np.log(values)
+
+    @property
+    def opacity_logits(self) -> Float32[np.ndarray, " n"]:
+        """What the sigmoid turns into :attr:`opacities`."""
+        return self.gaussians.opacity_logits
+
+    @property
+    def opacities(self) -> Float32[np.ndarray, " n"]:
+        """Opacities in (0, 1); a copy, but they can be set."""
+        return self.gaussians.opacities
+
+    @opacities.setter
+    def opacities(self, values: Float[np.ndarray, " n"]) -> None:
+        opacity = np.asarray(values, np.float64)
+        self.gaussians.opacity_logits[...] = np.log(opacity / (1 - opacity))
+
+    @property
+    def sh(self) -> Float32[np.ndarray, "n k 3"]:
+        """Spherical harmonics of the display colour, coefficient-major."""
+        return self.gaussians.sh
+
+    @sh.setter
+    def sh(self, values: Float[np.ndarray, "n k 3"]) -> None:
+        self.gaussians.sh[...] = values
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return self.gaussians.sh_degree
+
+    @property
+    def channels(self) -> Mapping[str, np.ndarray]:
+        """What else is known of each Gaussian, such as its albedo, by name."""
+        return self.gaussians.channels
+
+    @property
+    def normals(self) -> Float32[np.ndarray, "n 3"]:
+        """Unit normals, a copy."""
+        return self.gaussians.rotations[:, :, 0].copy()
+
+    def select(self, index: Index) -> "Scene":
+        """Return the Gaussians of an index, a mask or a slice, copied.
+
+        >>> import octasplat as osp
+        >>> scene = osp.load("scene.ply")
+        >>> len(scene.select(scene.opacities > 0.5)) < len(scene)
+        True
+        """
+        return Scene(self.gaussians.select(index), self.facts)
+
+    def copy(self) -> "Scene":
+        """Return an independent copy."""
+        return Scene(self.gaussians.copy(), self.facts)
+
+    def camera(self, width: int = 640, height: int = 480, *, fov: float = 50.0) -> "RenderCamera":
+        """Return a camera that sees the whole scene; ``fov`` is its angle of view in degrees, down.
+
+        >>> import octasplat as osp
+        >>> camera = osp.load("scene.ply").camera(width=96, height=64)
+        >>> camera.width_px, camera.height_px
+        (96, 64)
+        """
+        return self.turntable(1, width, height, fov=fov)[0]
+
+    def turntable(
+        self, frames: int, width: int = 640, height: int = 480, *, fov: float = 50.0
+    ) -> tuple["RenderCamera", ...]:
+        """Return cameras that go round the scene once, with -y up as in most scenes that COLMAP made.
+
+        >>> import octasplat as osp
+        >>> len(osp.load("scene.ply").turntable(12))
+        12
+        """
+        from octasplat.engine.render.jobs import gaussian_turntable, turntable_cameras
+
+        table = gaussian_turntable(self.gaussians, fov_y_degrees=fov, aspect=width / height)
+        return turntable_cameras(table, frames, width, height, fov)
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def __repr__(self) -> str:
+        plural = "" if len(self) == 1 else "s"
+        more = f", channels {', '.join(self.channels)}" if self.channels else ""
+        return f"Scene({len(self):,} Gaussian{plural}, harmonics of degree {self.sh_degree}{more})"
+
+    def _repr_html_(self) -> str:
+        low, high = self.means.min(axis=0), self.means.max(axis=0)
+        return table_html(
+            "Scene",
+            {
+                "Gaussians": f"{len(self):,}",
+                "harmonics": f"degree {self.sh_degree}",
+                "channels": ", ".join(self.channels) or "none",
+                "centres": " to ".join(
+                    " ".join(f"{value:.4g}" for value in corner) for corner in (low, high)
+                ),
+            },
+        )
+
+
+def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:
+    """Return the scene of a file of any format, or of a run.
+
+    What reading loses, as the thickness of Gaussians that were not flat, is logged.
+
+    Args:
+        source: the file, a run or its folder, or the folder of an unpacked SOG.
+        drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
+
+    Raises:
+        SceneFileError: the file cannot be read.
+
+    >>> import octasplat as osp
+    >>> osp.load("scene.ply")
+    Scene(1,200 Gaussians, harmonics of degree 1)
+    """
+    from octasplat.engine.files import read_facts
+    from octasplat.engine.operations.scenes import open_scene
+
+    path = Path(source)
+    return Scene(open_scene(path, log_event, drop_invalid=drop_invalid), read_facts(path))
+
+
+def save(scene: Scene, path: PathLike) -> Path:
+    """Write a scene in the format that the suffix of ``path`` says, and return the path.
+
+    What the format leaves out is logged.
+
+    Raises:
+        SceneFileError: no format has that suffix, or the file cannot be written.
+
+    >>> import octasplat as osp
+    >>> osp.save(osp.load("scene.ply"), "smaller.spz").name
+    'smaller.spz'
+    >>> len(osp.load("smaller.spz"))
+    1200
+    """
+    from octasplat.engine.operations.scenes import write_scene
+
+    target = Path(path)
+    write_scene(scene.gaussians, scene.facts, target, log_event)
+    return target

@@ -1,0 +1,275 @@
+"""The ray tracer as a differentiable function of torch, for training loops of one's own."""
+
+import weakref
+from collections import deque
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
+
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import RayBatch
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.trace.make import make_tracer
+from octasplat.engine.trace.protocol import TraceGradients, Tracer, TraceSettings
+from octasplat.engine.trace.ray_gradients import ray_gradients
+from octasplat.scenes import Scene
+
+_LEAST_ALPHA = 1e-8
+"""Rays that met less than this have no depth."""
+
+
+@dataclass
+class GaussianTensors:
+    """The parameters of ``n`` flat Gaussians before their activations, as tensors on the CPU.
+
+    Attributes:
+        means: centres, world units.
+        quats: rotations (w, x, y, z) of any length.
+        log_scales: natural logarithms of the standard deviations in the plane.
+        opacity_logits: what the sigmoid turns into opacities.
+        sh: spherical harmonics of the display colour; colour = max(0, 1/2 + sum_k sh[k] Y_k(direction)).
+        features: any further numbers, composited like colours.
+
+    >>> import octasplat as osp
+    >>> parameters = osp.GaussianTensors.of(osp.load("scene.ply"))
+    >>> parameters.means.shape, parameters.means.requires_grad
+    (torch.Size([1200, 3]), True)
+    >>> len(parameters.tensors())
+    5
+    """
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    log_scales: Float[Tensor, "n 2"]
+    opacity_logits: Float[Tensor, " n"]
+    sh: Float[Tensor, "n k 3"]
+    features: Float[Tensor, "n f"] | None = None
+
+    @classmethod
+    def of(cls, scene: Scene, *, requires_grad: bool = True) -> "GaussianTensors":
+        """Return leaves with the parameters of a scene, copied."""
+        arrays = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.sh)
+        return cls(*(torch.tensor(array, requires_grad=requires_grad) for array in arrays))
+
+    def tensors(self) -> list[Tensor]:
+        """Return the tensors, as an optimiser takes them; no features where there are none."""
+        found = (getattr(self, part.name) for part in fields(self))
+        return [tensor for tensor in found if tensor is not None]
+
+    def scene(self) -> Scene:
+        """Return the scene with these parameters, copied."""
+        return Scene(_gaussians(*(_array(tensor) for tensor in self.tensors()[:5])).copy())
+
+
+@dataclass
+class Rays:
+    """``r`` rays, which see what lies between ``t_min`` and ``t_max`` of their length.
+
+    Attributes:
+        origins: where they come from; one row stands for all.
+        directions: where they go, of any length; distances are in world units all the same.
+        t_min: distance at which they begin.
+        t_max: distance at which they end.
+
+    >>> import octasplat as osp
+    >>> rays = osp.Rays.of(osp.load("scene.ply").camera(width=96, height=64))
+    >>> rays.origins.shape, rays.directions.shape
+    (torch.Size([1, 3]), torch.Size([6144, 3]))
+    >>> rays[:100].directions.shape
+    torch.Size([100, 3])
+    """
+
+    origins: Float[Tensor, "#r 3"]
+    directions: Float[Tensor, "r 3"]
+    t_min: float = 0.0
+    t_max: float = float("inf")
+
+    @classmethod
+    def of(cls, camera: RenderCamera) -> "Rays":
+        """Return the rays through the pixels of a camera, row by row."""
+        rays = camera.rays().rays
+        return cls(torch.tensor(rays.origins_world), torch.tensor(rays.directions_world), camera.near_world)
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def __getitem__(self, which: Any) -> "Rays":
+        """Return the rays of a slice, a mask or numbers."""
+        shared = len(self.origins) == 1 and len(self) != 1
+        origins = self.origins if shared else self.origins[which]
+        return Rays(origins, self.directions[which], self.t_min, self.t_max)
+
+
+@dataclass(frozen=True)
+class TracedRays:
+    """What rays see.
+
+    Attributes:
+        rgb: display colours, multiplied by alpha: with a background b, a picture is rgb + (1 - alpha) b.
+        alpha: how much of the ray the Gaussians hide.
+        depth: mean distance, world units; 0 where nothing was met.
+        depth_median: distance of the Gaussian with which half of the light is gone; 0 where it never is.
+        normal: sum of the normals by weight, towards the viewer; its length is at most alpha.
+        features: sum of the Gaussians' features by weight.
+
+    >>> import octasplat as osp
+    >>> scene = osp.load("scene.ply")
+    >>> seen = osp.trace(scene, scene.camera(width=96, height=64))
+    >>> picture = (seen.rgb + (1 - seen.alpha)[:, None]).reshape(64, 96, 3)  # over white
+    >>> picture.shape
+    torch.Size([64, 96, 3])
+    """
+
+    rgb: Float[Tensor, "r 3"]
+    alpha: Float[Tensor, " r"]
+    depth: Float[Tensor, " r"]
+    depth_median: Float[Tensor, " r"]
+    normal: Float[Tensor, "r 3"]
+    features: Float[Tensor, "r f"]
+
+
+def trace(
+    scene: Scene | GaussianTensors,
+    rays: Rays | RenderCamera,
+    *,
+    settings: TraceSettings | None = None,
+    threads: int = 0,
+) -> TracedRays:
+    """Return what rays see of flat Gaussians, differentiably.
+
+    Everything has gradients by all parameters and by the origins and directions of the rays: those of the
+    compositing, the falloff, the planes and the view-dependent colour. There are none through the edges of
+    the octagons and the order of the hits. Rays beside each other that share their origin, as those of a
+    camera do, are traced together and fastest.
+
+    Args:
+        scene: parameters; a :class:`Scene` is taken as it is, without gradients.
+        rays: rays, or a camera for those through its pixels, row by row.
+        settings: where rays are cut off.
+        threads: 0 takes all cores.
+
+    >>> import octasplat as osp
+    >>> scene = osp.load("scene.ply")
+    >>> parameters = osp.GaussianTensors.of(scene)
+    >>> seen = osp.trace(parameters, scene.camera(width=96, height=64))
+    >>> seen.rgb.shape, seen.depth.shape, seen.normal.shape, seen.alpha.shape
+    (torch.Size([6144, 3]), torch.Size([6144]), torch.Size([6144, 3]), torch.Size([6144]))
+    >>> (1 - seen.alpha).mean().backward()
+    >>> parameters.opacity_logits.grad.shape
+    torch.Size([1200])
+    """
+    given = GaussianTensors.of(scene, requires_grad=False) if isinstance(scene, Scene) else scene
+    if settings is None:
+        beyond = scene.facts.turned_beyond if isinstance(scene, Scene) else 0.0
+        settings = TraceSettings(turned_beyond=beyond)
+    lines = Rays.of(rays) if isinstance(rays, RenderCamera) else rays
+    directions = lines.directions / lines.directions.norm(dim=-1, keepdim=True)
+    features = given.features
+    if features is None:
+        features = given.means.new_zeros((len(given.means), 0))
+    found: tuple[Tensor, ...] = _Trace.apply(  # type: ignore[no-untyped-call]
+        given.means, given.quats, given.log_scales, given.opacity_logits, given.sh, features,
+        lines.origins, directions, _Limits(settings, lines.t_min, lines.t_max, threads),
+    )  # fmt: skip
+    rgb, transmittance, depth_sum, depth_median, normal, extra = found
+    alpha = 1 - transmittance
+    met = alpha > _LEAST_ALPHA
+    depth = torch.where(met, depth_sum / torch.where(met, alpha, 1.0), 0.0)
+    return TracedRays(rgb, alpha, depth, depth_median, normal, extra)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """What is not differentiated."""
+
+    settings: TraceSettings
+    t_min: float
+    t_max: float
+    threads: int
+
+
+class _Lease:
+    """A tracer of which nobody else makes use until this object is gone; its memory serves the next one."""
+
+    def __init__(self, settings: TraceSettings, threads: int) -> None:
+        free = _FREE.setdefault((settings, threads), deque(maxlen=_MOST_FREE))
+        try:
+            self.tracer = free.pop()
+        except IndexError:
+            self.tracer = make_tracer(settings, threads=threads)
+        weakref.finalize(self, free.append, self.tracer).atexit = False
+
+
+_MOST_FREE = 2
+"""Tracers that are kept for each kind of settings: fresh memory costs more than the tracing in it."""
+_FREE: dict[tuple[TraceSettings, int], deque[Tracer]] = {}
+
+
+class _Trace(torch.autograd.Function):
+    """The tracer with its gradients; all tensors may be of any floating type, results are float32."""
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, *arguments: Any) -> tuple[Tensor, ...]:
+        *tensors, limits = arguments
+        means, quats, log_scales, logits, sh, features, origins, directions = map(_array, tensors)
+        gaussians = _gaussians(means, quats, log_scales, logits, sh)
+        rays = RayBatch(origins, directions, limits.t_min, limits.t_max)
+        lease = _Lease(limits.settings, limits.threads)
+        tracer = lease.tracer
+        tracer.build(gaussians, features if features.shape[1] else None)
+        seen = tracer.trace(rays, record=any(ctx.needs_input_grad))  # type: ignore[attr-defined]
+        ctx.save_for_backward(*tensors)  # so that torch notices where they are changed before backward
+        ctx.state = gaussians, rays, lease, seen.hits, features  # type: ignore[attr-defined]
+        return tuple(
+            torch.from_numpy(array)
+            for array in (
+                seen.rgb_srgb, seen.transmittance, seen.depth_sum, seen.depth_median, seen.normal_world,
+                seen.features,
+            )
+        )  # fmt: skip
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
+        tensors = ctx.saved_tensors
+        gaussians, rays, lease, hits, features = ctx.state
+        tracer = lease.tracer
+        gradients = TraceGradients(*(_array(part) for part in given))
+        out: list[Tensor | None] = [None] * 9
+        if any(ctx.needs_input_grad[:6]):
+            found = tracer.backward(hits, gradients).numpy()
+            rows = (
+                found.means_world, found.quats_wxyz, found.log_scales, found.opacity_logits, found.sh,
+                found.features,
+            )  # fmt: skip
+            places = torch.from_numpy(found.ids.astype(np.int64))
+            for number, part in enumerate(rows):
+                if ctx.needs_input_grad[number]:
+                    dense = torch.zeros_like(tensors[number])
+                    dense[places] = torch.from_numpy(part).to(dense.dtype)
+                    out[number] = dense
+        if any(ctx.needs_input_grad[6:8]):
+            extra = features if features.shape[1] else None
+            by_ray = ray_gradients(gaussians, rays, hits, gradients, tracer.settings, extra)
+            origins, directions = by_ray.origins_world, by_ray.directions_world
+            if len(rays.origins_world) == 1:
+                origins = origins.sum(axis=0, keepdims=True)
+            for number, part in ((6, origins), (7, directions)):
+                out[number] = torch.from_numpy(part).to(tensors[number].dtype)
+        return tuple(out)
+
+
+def _gaussians(
+    means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, logits: np.ndarray, sh: np.ndarray
+) -> FlatGaussians:
+    return FlatGaussians(means, quats, log_scales, logits, sh)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    """The tensor's values as the tracer takes them, not copied where they are that."""
+    return np.require(tensor.detach().cpu().to(torch.float32).numpy(), np.float32, ["C", "W"])

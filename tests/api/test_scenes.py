@@ -1,0 +1,79 @@
+"""Scenes in memory: parameters, files and pictures."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import octasplat as osp
+
+
+def test_arrays_are_views_of_the_scene(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    before = scene.means.copy()
+    scene.means += np.float32([1, 2, 3])
+    scene.scales = 2 * scene.scales
+    scene.opacities = np.full(len(scene), 0.25)
+    np.testing.assert_array_equal(scene.gaussians.means_world, before + np.float32([1, 2, 3]))
+    np.testing.assert_allclose(scene.scales, np.exp(scene.log_scales))
+    np.testing.assert_allclose(scene.opacities, 0.25, rtol=1e-6)
+    assert not np.allclose(scene.copy().means, before)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat", ".glb"])
+def test_scene_survives_every_format(scene_file: Path, tmp_path: Path, suffix: str) -> None:
+    scene = osp.load(scene_file)
+    again = osp.load(osp.save(scene, tmp_path / f"again{suffix}"))
+    assert len(again) == len(scene)
+    lows, highs = again.means.min(axis=0), again.means.max(axis=0)
+    np.testing.assert_allclose([lows, highs], [scene.means.min(axis=0), scene.means.max(axis=0)], atol=0.01)
+
+
+def test_losses_of_a_format_are_logged_and_nothing_is_printed(
+    scene_file: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with caplog.at_level(logging.INFO, logger="octasplat"):
+        osp.save(osp.load(scene_file), tmp_path / "plain.splat")
+    assert any("how colours change with the direction will be left out" in text for text in caplog.messages)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_unknown_suffix_is_refused_with_a_sentence(scene_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(osp.OctasplatError, match=r"scene\.xyz"):
+        osp.save(osp.load(scene_file), tmp_path / "scene.xyz")
+
+
+def test_picture_shows_the_near_side_of_a_ball(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    scene.opacities = np.full(len(scene), 0.99)
+    scene.scales = np.full((len(scene), 2), 0.08)
+    camera = osp.Camera.looking_at((0, 0, -4), (0, 0, 0), 65, 65, fov_y_degrees=40)
+    image = osp.render(scene, camera, background=(0.0, 0.0, 1.0))
+    middle, corner = (32, 32), (0, 0)
+    assert image.alpha[middle] > 0.99 and image.alpha[corner] == 0
+    assert image.depth[middle] == pytest.approx(3.0, abs=0.03) and image.depth[corner] == 0
+    np.testing.assert_allclose(image.normal[middle], (0, 0, -1), atol=0.1)
+    np.testing.assert_allclose(image.rgb[corner], (0, 0, 1))
+    # The heaviest Gaussian lies where the pixel sees it.
+    heaviest = image.gaussian[middle]
+    np.testing.assert_allclose(scene.means[heaviest], (0, 0, -1), atol=0.15)
+    assert image.gaussian[corner] == -1
+
+
+def test_results_have_a_page_for_notebooks(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    assert "1,200" in scene._repr_html_()
+    image = osp.render(scene, scene.camera(width=32, height=24))
+    assert image._repr_html_().startswith('<img src="data:image/png;base64,')
+    assert image._repr_png_().startswith(b"\x89PNG")
+
+
+def test_saved_pictures_are_read_back(scene_file: Path, tmp_path: Path) -> None:
+    from octasplat.engine.render.images import read_image
+
+    scene = osp.load(scene_file)
+    image = osp.render(scene, scene.camera(width=32, height=24))
+    found = read_image(image.save(tmp_path / "a.png"))
+    np.testing.assert_allclose(found[..., :3], image.rgb, atol=0.5 / 255 + 1e-6)
+    assert image.save(tmp_path / "a.exr").stat().st_size > 0
