@@ -9,6 +9,7 @@ from octasplat.engine.operations.base import Operation
 
 _MODULES = {
     "evaluate": "evaluate",
+    "surface": "surface",
     "material": "material",
     "crop": "crop",
 }

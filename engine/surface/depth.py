@@ -15,7 +15,7 @@ from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.cameras import RenderCamera
 from octasplat.engine.render.renderer import RenderedImage, render_rays
 from octasplat.engine.surface.fitting import Picture
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.writing import telling_of_room
 
@@ -45,7 +45,7 @@ class DepthMaps:
 def render_depth_maps(
     tracer: Tracer,
     cameras: Sequence[RenderCamera],
-    options: SurfaceOptions,
+    options: ExtractionOptions,
     folder: Path,
     progress: Progress = lambda _done, _total: None,
 ) -> tuple[DepthMaps, tuple[Picture, ...]]:
@@ -87,7 +87,7 @@ def _picture(
     return camera.rays(), np.asarray(stored)
 
 
-def _distances(image: RenderedImage, options: SurfaceOptions) -> Float32[np.ndarray, "h w"]:
+def _distances(image: RenderedImage, options: ExtractionOptions) -> Float32[np.ndarray, "h w"]:
     distances = image.depth_median if options.depth == "median" else image.depth
     distances = np.where(image.alpha >= options.min_alpha, distances, UNKNOWN)
     distances[image.alpha < EMPTY_ALPHA] = EMPTY

@@ -21,7 +21,7 @@ from octasplat.engine.surface.holes import fill_holes
 from octasplat.engine.surface.marching import surface_of
 from octasplat.engine.surface.materials import MATERIALS, with_materials
 from octasplat.engine.surface.mesh import EdgeReport, TriangleMesh, edge_report
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.region import Region, choose_region, focus
 from octasplat.engine.surface.settling import settled
 from octasplat.engine.surface.texture import lay_out
@@ -54,34 +54,11 @@ class ExtractedSurface:
     edges: EdgeReport
 
 
-def extract_surface(
-    tracer: Tracer,
-    cameras: Sequence[RenderCamera],
-    options: SurfaceOptions,
-    *,
-    scratch: Path,
-    light_frame: Float64[np.ndarray, "3 3"] | None = None,
-    photographs: Sequence[Picture] = (),
-    listener: Listener = ignore,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> ExtractedSurface:
-    """Fuse the depth that ``cameras`` see into a mesh, clean it up and colour it.
-
-    Arguments and errors are those of :func:`extract_levels`.
-    """
-    (surface,) = extract_levels(
-        tracer, cameras, options, (options.max_triangles,),
-        scratch=scratch, light_frame=light_frame, photographs=photographs,
-        listener=listener, should_stop=should_stop,
-    )  # fmt: skip
-    return surface
-
-
 def extract_levels(
     tracer: Tracer,
     cameras: Sequence[RenderCamera],
-    options: SurfaceOptions,
-    levels: Sequence[int | None],
+    options: ExtractionOptions,
+    levels: Sequence[int | None] = (None,),
     *,
     scratch: Path,
     light_frame: Float64[np.ndarray, "3 3"] | None = None,
@@ -89,14 +66,14 @@ def extract_levels(
     listener: Listener = ignore,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[ExtractedSurface, ...]:
-    """One surface in several levels of detail: what is fused once is decimated to each and coloured.
+    """Return one surface in several levels of detail: what is fused once is decimated to each and coloured.
 
-    Each is what :func:`extract_surface` gives with that many triangles.
+    Each is what it is alone.
 
     Args:
         tracer: with the scene built.
         cameras: where depth and colours are rendered from.
-        options: all settings; ``max_triangles`` is passed over.
+        options: all settings.
         levels: at most so many triangles; None keeps all.
         scratch: folder for a temporary file of 12 bytes for every pixel of the depth maps.
         light_frame: bake materials, which the tracer then has as its first features
@@ -130,7 +107,7 @@ def extract_levels(
         progress(1, 3)
         mesh = _large_parts(mesh, options)
         progress(2, 3)
-        max_rim = None if options.fill_holes is None else options.fill_holes * region.voxel_world
+        max_rim = None if options.fill_holes == "all" else options.fill_holes * region.voxel_world
         mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
         progress(3, 3)
     if options.settle:  # while triangles are small enough to show what the pictures do
@@ -153,7 +130,7 @@ def _coloured(
     cameras: Sequence[RenderCamera],
     renders: Sequence[Picture],
     photographs: Sequence[Picture],
-    options: SurfaceOptions,
+    options: ExtractionOptions,
     mesh: TriangleMesh,
     region: Region,
     light_frame: Float64[np.ndarray, "3 3"] | None,
@@ -191,7 +168,7 @@ def _coloured(
 
 
 def _in_levels(
-    mesh: TriangleMesh, options: SurfaceOptions, levels: Sequence[int | None], tell: Listener
+    mesh: TriangleMesh, options: ExtractionOptions, levels: Sequence[int | None], tell: Listener
 ) -> list[TriangleMesh]:
     """The mesh with at most so many triangles, for each level."""
     if all(level is None for level in levels):
@@ -205,7 +182,7 @@ def _in_levels(
     return meshes
 
 
-def _large_parts(mesh: TriangleMesh, options: SurfaceOptions) -> TriangleMesh:
+def _large_parts(mesh: TriangleMesh, options: ExtractionOptions) -> TriangleMesh:
     return keep_large_components(mesh, keep=options.keep_components, min_share=options.min_component)
 
 

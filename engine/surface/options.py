@@ -1,68 +1,138 @@
 """What a surface is extracted with."""
 
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from octasplat.engine.fields import Group, Spelling, Unit
 
 Box = tuple[float, float, float, float, float, float]
 
 
-class SurfaceOptions(BaseModel):
-    """Settings of :func:`octasplat.engine.surface.extract.extract_surface`.
+def _read_box(value: object) -> object:
+    """Return the six numbers of a text with commas between them; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    try:
+        numbers = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 6:
+        raise ValueError(f"{value!r} is not six numbers x0,y0,z0,x1,y1,z1")
+    return numbers
 
-    Attributes:
-        unbounded: reach to infinity by fusing in contracted space instead of a box.
-        bounds: the box (x0, y0, z0, x1, y1, z1) to fuse in, world units; None takes the region that the
-            cameras stand around.
-        voxel: side of a voxel, world units (at the centre where ``unbounded``); None follows ``resolution``.
-        resolution: voxels along the longest side of the region; None takes 512, or fewer where a voxel would
-            be smaller than one and a half pixels of the depth maps.
-        truncation: half width of the band around the surface in which distances are kept, in voxels; None
-            takes 3 % of the cameras' distance, which is about what trained depths are off by, and at least 4.
-        depth_trunc: depths beyond this do not count, world units; None keeps all.
-        depth: which depth is fused, the median (where half of the light is gone) or the expected one.
-        depth_side: longer side of the depth maps, px.
-        min_alpha: pixels that the scene covers less than this have no depth.
-        min_weight: weight that a voxel must have collected to count; a view that looks straight onto the
-            surface gives 1.
-        unseen: what space near the surface is that no view saw: ``open`` leaves holes at its border,
-            ``solid`` closes the mesh there.
-        backdrop: put a sphere around everything that shows what the scene shows in the mesh's gaps.
-        keep_components: how many connected parts to keep, largest first; None goes by ``min_component``.
-        min_component: parts with less than this share of the largest part's area are removed.
-        fill_holes: holes whose rim is shorter than this many voxels are closed; None closes all, 0 none.
-        max_triangles: decimate to at most this many; None keeps all.
-        settle: move vertices along their normals to where the pictures agree.
-        fit: of all colours, those with which the mesh looks as like the pictures as it can.
-        texture_side: bake colours into a square texture of this side, px; None bakes them into the vertices.
-        max_memory_gb: refuse a volume that takes more, GB.
-    """
+
+def _read_rim(value: object) -> object:
+    """Return a number of voxels, or ``all``."""
+    if value == "all":
+        return value
+    number: Any = value
+    try:
+        number = float(number)
+    except (TypeError, ValueError):
+        number = -1.0
+    if not number >= 0:
+        raise ValueError(f"{value!r} is neither a number of voxels nor 'all'")
+    return number
+
+
+class ExtractionOptions(BaseModel):
+    """Settings of :func:`octasplat.engine.surface.extract.extract_levels`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    unbounded: bool = False
-    bounds: Box | None = None
-    voxel: float | None = Field(None, gt=0)
-    resolution: int | None = Field(None, ge=16, le=4096)
-    truncation: float | None = Field(None, ge=2, le=128)
-    depth_trunc: float | None = Field(None, gt=0)
-    depth: Literal["median", "expected"] = "median"
-    depth_side: int = Field(640, ge=16, le=8192)
-    min_alpha: float = Field(0.5, ge=0.5, lt=1)
-    min_weight: float = Field(0.5, gt=0)
-    unseen: Literal["open", "solid"] = "open"
-    backdrop: bool = False
-    keep_components: int | None = Field(None, ge=1)
-    min_component: float = Field(0.01, ge=0, le=1)
-    fill_holes: float | None = Field(0.0, ge=0)
-    max_triangles: int | None = Field(None, ge=4)
-    settle: bool = False
-    fit: bool = True
-    texture_side: int | None = Field(None, ge=64, le=16384)
-    max_memory_gb: float = Field(4.0, gt=0)
+    unbounded: bool = Field(
+        False, description="Reach to the horizon, with ever coarser voxels, instead of meshing a box."
+    )
+    bounds: Annotated[
+        Box | None,
+        Spelling(metavar="X0,Y0,Z0,X1,Y1,Z1"),
+        BeforeValidator(_read_box, json_schema_input_type=Box | str | None),
+    ] = Field(
+        None,
+        description="The box to mesh, in scene units; octasplat info tells where the scene lies.  "
+        "[default: what is seen of the space that the cameras surround]",
+    )
+    voxel: Annotated[float | None, Unit("scene units")] = Field(
+        None,
+        gt=0,
+        description="Side of a voxel, in scene units, at the centre where unbounded.  "
+        "[default: as resolution says]",
+    )
+    resolution: int | None = Field(
+        None,
+        ge=16,
+        le=4096,
+        description="Voxels along the longest side of the box.  [default: 512, or fewer where a voxel would "
+        "be smaller than one and a half pixels of the depth maps]",
+    )
+    truncation: Annotated[float | None, Unit("voxels"), Spelling(metavar="VOXELS")] = Field(
+        None,
+        ge=2,
+        le=128,
+        description="Half width of the band around the surface in which distances are kept.  "
+        "[default: 3% of the cameras' distance, about what trained depths are off by, and at least 4]",
+    )
+    depth_trunc: Annotated[float | None, Unit("scene units")] = Field(
+        None, gt=0, description="Ignore depths beyond this, in scene units.  [default: none]"
+    )
+    depth: Literal["median", "expected"] = Field(
+        "median",
+        description="Which depth is fused: the median, where half of the light is gone, or the expected one.",
+    )
+    depth_side: Annotated[int, Unit("px"), Spelling(metavar="PX")] = Field(
+        640, ge=16, le=8192, description="Longer side of the depth maps."
+    )
+    min_alpha: Annotated[float, Group("advanced")] = Field(
+        0.5, ge=0.5, lt=1, description="Pixels that the scene covers less than this have no depth."
+    )
+    min_weight: float = Field(
+        0.5,
+        gt=0,
+        description="Least evidence for a voxel; a view that looks straight onto the surface gives 1.",
+    )
+    unseen: Literal["open", "solid"] = Field(
+        "open",
+        description="Space near the surface that no view saw: open leaves holes there, solid closes the "
+        "mesh.",
+    )
+    backdrop: bool = Field(
+        False,
+        description="A sphere around everything that shows what the scene shows in the gaps of the mesh.",
+    )
+    settle: bool = Field(
+        False, description="Move vertices along their normals to where the pictures agree, before colours."
+    )
+    keep_components: Annotated[int | None, Spelling(("--components",))] = Field(
+        None,
+        ge=1,
+        description="Keep so many connected parts only, largest first.  [default: by min_component]",
+    )
+    min_component: float = Field(
+        0.01, ge=0, le=1, description="Remove parts of less than this share of the largest part's area."
+    )
+    fill_holes: Annotated[
+        Literal["all"] | float,
+        Unit("voxels"),
+        Spelling(metavar="VOXELS"),
+        BeforeValidator(_read_rim, json_schema_input_type=Literal["all"] | float),
+    ] = Field(0.0, description="Close holes with rims shorter than so many voxels; or 'all'.")
+    fit: Annotated[bool, Group("advanced")] = Field(
+        True,
+        description="Of all colours, take those with which the mesh looks as like the pictures as it can.",
+    )
+    texture_side: Annotated[int | None, Unit("px"), Spelling(("--texture",), metavar="PX")] = Field(
+        None,
+        ge=64,
+        le=16384,
+        description="Colours in a square texture of this side instead of in the vertices; .glb and .obj.",
+    )
+    max_memory_gb: Annotated[float, Unit("GB"), Spelling(("--max-memory",), metavar="GB")] = Field(
+        4.0, gt=0, description="Refuse a volume that takes more memory than this."
+    )
 
     @model_validator(mode="after")
-    def _consistent(self) -> "SurfaceOptions":
+    def _consistent(self) -> "ExtractionOptions":
         if self.unbounded and self.bounds is not None:
             raise ValueError("bounds and unbounded contradict each other")
         if self.bounds is not None and not all(

@@ -10,7 +10,7 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.render.cameras import RenderCamera
 from octasplat.engine.render.paths import fit_turntable
 from octasplat.engine.surface.depth import DepthMaps
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 
 BLOCK = 8
 """Voxels along a side of a block."""
@@ -75,7 +75,7 @@ class Region:
         return self.centre_world + self.radius * np.where(length > 1.0, stretch, 1.0) * at
 
 
-def choose_region(maps: DepthMaps, options: SurfaceOptions) -> Region:
+def choose_region(maps: DepthMaps, options: ExtractionOptions) -> Region:
     """The region that the options ask for, or what is seen of the space that the cameras stand around.
 
     That space is a cube around the point nearest to all viewing axes, as far to each side as the cameras are
@@ -151,7 +151,7 @@ def _grid(
     high: Float64[np.ndarray, "3"],
     distance: float,
     pixel: float,
-    options: SurfaceOptions,
+    options: ExtractionOptions,
 ) -> Region:
     """The grid over a box that is seen from a distance, where a pixel is ``pixel`` wide."""
     side = float((high - low).max())

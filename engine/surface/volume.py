@@ -15,7 +15,7 @@ from octasplat.engine.surface.kernels_volume import (
     mark_blocks,
     tile_ranges,
 )
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.region import NOTHING_SEEN, Region
 
 BYTES_PER_BLOCK = VOXELS * (4 + 4 + 4 + 1)
@@ -44,7 +44,7 @@ class Volume:
 def fuse(
     maps: DepthMaps,
     region: Region,
-    options: SurfaceOptions,
+    options: ExtractionOptions,
     progress: Progress = lambda _done, _total: None,
 ) -> Volume:
     """Fuse depth maps into a volume (Curless and Levoy 1996).
@@ -102,7 +102,7 @@ def _lenses(maps: DepthMaps) -> list[tuple[float, float, float, float, np.ndarra
     ]
 
 
-def _check_size(count: int, options: SurfaceOptions) -> None:
+def _check_size(count: int, options: ExtractionOptions) -> None:
     if count == 0:
         raise ConfigError(NOTHING_SEEN)
     need_gb = count * BYTES_PER_BLOCK / 1e9

@@ -82,7 +82,8 @@ def test_octagons_are_lit_where_asked(shiny, octasplat, tmp_path):
     assert result.exit_code == 1 and "plain.ply has no materials" in result.output
     result = octasplat("export", shiny, tmp_path / "b.ply", "--materials")
     assert result.exit_code == 2 and "--materials is for octagon GLB" in result.output
-    for command in (("export", shiny, tmp_path / "b.glb"), ("surface", shiny, "-o", tmp_path / "b.glb")):
-        result = octasplat(*command, "--up", "z")
-        assert result.exit_code == 2 and "--up goes with --materials" in result.output
+    result = octasplat("export", shiny, tmp_path / "b.glb", "--up", "z")
+    assert result.exit_code == 2 and "--up goes with --materials" in result.output
+    result = octasplat("surface", shiny, "-o", tmp_path / "b.glb", "--up", "z")
+    assert result.exit_code == 1 and "--up: goes with materials" in result.output
     assert [path.name for path in tmp_path.iterdir()] == ["a.glb"]

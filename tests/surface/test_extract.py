@@ -14,9 +14,9 @@ from octasplat.engine.events import StageFinished
 from octasplat.engine.files import write_surface
 from octasplat.engine.render.images import read_image
 from octasplat.engine.surface.cameras import cameras_around
-from octasplat.engine.surface.extract import ExtractedSurface, extract_surface
+from octasplat.engine.surface.extract import ExtractedSurface, extract_levels
 from octasplat.engine.surface.mesh import TriangleMesh, edge_report
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
@@ -29,9 +29,11 @@ def tracer(ball) -> CpuTracer:
     return made
 
 
-def extracted(tracer, tmp_path: Path, **settings) -> ExtractedSurface:
-    options = SurfaceOptions(**{"resolution": 64, "depth_side": 96, **settings})
-    return extract_surface(tracer, cameras_on_sphere(30, 3.0, 96), options, scratch=tmp_path)
+def extracted(tracer, tmp_path: Path, triangles: int | None = None, **settings) -> ExtractedSurface:
+    options = ExtractionOptions(**{"resolution": 64, "depth_side": 96, **settings})
+    cameras = cameras_on_sphere(30, 3.0, 96)
+    (surface,) = extract_levels(tracer, cameras, options, (triangles,), scratch=tmp_path)
+    return surface
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +43,7 @@ def surface(tracer, tmp_path_factory) -> ExtractedSurface:
 
 @pytest.fixture(scope="module")
 def textured(tracer, tmp_path_factory) -> TriangleMesh:
-    return extracted(tracer, tmp_path_factory.mktemp("scratch"), max_triangles=2000, texture_side=256).mesh
+    return extracted(tracer, tmp_path_factory.mktemp("scratch"), triangles=2000, texture_side=256).mesh
 
 
 def test_ball_comes_out_closed_round_and_in_its_colours(surface):
@@ -133,16 +135,16 @@ def test_files_that_cannot_be(surface, textured, tmp_path):
 
 
 def test_stages_are_told_and_stopping_leaves_nothing(tracer, tmp_path):
-    options = SurfaceOptions(resolution=32, depth_side=32)
+    options = ExtractionOptions(resolution=32, depth_side=32)
     cameras = cameras_on_sphere(12, 3.0, 32)
     heard = []
-    extract_surface(tracer, cameras, options, scratch=tmp_path, listener=heard.append)
+    extract_levels(tracer, cameras, options, scratch=tmp_path, listener=heard.append)
     finished = [event.stage for event in heard if isinstance(event, StageFinished)]
     assert finished == ["depth", "fusing", "meshing", "colouring", "fitting"]
     for stop_at in range(1, 40, 9):
         asked = iter(range(1000))
         with pytest.raises(Cancelled):
-            extract_surface(
+            extract_levels(
                 tracer,
                 cameras,
                 options,
@@ -154,14 +156,15 @@ def test_stages_are_told_and_stopping_leaves_nothing(tracer, tmp_path):
 
 def test_cameras_around_see_the_whole_ball(ball, tracer, tmp_path):
     cameras = cameras_around(ball, 64, count=40)
-    options = SurfaceOptions(resolution=48, depth_side=64)
-    mesh = extract_surface(tracer, cameras, options, scratch=tmp_path).mesh
+    options = ExtractionOptions(resolution=48, depth_side=64)
+    (extracted,) = extract_levels(tracer, cameras, options, scratch=tmp_path)
+    mesh = extracted.mesh
     assert edge_report(mesh.faces).watertight
     assert np.abs(np.linalg.norm(mesh.vertices_world, axis=1) - 1).max() < 0.04
 
 
 def test_contradicting_options():
     with pytest.raises(ValueError, match="contradict"):
-        SurfaceOptions(unbounded=True, bounds=(0, 0, 0, 1, 1, 1))
+        ExtractionOptions(unbounded=True, bounds=(0, 0, 0, 1, 1, 1))
     with pytest.raises(ValueError, match="x0 < x1"):
-        SurfaceOptions(bounds=(0, 0, 0, 1, -1, 1))
+        ExtractionOptions(bounds=(0, 0, 0, 1, -1, 1))

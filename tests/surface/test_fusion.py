@@ -8,7 +8,7 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.surface.depth import DepthMaps
 from octasplat.engine.surface.marching import surface_of
 from octasplat.engine.surface.mesh import edge_report
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.region import choose_region, focus
 from octasplat.engine.surface.volume import fuse
 
@@ -24,7 +24,7 @@ def sphere_maps(
 
 
 def mesh_of(maps, **settings):
-    options = SurfaceOptions(**settings)
+    options = ExtractionOptions(**settings)
     region = choose_region(maps, options)
     return surface_of(fuse(maps, region, options), options.min_weight), region
 
@@ -46,15 +46,15 @@ def test_region_is_what_the_cameras_surround():
 
 def test_region_is_what_is_seen_between_the_cameras():
     maps = sphere_maps()
-    region = choose_region(maps, SurfaceOptions(resolution=64))
+    region = choose_region(maps, ExtractionOptions(resolution=64))
     np.testing.assert_allclose(region.low, -1.1, atol=0.02)  # the ball and a margin
     assert region.voxel == pytest.approx(2.2 / 64, rel=0.02)
     assert region.truncation == pytest.approx(0.03 * 3 / region.voxel, abs=1e-3) or region.truncation == 4
-    coarse = choose_region(maps, SurfaceOptions())
+    coarse = choose_region(maps, ExtractionOptions())
     assert coarse.voxel == pytest.approx(1.5 * 3 / maps.cameras[0].fx_px)
     behind = DepthMaps(maps.cameras, tuple(d + 10 for d in maps.distances), maps.cosines)
     with pytest.raises(ConfigError, match="No surface"):
-        choose_region(behind, SurfaceOptions())
+        choose_region(behind, ExtractionOptions())
 
 
 def test_box_and_voxel_are_kept():

@@ -17,11 +17,11 @@ from octasplat.engine.scene.generated.arrangement import TABLE_RADIUS, still_lif
 from octasplat.engine.surface.cameras import photograph_cameras
 from octasplat.engine.surface.compare import SurfaceScore, distances_to_surface, sample_surface, score
 from octasplat.engine.surface.depth import DepthMaps
-from octasplat.engine.surface.extract import extract_surface
+from octasplat.engine.surface.extract import extract_levels
 from octasplat.engine.surface.marching import surface_of
 from octasplat.engine.surface.mesh import TriangleMesh, edge_report
 from octasplat.engine.surface.occlusion import Occluder
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.region import choose_region
 from octasplat.engine.surface.volume import fuse
 from octasplat.engine.trace.cpu.tracer import CpuTracer
@@ -77,7 +77,7 @@ def test_true_depth_gives_the_true_surface(tmp_path):
         along = directions @ camera.rotation_cam_from_world[2]
         distances.append((depth_cam / along).astype(np.float32))
         cosines.append(np.abs((normals * directions).sum(axis=-1)).astype(np.float32))
-    options = SurfaceOptions(resolution=320)
+    options = ExtractionOptions(resolution=320)
     maps = DepthMaps(cameras, tuple(distances), tuple(cosines))
     mesh = surface_of(fuse(maps, choose_region(maps, options), options), options.min_weight)
     result = scored(mesh, cameras, 0.01)
@@ -101,9 +101,9 @@ def test_reconstruction_comes_near_the_truth(tmp_path):
     gaussians, _ = read_gaussian_ply(run / SCENE)
     tracer = CpuTracer()
     tracer.build(gaussians)
-    options = SurfaceOptions(resolution=256)
+    options = ExtractionOptions(resolution=256)
     median, expected = (
-        extract_surface(tracer, cameras, options.model_copy(update={"depth": depth}), scratch=tmp_path).mesh
+        extract_levels(tracer, cameras, options.model_copy(update={"depth": depth}), scratch=tmp_path)[0].mesh
         for depth in ("median", "expected")
     )
     result = scored(median, cameras, 0.02)

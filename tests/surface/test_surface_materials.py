@@ -11,10 +11,10 @@ from octasplat.engine.colour import linear_to_srgb
 from octasplat.engine.files import read_mesh, write_surface
 from octasplat.engine.files.gltf import GlbFile
 from octasplat.engine.shading.environment_frame import environment_frame
-from octasplat.engine.surface.extract import extract_surface
+from octasplat.engine.surface.extract import extract_levels
 from octasplat.engine.surface.materials import material_features, with_materials
 from octasplat.engine.surface.mesh import TriangleMesh
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.surface.tangents import vertex_tangents
 from octasplat.engine.surface.texture import TextureLayout
 from octasplat.engine.trace.cpu.tracer import CpuTracer
@@ -34,11 +34,12 @@ def surface(ball, tmp_path_factory) -> TriangleMesh:
     )
     tracer = CpuTracer(threads=1)
     tracer.build(scene, material_features(scene))
-    options = SurfaceOptions(resolution=64, depth_side=96, max_triangles=1500, texture_side=SIDE)
-    return extract_surface(
-        tracer, cameras_on_sphere(30, 3.0, 96), options,
+    options = ExtractionOptions(resolution=64, depth_side=96, texture_side=SIDE)
+    (extracted,) = extract_levels(
+        tracer, cameras_on_sphere(30, 3.0, 96), options, (1500,),
         scratch=tmp_path_factory.mktemp("scratch"), light_frame=environment_frame(np.array(UP)),
-    ).mesh  # fmt: skip
+    )  # fmt: skip
+    return extracted.mesh
 
 
 def at_middles(mesh: TriangleMesh, image: np.ndarray) -> np.ndarray:

@@ -20,10 +20,10 @@ from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.render.paths import look_at
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.surface.cameras import cameras_around
-from octasplat.engine.surface.extract import extract_surface
+from octasplat.engine.surface.extract import extract_levels
 from octasplat.engine.surface.materials import material_features
 from octasplat.engine.surface.mesh import TriangleMesh
-from octasplat.engine.surface.options import SurfaceOptions
+from octasplat.engine.surface.options import ExtractionOptions
 from octasplat.engine.trace.cpu.tracer import CpuTracer
 from octasplat.engine.trace.protocol import TraceSettings
 
@@ -63,11 +63,12 @@ def surface(tmp_path_factory: pytest.TempPathFactory) -> TriangleMesh:
     scene = egg()
     tracer = CpuTracer(threads=2)
     tracer.build(scene, material_features(scene))
-    options = SurfaceOptions(resolution=64, depth_side=128, max_triangles=3000, texture_side=256)
-    return extract_surface(
-        tracer, cameras_around(scene, 128, 40), options,
+    options = ExtractionOptions(resolution=64, depth_side=128, texture_side=256)
+    (extracted,) = extract_levels(
+        tracer, cameras_around(scene, 128, 40), options, (3000,),
         scratch=tmp_path_factory.mktemp("scratch"), light_frame=FRAME,
-    ).mesh  # fmt: skip
+    )  # fmt: skip
+    return extracted.mesh
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,7 @@ from octasplat.workers.work.kinds.options import (
     resolve_reconstruction,
     revise_reconstruction,
 )
+from octasplat.workers.work.kinds.surface import Surface
 from octasplat.workers.work.kinds.table import JobKind, register
 from octasplat.workers.work.task import Task
 
@@ -183,7 +184,7 @@ class Relight(JobKind[RelightJobOptions]):
 class Material(OperationKind):
     """Other materials."""
 
-    def places(self, task: Task, options: Options) -> dict[str, Path]:
+    def places(self, task: Task, options: Any) -> dict[str, Path]:
         """Return the run, and the folder of the run that comes of it, which is published file by file."""
         return {"source": task.run, "output": task.folder / "changed"}
 
@@ -249,4 +250,5 @@ def register_all() -> None:
             source_files=(_LIGHT, *_RUN_FILES, "edits.json"),
         )
     )
+    register(Surface())
     register(OperationKind(CROP, stages=("edit",)))

@@ -19,6 +19,7 @@ class OperationKind(JobKind[Any]):
     Args:
         operation: what it does.
         title: one line for people; None takes that of the operation.
+        options: class of its options, where a job has more than the operation.
         stages: names of its stages.
         source_files: results of the source job that it reads.
         output: name of the file or folder, among the results, that the request calls its output.
@@ -31,6 +32,7 @@ class OperationKind(JobKind[Any]):
         operation: Operation[Any, Any],
         *,
         title: str | None = None,
+        options: type[Options] | None = None,
         stages: Sequence[str],
         source_files: Sequence[str] = (SCENE_FILE, "config.json"),
         output: str = SCENE_FILE,
@@ -42,13 +44,13 @@ class OperationKind(JobKind[Any]):
             name=operation.name,
             title=title or operation.title.removesuffix("."),
             needs=needs,
-            options=operation.options,
+            options=options or operation.options,
             program=program,
             stages=stages,
             source_files=source_files,
         )
         self.operation = operation
-        self.takes_files = takes_files(operation.options)
+        self.takes_files = takes_files(self.options)
         self.tells_stages = tells_stages
         self._output = output
 
@@ -64,10 +66,11 @@ class OperationKind(JobKind[Any]):
         """
         options = self.resolve(task.options)
         values = map_named_files(options, lambda path: task.files / check_name(path.as_posix()))
-        request: Request = self.operation.request.model_validate({**values, **self.places(task, options)})
+        known = {name: value for name, value in values.items() if name in self.operation.request.model_fields}
+        request: Request = self.operation.request.model_validate({**known, **self.places(task, options)})
         return request
 
-    def places(self, task: Task, options: Options) -> dict[str, Path]:
+    def places(self, task: Task, options: Any) -> dict[str, Path]:
         """Return where a job reads and writes, by the names of the request."""
         places = {"source": task.source, "output": task.results / self._output}
         if task.scene is not None and "dataset" in self.operation.request.model_fields:

@@ -1,0 +1,101 @@
+"""What ``surface`` looks from and at: cameras, and the photographs of a run."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from octasplat.engine.colour import to_bytes
+from octasplat.engine.config import read_config
+from octasplat.engine.errors import DatasetError, OutputError
+from octasplat.engine.events import Listener
+from octasplat.engine.files import read_facts
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.rays import ImageRays
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.run_folder import (
+    CONFIG,
+    found_model,
+    is_run,
+    open_photographs,
+    photographs_folder,
+    run_exposures,
+    run_near_world,
+    run_viewpoints,
+)
+from octasplat.engine.scene import Dataset, load_scene
+from octasplat.engine.shading.exposure import Exposures
+from octasplat.engine.surface.cameras import cameras_around, photograph_cameras
+from octasplat.engine.surface.fitting import Picture
+from octasplat.engine.trace.protocol import TraceSettings
+
+
+def camera_views(
+    source: Path, dataset: Path | None, gaussians: FlatGaussians, side_px: int
+) -> tuple[tuple[RenderCamera, ...], TraceSettings]:
+    """Return the cameras to render depth from, and the settings of the tracer.
+
+    Args:
+        source: the folder of a run, or a file of Gaussians.
+        dataset: a folder of photographs whose cameras to take; None takes those that a run keeps, or for a
+            file cameras all around.
+        gaussians: the scene.
+        side_px: longer side of the views.
+
+    Raises:
+        ConfigError: the run's settings cannot be read.
+        DatasetError: the photographs cannot be used.
+    """
+    if is_run(source) and (source / CONFIG).exists():
+        seen = run_viewpoints(source, scene=dataset)
+        settings = read_config(source / CONFIG).train.trace
+        near_world = run_near_world(source, seen)
+        return photograph_cameras(seen, seen.train_indices, side_px, near_world), settings
+    facts = read_facts(source)
+    settings = TraceSettings(turned_beyond=facts.turned_beyond)
+    if dataset is not None:
+        photographs = load_scene(dataset)
+        every = np.arange(len(photographs.views))
+        return photograph_cameras(photographs, every, side_px, facts.near_world), settings
+    return cameras_around(gaussians, side_px), settings
+
+
+def training_photographs(
+    source: Path, dataset: Path | None, threads: int, listener: Listener
+) -> tuple[Picture, ...]:
+    """Return the training photographs of a run, all as exposed as the scene.
+
+    Args:
+        source: the folder of a run, or a file of Gaussians, which has none.
+        dataset: the folder of the photographs; None takes the one that the run was made from.
+        threads: for decoding; 0 takes all cores.
+        listener: hears the progress.
+
+    Returns:
+        None of them where they are not on this machine, or show reflections that the surface does not.
+    """
+    if not (is_run(source) and (source / CONFIG).exists()):
+        return ()
+    config = read_config(source / CONFIG)
+    if config.train.materials.learn:
+        return ()
+    try:
+        folder, model = photographs_folder(source, dataset), found_model(source)
+        opened = open_photographs(folder, source, config, threads, listener, model_folder=model)
+    except (DatasetError, OutputError):
+        return ()
+    exposures = None
+    if (known := run_exposures(source)) is not None:
+        exposures = Exposures.known([view.name for view in opened.views], known)
+    return tuple(partial(_photograph, opened, exposures, index) for index in opened.train_indices.tolist())
+
+
+def _photograph(
+    dataset: Dataset, exposures: Exposures | None, index: int
+) -> tuple[ImageRays, UInt8[np.ndarray, "h w 4"]]:
+    rgb, alpha, weight = dataset.view_image(index)
+    if exposures is not None:
+        rgb = exposures.undone(rgb, index)
+    solid = (alpha * weight)[..., None]
+    return dataset.view_rays(index), to_bytes(np.concatenate([rgb * solid, solid], axis=2))

@@ -1,0 +1,129 @@
+"""A job of the kind ``surface``: the bytes of the command, and options as they are asked for and kept."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from octasplat.engine.operations.base import first_complaint
+from octasplat.engine.operations.surface import MATERIAL_DEFAULTS, ROOM, SurfaceRequest
+from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.work.programs import run_operation
+from octasplat.workers.work.task import Task
+
+SURFACE = kind_named("surface")
+
+
+def results_of(run: Path, attempt: Path, options: dict[str, object], **task: object) -> Path:
+    """The results of a job that works on what a run publishes."""
+    (attempt / "run").mkdir(parents=True)
+    for name in SURFACE.source_files:
+        if (run / name).exists():
+            shutil.copy(run / name, attempt / "run" / name)
+    config = json.loads((run / "config.json").read_text())
+    (attempt / "run" / "config.json").write_text(json.dumps({**config, "scene": "a thing"}))
+    dumped = SURFACE.resolve(options).model_dump(mode="json")
+    run_operation(Task(attempt, json.loads(json.dumps(dumped)), threads=1, kind="surface", **task))
+    return attempt / "results"
+
+
+def test_job_with_photographs_gives_the_bytes_of_the_command(run, octasplat, tmp_path):
+    done = octasplat(
+        "surface", run.output, "-o", tmp_path / "surface.obj", "--resolution", 48, "--depth-side", 48,
+        "--min-component", 0, "--texture", 64, "--max-triangles", "0.3k,100", "--threads", 1,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    options = {
+        "resolution": 48, "depth_side": 48, "min_component": 0, "texture_side": 64,
+        "max_triangles": ["0.3k", 100], "format": "obj",
+    }  # fmt: skip
+    results = results_of(run.output, tmp_path / "attempt", options, scene=run.scene)
+    names = sorted(path.name for path in results.iterdir())
+    assert names == sorted(
+        f"surface_{level}.{end}" for level in ("0.3k", "100") for end in ("mtl", "obj", "png")
+    )
+    for name in names:
+        assert (results / name).read_bytes() == (tmp_path / name).read_bytes(), name
+
+
+def test_job_without_photographs_takes_colours_from_the_scene(run, octasplat, tmp_path):
+    few = ("--resolution", 32, "--depth-side", 32, "--threads", 1)
+    copy = shutil.copytree(run.output, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+    config = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**config, "scene": "a thing"}))
+    assert octasplat("surface", copy, "-o", tmp_path / "a.glb", *few).exit_code == 0
+    heard = []
+    options = {"resolution": 32, "depth_side": 32}
+    results = results_of(run.output, tmp_path / "attempt", options, listener=heard.append)
+    assert (results / "surface.glb").read_bytes() == (tmp_path / "a.glb").read_bytes()
+    assert any(getattr(event, "message", "").endswith(" MB).") for event in heard)
+    assert str(tmp_path) not in "".join(getattr(event, "message", "") for event in heard)
+
+
+def test_materials_bring_their_light(shiny_run, octasplat, tmp_path):
+    few = ("--resolution", 32, "--depth-side", 32, "--texture", 64, "--max-triangles", 300, "--threads", 1)
+    assert octasplat("surface", shiny_run, "--materials", "-o", tmp_path / "a.glb", *few).exit_code == 0
+    options = {
+        "materials": True, "resolution": 32, "depth_side": 32, "texture_side": 64, "max_triangles": 300,
+    }  # fmt: skip
+    results = results_of(shiny_run, tmp_path / "attempt", options)
+    assert sorted(path.name for path in results.iterdir()) == ["environment.hdr", "surface.glb"]
+    assert (results / "surface.glb").read_bytes() == (tmp_path / "a.glb").read_bytes()
+    assert (results / "environment.hdr").read_bytes() == (shiny_run / "environment.hdr").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "flag", "text", "value"),
+    [
+        ("bounds", "--bounds", "1,2,3", [1, 2, 3, 4, 5, 6.5]),
+        ("fill_holes", "--fill-holes", "some", "all"),
+        ("fill_holes", "--fill-holes", "-1", 3.5),
+        ("max_triangles", "--max-triangles", "5q", ["5k", "60000"]),
+        ("max_triangles", "--max-triangles", "3", ["4"]),
+        ("max_triangles", "--max-triangles", "5k,5000", []),
+    ],
+)
+def test_texts_are_read_alike_by_command_and_job(octasplat, tmp_path, name, flag, text, value):
+    with pytest.raises(ValidationError) as refused:
+        SURFACE.resolve({name: text})
+    sentence = first_complaint(refused.value).removeprefix(f"{name}: ")
+    done = octasplat("surface", tmp_path / "none.ply", "-o", tmp_path / "a.glb", flag, text)
+    assert done.exit_code == 2 and f"Invalid value for '{flag}': {sentence}" in done.output
+    joined = ",".join(map(str, value)) if isinstance(value, list) else str(value)
+    as_text, as_json = SURFACE.resolve({name: joined} if joined else {}), SURFACE.resolve({name: value})
+    assert as_text == as_json == SURFACE.resolve(as_json.model_dump(mode="json"))
+
+
+def test_presets_decide_what_is_left_open():
+    room = SURFACE.resolve({"room": True, "resolution": 99, "unseen": "open"})
+    decided = {name: getattr(room, name) for name in ROOM}
+    assert decided == {**ROOM, "resolution": 99, "unseen": "open"}
+    lit = SURFACE.resolve({"materials": True, "max_triangles": "5k"})
+    assert lit.texture_side == MATERIAL_DEFAULTS["texture_side"] and dict(lit.levels) == {"5k": 5000}
+    plain = SURFACE.revised(room.model_dump(mode="json"), {"room": False})
+    assert plain == SURFACE.resolve({"resolution": 99})
+    request = SurfaceRequest(source="a.ply", output="b.glb", room=True, max_triangles=("5k", "60000"))
+    assert request.settle and [path.name for path in request.outputs] == ["b_5k.glb", "b_60000.glb"]
+
+
+def test_photographs_are_asked_for_where_colours_are_fitted():
+    for options, needed in (({}, True), ({"fit": False}, False), ({"materials": True}, False)):
+        assert SURFACE.needs_photographs(SURFACE.resolve(options)) is needed
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"format": "ply", "texture_side": 128}, "a PLY holds no texture"),
+        ({"format": "obj", "materials": True}, "materials are written as .glb"),
+        ({"up": "z"}, "up: goes with materials"),
+        ({"unbounded": True, "bounds": "0,0,0,1,1,1"}, "contradict"),
+        ({"bounds": "0,0,0,1,1,0"}, "z0 < z1"),
+    ],
+)
+def test_what_contradicts_is_refused(options, told):
+    with pytest.raises(ValidationError) as refused:
+        SURFACE.resolve(options)
+    assert told in first_complaint(refused.value)

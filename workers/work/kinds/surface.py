@@ -1,0 +1,78 @@
+"""The kind ``surface``: a mesh of the scene of a reconstruction."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.files import check_surface_path
+from octasplat.engine.operations.base import Options
+from octasplat.engine.operations.surface import OPERATION, SurfaceOptions
+from octasplat.workers.work.kinds.operation_kind import OperationKind
+from octasplat.workers.work.task import Task
+
+_PRESETS = ("room", "materials")
+"""Options that decide what others are where nothing is said of these."""
+
+
+class SurfaceJobOptions(SurfaceOptions):
+    """Options of ``surface``: how the surface is meshed and coloured, and in which format."""
+
+    format: Literal["glb", "ply", "obj"] = Field(
+        "glb", description="Format of the mesh, which is surface.glb, .ply or .obj among the results."
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> "SurfaceJobOptions":
+        try:
+            check_surface_path(
+                Path(f"surface.{self.format}"), textured=self.texture_side is not None, lit=self.materials
+            )
+        except ConfigError as error:
+            raise ValueError(str(error).removesuffix(".")) from None
+        return self
+
+
+class Surface(OperationKind):
+    """A mesh; its colours are fitted to the photographs where they are at hand."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            OPERATION,
+            title="One coloured triangle mesh of the scene of a reconstruction",
+            options=SurfaceJobOptions,
+            stages=("depth", "fusing", "meshing"),
+            source_files=(
+                *("scene.ply", "config.json", "held_out.json", "views.json", "training.json"),
+                "environment.hdr",
+            ),
+            tells_stages=True,
+        )
+
+    def needs_photographs(self, options: SurfaceJobOptions) -> bool:
+        """Return whether colours are fitted to photographs."""
+        return options.fit and not options.materials
+
+    def stages(self, options: SurfaceJobOptions) -> tuple[str, ...]:
+        """Return the stages; colours that are fitted to photographs need not be seen in the scene first."""
+        asked = {
+            "settling": options.settle,
+            "decimating": bool(options.max_triangles),
+            "unwrapping": options.texture_side is not None,
+            "colouring": options.materials or not options.fit,
+            "fitting": options.fit and not options.materials,
+        }
+        return (*super().stages(options), *(name for name, is_asked in asked.items() if is_asked))
+
+    def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> Options:
+        """Return the options of a job with changes; what its presets decided follows those of now."""
+        presets = {name: before[name] for name in _PRESETS if name in before}
+        decided = self.resolve(presets).model_dump(mode="json")
+        kept = {name: value for name, value in before.items() if decided.get(name) != value}
+        return self.resolve({**presets, **kept, **changes})
+
+    def places(self, task: Task, options: SurfaceJobOptions) -> dict[str, Path]:
+        """Return where a job reads and writes."""
+        return {**super().places(task, options), "output": task.results / f"surface.{options.format}"}
