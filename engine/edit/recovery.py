@@ -44,6 +44,8 @@ class EditOptions(BaseModel):
             corners left, turned back, or moved as their neighbours were; ``drop``: left out.
         axes: the turn about x that brings the mesh into the scene's frame, or ``auto``.
         q: chi-square quantile that the mesh was exported with; None asks the mesh.
+        min_opacity: least opacity that the mesh was exported with; None asks the mesh, and one that does not
+            say has an octagon of every Gaussian that can have one.
         whole_octagons: octagons of which some corners moved and others did not move as those that moved if
             these are the half of them at least, and else not at all.
         max_residual: octagons further than this from an affine image, in standard deviations, are crumpled.
@@ -55,6 +57,7 @@ class EditOptions(BaseModel):
     damaged: Literal["repair", "drop"] = "repair"
     axes: Literal["auto"] | Axes = "auto"
     q: float | None = Field(default=None, gt=0.0, le=100.0)
+    min_opacity: float | None = Field(default=None, ge=0.0, lt=1.0)
     whole_octagons: bool = False
     max_residual: float = Field(default=1.0, gt=0.0)
 
@@ -154,6 +157,8 @@ def recover_edit(
     radii = octagon_radii(opacities, q)
     octagons = match_octagons(path, mesh, opacities, radii)
     file_rounding = mesh.rounding
+    asked, stated = options.min_opacity, mesh.min_opacity
+    exported = (radii > 0) & (opacities >= ((stated or 0.0) if asked is None else asked))
     del mesh  # the largest thing around, where the caller keeps it no longer
     geometry = gaussians.bare()
     report = EditReport(len(gaussians), matched_by=octagons.matched_by, axes_usual=usual_axes(path), q=q)
@@ -170,7 +175,7 @@ def recover_edit(
         octagons = octagons.nearest_first(_mean_moves(geometry, octagons, radii))
     old = geometry.select(octagons.gids)
     recovered = _recover(old, octagons, radii[octagons.gids], file_rounding, options, report)
-    result = _assemble(gaussians, old, octagons, recovered, radii, options, report)
+    result = _assemble(gaussians, old, octagons, recovered, exported, options, report)
     report.foreign_vertices = octagons.foreign_vertices
     report.ambiguous_corners = octagons.ambiguous_corners
     report.result_size = len(result)
@@ -320,7 +325,7 @@ def _assemble(
     old: FlatGaussians,
     octagons: Octagons,
     recovered: _Recovered,
-    radii: Float[np.ndarray, " n"],
+    exported: Bool[np.ndarray, " n"],
     options: EditOptions,
     report: EditReport,
 ) -> FlatGaussians:
@@ -329,10 +334,7 @@ def _assemble(
     gids = octagons.gids
     absent = np.ones(len(gaussians), dtype=bool)
     absent[gids] = False
-    # What the export left out is kept; it may also have left out those below a least opacity.
-    faintest = gaussians.opacities[gids].min() if len(gids) else 1.0
-    never = absent & ((radii <= 0) | (gaussians.opacities < faintest))
-    deleted = absent & ~never
+    never, deleted = absent & ~exported, absent & exported
     report.deleted = int(deleted.sum())
     kept = np.ones(len(octagons), dtype=bool)
     if options.damaged == "drop":

@@ -11,20 +11,18 @@ from octasplat.engine.files.options import ExportOptions
 from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
 from octasplat.engine.files.registry import Exporter, register
 from octasplat.engine.files.selection import selected
+from octasplat.engine.files.spatial import compact_order
 from octasplat.engine.gaussians.model import FLAT_SCALE, SH_C0, FlatGaussians
-
-_AXES_BITS = 10
-"""Steps along each axis of the curve that the Gaussians are sorted along, as a power of two."""
 
 
 def write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
-    """Write the Gaussians along a Morton curve; the flat axis is the first, with a deviation of 1e-5.
+    """Write the Gaussians in compact chunks; the flat axis is the first, with a deviation of 1e-5.
 
     Raises:
         SceneFileError: nothing to write, values that are not finite, or the file cannot be written.
     """
     scene = selected(gaussians, path, options)
-    scene = scene.select(np.argsort(_morton(scene.means_world.astype(np.float64)), kind="stable"))
+    scene = scene.select(compact_order(scene.means_world, CHUNK))
     count = len(scene)
     flat = np.full((count, 1), np.log(FLAT_SCALE))
     groups = {
@@ -92,17 +90,6 @@ def _rotations(scene: FlatGaussians) -> UInt32[np.ndarray, " n"]:
     small, largest = smallest_three(scene.quats_wxyz)
     packed = _word(small / (2.0 * SQRT_HALF) + 0.5, (10, 10, 10))
     return np.asarray((largest.astype(np.uint32) << np.uint32(30)) | packed)
-
-
-def _morton(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:
-    low, high = points.min(axis=0), points.max(axis=0)
-    extent = np.where(high > low, high - low, 1.0)
-    cells = np.rint((points - low) / extent * ((1 << _AXES_BITS) - 1)).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(_AXES_BITS):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return code
 
 
 register(

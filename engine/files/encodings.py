@@ -8,8 +8,17 @@ from jaxtyping import Float, Float32, Int, UInt8
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 
 SQRT_HALF = float(np.sqrt(0.5))
+MAX_SH_DEGREE = 3
+"""The highest degree of spherical harmonics that scenes have."""
 HALF_TURN_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
 """Parity of the 16 harmonics under y -> -y, z -> -z."""
+
+
+def dropped_harmonics(degree: int) -> tuple[str, ...]:
+    """Return what to tell of a file with harmonics of ``degree``, of which only degree 3 can be kept."""
+    if degree <= MAX_SH_DEGREE:
+        return ()
+    return (f"Harmonics of degree {degree} were left out; degree {MAX_SH_DEGREE} is the highest here.",)
 
 
 def sh0_from_rgb(rgb_srgb: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 1 3"]:

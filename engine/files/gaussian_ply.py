@@ -11,15 +11,19 @@ Named channels come last, ``metallic`` or ``albedo_0..2``, and a comment ``octas
 of each that it is one.
 """
 
+import functools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float32
 
 from octasplat.engine.errors import ConfigError, SceneFileError
 from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
+from octasplat.engine.files.encodings import MAX_SH_DEGREE, dropped_harmonics
 from octasplat.engine.files.octagon_reading import is_octagon_ply
 from octasplat.engine.files.options import ExportOptions
 from octasplat.engine.files.ply_container import (
@@ -37,8 +41,17 @@ from octasplat.engine.gaussians.flattening import FLAT_LOG_SCALE, GaussianCloud,
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
 
-MAX_SH_DEGREE = 3
 ROWS_AT_ONCE = 65536
+Dialect = Literal["3dgs", "2dgs", "games"]
+"""What the scales of a PLY mean.
+
+``3dgs``: the normal is the axis of the smallest of three; two are read as 2DGS writes them. ``2dgs`` (2D
+Gaussian Splatting, and gsplat's, whose third scale means nothing): the first two lie in the plane, the normal
+is axis 2. ``games`` (GaMeS, REdiSplats): the last two lie in the plane, the normal is axis 0.
+"""
+_FILTER = "filter_3D"
+"""Standard deviation (world units) of the smoothing that Mip-Splatting and Gaussian Opacity Fields apply to
+each Gaussian before they show it."""
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -127,7 +140,7 @@ def _row_blocks(gaussians: FlatGaussians, degree: int, dtype: np.dtype[np.void])
 def read_gaussian_ply(
     path: Path,
     *,
-    two_scale_normal: Literal[0, 2] = 0,
+    dialect: Dialect = "3dgs",
     drop_invalid: bool = False,
     channels: ChannelChoice = "own",
 ) -> tuple[FlatGaussians, ImportReport]:
@@ -138,8 +151,7 @@ def read_gaussian_ply(
 
     Args:
         path: the file.
-        two_scale_normal: which axis is the normal in a file with two scales: 0 as GaMeS writes it, 2 as
-            2DGS does.
+        dialect: what its scales mean.
         drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
         channels: which properties become channels beside the parameters.
 
@@ -147,16 +159,16 @@ def read_gaussian_ply(
         SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, lacks a
             property, or holds values that are not finite.
     """
-    cloud = read_ply_cloud(path, channels)
-    return flatten(cloud, path, two_scale_normal=two_scale_normal, drop_invalid=drop_invalid)
+    return flatten(read_ply_cloud(path, channels, dialect), path, drop_invalid=drop_invalid)
 
 
-def read_ply_cloud(path: Path, channels: ChannelChoice = "own") -> GaussianCloud:
+def read_ply_cloud(path: Path, channels: ChannelChoice = "own", dialect: Dialect = "3dgs") -> GaussianCloud:
     """The Gaussians of a PLY as they are in the file, found by property name.
 
     Args:
         path: the file.
         channels: which properties become channels beside the parameters.
+        dialect: what its scales mean.
 
     Raises:
         SceneFileError: the file is not a PLY, is truncated, holds compressed or no Gaussians, or lacks a
@@ -170,24 +182,65 @@ def read_ply_cloud(path: Path, channels: ChannelChoice = "own") -> GaussianCloud
         )
     if vertex is None:
         raise SceneFileError(f"{path}: has no element 'vertex', so it holds no Gaussians.")
-    rest_count, scale_count = _check_properties(path, vertex)
+    degree, scale_count = _check_properties(path, vertex)
     if vertex.count == 0:
         raise SceneFileError(f"{path}: holds no Gaussians.")
     table = read_ply(path, ["vertex"])[1]["vertex"]
-    colours = columns(table, [*_SH_DC, *(f"f_rest_{k}" for k in range(rest_count))])
-    rest = colours[:, 3:].reshape(len(table), 3, rest_count // 3).transpose(0, 2, 1)
-    found = chosen_columns(path, declared_channels(header.comments), vertex.names, channels)
+    kept = (min(degree, MAX_SH_DEGREE) + 1) ** 2 - 1
+    each = (degree + 1) ** 2 - 1
+    names = [f"f_rest_{colour * each + k}" for colour in range(3) for k in range(kept)]
+    colours = columns(table, [*_SH_DC, *names])
+    rest = colours[:, 3:].reshape(len(table), 3, kept).transpose(0, 2, 1)
+    unnamed = [name for name in vertex.names if name != _FILTER]
+    found = chosen_columns(path, declared_channels(header.comments), unnamed, channels)
     try:
         named = Channels({name: columns(table, own) for name, own in found.items()})
     except ConfigError as error:
         raise SceneFileError(f"{path}: {error}") from error
-    return GaussianCloud(
+    cloud = GaussianCloud(
         means_world=columns(table, _POSITION),
         quats_wxyz=columns(table, _ROTATION),
         log_scales=columns(table, _scale_names(scale_count)),
         opacity_logits=columns(table, ["opacity"])[:, 0],
         sh=np.ascontiguousarray(np.concatenate([colours[:, None, :3], rest], axis=1)),
+        notes=dropped_harmonics(degree),
         channels=named,
+        normal_axis=_normal_axis(dialect, scale_count),
+    )
+    if dialect == "3dgs" and scale_count == 2:
+        cloud = replace(cloud, notes=(*cloud.notes, _READ_AS_2DGS))
+    return _smoothed(cloud, columns(table, [_FILTER])[:, 0]) if _FILTER in vertex.names else cloud
+
+
+_READ_AS_2DGS = (
+    "Its Gaussians have two scales; they were read as 2DGS writes them, with the third axis as the normal. "
+    "If GaMeS or REdiSplats wrote the file, import it with --format games."
+)
+
+
+def _normal_axis(dialect: Dialect, scale_count: int) -> Literal[0, 2] | None:
+    if dialect == "games":
+        return 0
+    return 2 if dialect == "2dgs" or scale_count == 2 else None
+
+
+def _smoothed(cloud: GaussianCloud, deviations: Float32[np.ndarray, " n"]) -> GaussianCloud:
+    """Return the Gaussians as they are shown by programs that smooth each one.
+
+    Each is convolved with a Gaussian of the given standard deviation, and its opacity is lowered so that
+    the integral stays the same (Mip-Splatting, Eq. 9).
+    """
+    scales = cloud.log_scales.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        wider = 0.5 * np.logaddexp(2.0 * scales, 2.0 * np.log(np.abs(deviations.astype(np.float64)))[:, None])
+        lost = np.where(np.isfinite(scales), scales - wider, 0.0).sum(axis=1)
+        log_opacity = lost - np.logaddexp(0.0, -cloud.opacity_logits.astype(np.float64))
+        logits = log_opacity - np.log(-np.expm1(log_opacity))
+    return replace(
+        cloud,
+        log_scales=wider.astype(np.float32),
+        opacity_logits=np.where(lost == 0.0, cloud.opacity_logits, logits).astype(np.float32),
+        notes=(*cloud.notes, f"Its smoothing filter ({_FILTER}) was folded into scales and opacities."),
     )
 
 
@@ -215,7 +268,7 @@ def _scale_names(count: int) -> list[str]:
 
 
 def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
-    """Numbers of f_rest and scale properties of an element that has all it needs."""
+    """Return the degree of the harmonics and the number of scales of an element that has all it needs."""
     names = set(vertex.names)
     rest_count = sum(name.startswith("f_rest_") for name in names)
     scale_count = 3 if "scale_2" in names else 2
@@ -225,7 +278,8 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
         raise SceneFileError(
             f"{path}: is not a PLY of Gaussians; it lacks the property {', '.join(missing)}."
         )
-    if rest_count not in {len(_rest_names(degree)) for degree in range(MAX_SH_DEGREE + 1)}:
+    degree = math.isqrt(rest_count // 3 + 1) - 1
+    if rest_count != len(_rest_names(degree)):
         raise SceneFileError(
             f"{path}: has {rest_count} f_rest properties, but degrees 0 to 3 of spherical harmonics "
             "need 0, 9, 24 or 45."
@@ -241,7 +295,7 @@ def _check_properties(path: Path, vertex: PlyElement) -> tuple[int, int]:
         raise SceneFileError(
             f"{path}: property '{lists[0]}' of element 'vertex' is a list; Gaussians have scalars only."
         )
-    return rest_count, scale_count
+    return degree, scale_count
 
 
 def _write(gaussians: FlatGaussians, path: Path, options: ExportOptions) -> tuple[Path, ...]:
@@ -265,6 +319,13 @@ register(
         read_with=read_ply_cloud,
     )
 )
+_NAMED_DIALECTS: tuple[tuple[Dialect, str], ...] = (
+    ("2dgs", "Gaussians in the PLY layout of 2DGS or gsplat's 2DGS, the normal being the third axis"),
+    ("games", "Gaussians in the PLY layout of GaMeS or REdiSplats, the normal being the first axis"),
+)
+for _dialect, _what in _NAMED_DIALECTS:
+    _read = functools.partial(read_ply_cloud, dialect=_dialect)
+    register(Importer(_dialect, ("*.ply",), _what, _read, read_with=_read))
 register(
     Exporter(
         "gaussians",

@@ -6,6 +6,7 @@ readers that evaluate harmonics in world directions are right too. With untransf
 only, so that our own files keep the bits of positions and harmonics.
 """
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,8 @@ from octasplat.engine.files import gltf
 from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
 from octasplat.engine.files.encodings import (
     HALF_TURN_SIGNS,
+    MAX_SH_DEGREE,
+    dropped_harmonics,
     half_turn_points,
     half_turn_quats,
     half_turn_sh,
@@ -110,13 +113,19 @@ def _cloud(file: GlbFile, attributes: dict[str, int], splats: dict[str, Any]) ->
         log_scales=log_scales,
         opacity_logits=logits.astype(np.float32),
         sh=sh,
-        notes=notes,
+        notes=(*notes, *dropped_harmonics(_stated_degree(attributes))),
     )
+
+
+def _stated_degree(attributes: dict[str, int]) -> int:
+    """Return the highest degree of which there are coefficients."""
+    found = (re.fullmatch(rf"{EXTENSION}:SH_DEGREE_(\d+)_COEF_0", name) for name in attributes)
+    return max((int(match[1]) for match in found if match), default=0)
 
 
 def _harmonics(file: GlbFile, attributes: dict[str, int]) -> Float32[np.ndarray, "n k 3"]:
     bands: list[np.ndarray] = []
-    for degree in range(4):
+    for degree in range(MAX_SH_DEGREE + 1):
         names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{place}" for place in range(2 * degree + 1)]
         if not all(name in attributes for name in names):
             break

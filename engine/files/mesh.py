@@ -22,6 +22,7 @@ class Mesh:
         corner: corner number 0 to 7 likewise.
         radius: radius of the octagon in standard deviations likewise.
         q: chi-square quantile of the octagons, where the file still names it.
+        min_opacity: octagons were made of Gaussians at least this opaque, where the file still says so.
         rounding: how far a coordinate may be off because of the digits that the file keeps, beyond float32.
         corner_uv: of a mesh read with its looks: texture coordinates of the triangles' corners, (0, 0) at the
             upper left, NaN where there are none; None without any.
@@ -38,6 +39,7 @@ class Mesh:
     corner: Float32[np.ndarray, " v"] | None = None
     radius: Float32[np.ndarray, " v"] | None = None
     q: float | None = None
+    min_opacity: float | None = None
     rounding: float = 0.0
     corner_uv: Float32[np.ndarray, "t 3 2"] | None = None
     normals: Float32[np.ndarray, "v 3"] | None = None
@@ -54,11 +56,15 @@ def upright(uv: Float32[np.ndarray, "v 2"]) -> Float32[np.ndarray, "v 2"]:
     return uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
 
 
-def stated_q(comments: tuple[str, ...]) -> float | None:
-    """The chi-square quantile that our exporters write as a comment, or None."""
+Q_KEY = "octasplat_q"
+MIN_OPACITY_KEY = "octasplat_min_opacity"
+
+
+def stated_number(comments: tuple[str, ...], name: str) -> float | None:
+    """Return the number that our exporters write under ``name`` in a comment, or None."""
     for comment in comments:
         words = comment.split()
-        if len(words) == 2 and words[0] == "octasplat_q":
+        if len(words) == 2 and words[0] == name:
             try:
                 return float(words[1])
             except ValueError:

@@ -29,7 +29,7 @@ from octasplat.engine.errors import ConfigError, SceneFileError
 from octasplat.engine.files import gltf
 from octasplat.engine.files.glb_materials import glb_materials, texture_frame
 from octasplat.engine.files.gltf import GlbFile, channel_attributes, padded, write_glb
-from octasplat.engine.files.mesh import Mesh
+from octasplat.engine.files.mesh import MIN_OPACITY_KEY, Q_KEY, Mesh
 from octasplat.engine.files.octagon_glb_layout import OPAQUE_CUTOFF, Bounds, GlbLayout
 from octasplat.engine.files.octagon_soup import OctagonBatch, OctagonSoup
 from octasplat.engine.files.options import ExportOptions
@@ -137,7 +137,12 @@ def _mesh(file: GlbFile, *, looks: bool) -> tuple[Mesh, Int32[np.ndarray, " t"]]
                 extras[key].append(np.full((size, ATTRIBUTE_WIDTHS.get(key, 1)), np.nan, np.float32))
         count += size
     whole = {key: _joined(parts) for key, parts in extras.items()}
-    q = file.document.get("asset", {}).get("extras", {}).get("octasplat_q")
+    stated = file.document.get("asset", {}).get("extras", {})
+    numbers_stated = {
+        key: float(value)
+        for key in (Q_KEY, MIN_OPACITY_KEY)
+        if isinstance(value := stated.get(key), int | float)
+    }
     mesh = Mesh(
         np.concatenate([*vertices, np.zeros((0, 3))]),
         np.concatenate([*triangles, np.zeros((0, 3), np.int64)]),
@@ -145,7 +150,8 @@ def _mesh(file: GlbFile, *, looks: bool) -> tuple[Mesh, Int32[np.ndarray, " t"]]
         gid=_flat(whole["gid"]),
         corner=_flat(whole["corner"]),
         radius=_flat(whole["radius"]),
-        q=float(q) if isinstance(q, int | float) else None,
+        q=numbers_stated.get(Q_KEY),
+        min_opacity=numbers_stated.get(MIN_OPACITY_KEY),
         normals=whole.get("normal"),
         rgb_linear=whole.get("colour"),
     )
@@ -217,7 +223,11 @@ def _parts(
 
 def _extras(soup: OctagonSoup, options: ExportOptions, parts: int) -> list[dict[str, object]]:
     """What each file says of itself: enough for an edited mesh to find back to its Gaussians."""
-    extras: dict[str, object] = {"octasplat_q": options.q, "octasplat_gaussians": soup.scene_size}
+    extras: dict[str, object] = {
+        Q_KEY: options.q,
+        MIN_OPACITY_KEY: options.min_opacity,
+        "octasplat_gaussians": soup.scene_size,
+    }
     if options.opaque:
         extras["octasplat_opaque_cutoff"] = OPAQUE_CUTOFF
     extras |= gltf.channel_extras(soup.channel_widths)

@@ -6,6 +6,7 @@ has no opacity per vertex, so the Gaussians' own opacities are lost; the texture
 Reading is fast: whole blocks of the file are sorted by kind of line and parsed at once.
 """
 
+import codecs
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from jaxtyping import Float32, Int32, Int64
 
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files.mesh import Mesh, stated_q, upright
+from octasplat.engine.files.mesh import MIN_OPACITY_KEY, Q_KEY, Mesh, stated_number, upright
 from octasplat.engine.files.mesh_looks import MeshMaterial
 from octasplat.engine.files.obj_materials import read_mtl
 from octasplat.engine.files.octagon_soup import BATCH, OctagonBatch, OctagonSoup
@@ -35,6 +36,7 @@ NEWLINE, SPACE, TAB = 10, 32, 9  # every other white space lies below the space
 MAX_HEADER_LINES = 64
 DIGIT_LINES = 2000
 LINES_AT_ONCE = 100_000
+_INDENT = re.compile(rb"^[ \t]+", re.MULTILINE)
 MATERIAL = "octagons"
 POSITION_LINE = "v %.9g %.9g %.9g"
 COLOUR_END = " %.5g %.5g %.5g\n"
@@ -97,7 +99,8 @@ def _read(path: Path, parts: _Parts) -> Mesh:
         positions,
         triangles,
         uv=uv,
-        q=stated_q(tuple(parts.comments)),
+        q=stated_number(tuple(parts.comments), Q_KEY),
+        min_opacity=stated_number(tuple(parts.comments), MIN_OPACITY_KEY),
         rounding=rounding,
         **looks,
     )
@@ -126,7 +129,7 @@ def _looks(path: Path, parts: _Parts, count: int) -> dict[str, Any]:
 
 def _blocks(handle: IO[bytes]) -> Iterator[bytes]:
     """The file in blocks that end at the end of a line."""
-    rest = b""
+    rest = handle.read(len(codecs.BOM_UTF8)).removeprefix(codecs.BOM_UTF8)
     while chunk := handle.read(BLOCK_BYTES):
         whole, newline, tail = chunk.rpartition(b"\n")
         if newline:
@@ -145,6 +148,8 @@ def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
                 parts.comments.append(line[1:].decode("utf-8", "replace").strip())
     if b"\\\n" in block or b"\\\r\n" in block:
         block = block.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    if _INDENT.search(block):
+        block = _INDENT.sub(b"", block)
     data = np.frombuffer(block, np.uint8)
     ends = np.flatnonzero(data == NEWLINE) + 1
     starts = np.concatenate([[0], ends[:-1]])
@@ -155,6 +160,10 @@ def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
     is_uv = (first == ord("v")) & (second == ord("t")) & ((third == SPACE) | (third == TAB))
     is_face = (first == ord("f")) & blank
     lengths = ends - starts
+    # Vertices and texture coordinates before each line, from which its relative numbers count back.
+    before = np.stack(
+        [parts.vertex_count + np.cumsum(is_position), parts.uv_count + np.cumsum(is_uv)], axis=1
+    )
     if is_position.any():
         text = _lines(data, is_position, lengths)
         values = _numbers(path, text.translate(None, b"v"), int(is_position.sum()), "v")
@@ -181,7 +190,7 @@ def _take_block(path: Path, block: bytes, parts: _Parts) -> None:
         chosen = is_face.copy()
         chosen[:begin] = chosen[end:] = False
         if chosen.any():
-            _take_faces(path, _lines(data, chosen, lengths), int(chosen.sum()), parts)
+            _take_faces(path, _lines(data, chosen, lengths), before[chosen], parts)
 
 
 def _take_libraries(block: bytes, parts: _Parts) -> None:
@@ -230,8 +239,16 @@ def _ragged_numbers(path: Path, text: bytes, keyword: str) -> np.ndarray:
     return np.array([[float(word) for word in row[:width]] for row in rows])
 
 
-def _take_faces(path: Path, text: bytes, lines: int, parts: _Parts) -> None:
-    """Faces as fans of triangles, and the texture coordinates of their corners where they name some."""
+def _take_faces(path: Path, text: bytes, before: Int64[np.ndarray, "f 2"], parts: _Parts) -> None:
+    """Take faces as fans of triangles, and the texture coordinates of their corners where they name some.
+
+    Args:
+        path: named in errors.
+        text: the lines of the faces.
+        before: vertices and texture coordinates that come before each of these lines.
+        parts: gets the triangles.
+    """
+    lines = len(before)
     sample = text[: text.index(b"\n")].split()[1:]
     slashes = {word.count(b"/") for word in sample}
     spaces, words_per_line = text.count(b"/"), len(sample)
@@ -241,9 +258,9 @@ def _take_faces(path: Path, text: bytes, lines: int, parts: _Parts) -> None:
         values = _numbers(path, text.replace(b"/", b" ").translate(None, b"f"), lines, "f")
         if values.shape[1] == words_per_line * per_word and not _is_ragged(text, words_per_line + 1):
             indices = values.astype(np.int64).reshape(lines, words_per_line, per_word)
-            _add_fans(indices[:, :, 0], indices[:, :, 1] if per_word > 1 else None, parts)
+            _add_fans(indices[:, :, 0], indices[:, :, 1] if per_word > 1 else None, before, parts)
             return
-    for line in text.split(b"\n"):
+    for number, line in enumerate(text.split(b"\n")[:lines]):
         words = [word.split(b"/") for word in line.split()[1:]]
         if len(words) < 3:
             continue
@@ -253,7 +270,7 @@ def _take_faces(path: Path, text: bytes, lines: int, parts: _Parts) -> None:
             texture = np.array([[int(word[1]) for word in words]]) if named else None
         except ValueError as error:
             raise SceneFileError(f"{path}: a line 'f' holds something that is no number.") from error
-        _add_fans(vertex, texture, parts)
+        _add_fans(vertex, texture, before[number : number + 1], parts)
 
 
 def _is_ragged(text: bytes, words_per_line: int) -> bool:
@@ -267,16 +284,18 @@ def _is_ragged(text: bytes, words_per_line: int) -> bool:
     return bool((counts != words_per_line).any())
 
 
-def _add_fans(vertex: np.ndarray, texture: np.ndarray | None, parts: _Parts) -> None:
+def _add_fans(
+    vertex: np.ndarray, texture: np.ndarray | None, before: Int64[np.ndarray, "f 2"], parts: _Parts
+) -> None:
     sides = vertex.shape[1]
     fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
-    # Numbers count from 1; negative ones count back from the newest vertex.
-    positions = np.where(vertex > 0, vertex - 1, vertex + parts.vertex_count)
+    # Numbers count from 1; negative ones count back from the newest vertex before the line.
+    positions = np.where(vertex > 0, vertex - 1, vertex + before[:, :1])
     parts.triangles.append(_small(positions[:, fan].reshape(-1, 3)))
     if texture is None:
         parts.triangle_uv.append(np.full((len(vertex) * len(fan), 3), -1, np.int32))
     else:
-        places = np.where(texture > 0, texture - 1, texture + parts.uv_count)
+        places = np.where(texture > 0, texture - 1, texture + before[:, 1:])
         parts.triangle_uv.append(_small(places[:, fan].reshape(-1, 3)))
 
 
@@ -325,7 +344,8 @@ def _material(name: str) -> str:
 def _octagon_lines(soup: OctagonSoup, material_name: str) -> Iterator[str]:
     yield (
         f"# octasplat octagons: {SIDES} vertices and 6 triangles per Gaussian, in the order of the scene\n"
-        f"# octasplat_q {soup.q!r}\n# octasplat_gaussians {soup.scene_size}\n"
+        f"# {Q_KEY} {soup.q!r}\n# {MIN_OPACITY_KEY} {soup.min_opacity!r}\n"
+        f"# octasplat_gaussians {soup.scene_size}\n"
         f"mtllib {material_name}\no octagons\nusemtl {MATERIAL}\n"
     )
     for batch in soup.batches():

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int, Int64
 from octasplat.engine.colour import srgb_to_linear, to_bytes
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files.gaussian_ply import channel_comments
-from octasplat.engine.files.mesh import Mesh, stated_q, upright
+from octasplat.engine.files.mesh import MIN_OPACITY_KEY, Q_KEY, Mesh, stated_number, upright
 from octasplat.engine.files.octagon_soup import BATCH, OctagonSoup
 from octasplat.engine.files.options import ExportOptions
 from octasplat.engine.files.ply_container import (
@@ -76,7 +76,8 @@ def read(path: Path) -> Mesh:
         gid=_attribute(table, "gid"),
         corner=_attribute(table, "corner"),
         radius=_attribute(table, "radius"),
-        q=stated_q(header.comments),
+        q=stated_number(header.comments, Q_KEY),
+        min_opacity=stated_number(header.comments, MIN_OPACITY_KEY),
     )
 
 
@@ -136,7 +137,8 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     widths = soup.channel_widths
     comments = (
         "octasplat octagons",
-        f"octasplat_q {options.q!r}",
+        f"{Q_KEY} {options.q!r}",
+        f"{MIN_OPACITY_KEY} {options.min_opacity!r}",
         f"octasplat_gaussians {soup.scene_size}",
         *channel_comments(widths),
     )

@@ -37,7 +37,7 @@ def read_mtl(obj: Path, names: Sequence[str]) -> dict[str, MeshMaterial]:
         try:
             if path.stat().st_size > MAX_BYTES:
                 raise SceneFileError(f"{path}: is larger than {MAX_BYTES >> 20} MB, which no MTL needs.")
-            text = path.read_text(encoding="utf-8", errors="replace")
+            text = path.read_text(encoding="utf-8-sig", errors="replace")
         except OSError as error:
             raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}).") from error
         for entry in _entries(text):

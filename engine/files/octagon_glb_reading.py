@@ -17,6 +17,7 @@ from octasplat.engine.files import gltf
 from octasplat.engine.files.channel_columns import ChannelChoice, chosen_columns
 from octasplat.engine.files.encodings import sh0_from_rgb
 from octasplat.engine.files.gltf import GlbFile
+from octasplat.engine.files.mesh import Q_KEY
 from octasplat.engine.files.octagon_reading import TOLERANCE, edited, notes, placed_octagons
 from octasplat.engine.gaussians.channels import Channels
 from octasplat.engine.gaussians.flattening import GaussianCloud
@@ -28,7 +29,7 @@ UNLIT = "KHR_materials_unlit"
 
 def octagon_q(file: GlbFile) -> float | None:
     """The chi-square quantile of a file's octagons; None where it holds none, or holds them to be lit."""
-    q = file.document.get("asset", {}).get("extras", {}).get("octasplat_q")
+    q = file.document.get("asset", {}).get("extras", {}).get(Q_KEY)
     return float(q) if q is not None and UNLIT in file.document.get("extensionsUsed", []) else None
 
 

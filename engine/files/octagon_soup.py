@@ -59,6 +59,7 @@ class OctagonSoup:
         ids: numbers of the Gaussians that have an octagon, ascending.
         scene_size: number of Gaussians in the scene.
         q: the chi-square quantile that the radii come from.
+        min_opacity: the least opacity of a Gaussian with an octagon.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class OctagonSoup:
                 f"{len(gaussians)}. Export it in parts or as a Gaussian PLY."
             )
         self.q = options.q
+        self.min_opacity = options.min_opacity
         self.scene_size = len(gaussians)
         self._path = path
         self._gaussians = gaussians

@@ -8,7 +8,9 @@ from jaxtyping import Float, Float32
 from octasplat.engine.colour import rounded_bytes
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files.encodings import (
+    MAX_SH_DEGREE,
     SQRT_HALF,
+    dropped_harmonics,
     from_smallest_three,
     half_turn_points,
     half_turn_quats,
@@ -17,7 +19,6 @@ from octasplat.engine.files.encodings import (
     logits_from_bytes,
     smallest_three,
 )
-from octasplat.engine.files.gaussian_ply import MAX_SH_DEGREE
 from octasplat.engine.files.options import ExportOptions
 from octasplat.engine.files.registry import Exporter, Importer, register
 from octasplat.engine.files.selection import blocks, selected
@@ -56,9 +57,7 @@ def read(path: Path) -> GaussianCloud:
     constant = (colours.astype(np.float32) / 255.0 - 0.5) / COLOUR_SCALE
     sh = np.concatenate([constant[:, None, :], rest], axis=1).astype(np.float32)
     quats = _first_three(rotations) if file.version == 2 else _smallest_three(rotations)
-    notes = []
-    if file.sh_degree > MAX_SH_DEGREE:
-        notes.append(f"Harmonics of degree {file.sh_degree} were left out; degree 3 is the highest here.")
+    notes = [*dropped_harmonics(file.sh_degree)]
     if file.flags & ANTIALIASED:
         notes.append("The scene was trained with antialiasing, which is not modelled here.")
     return GaussianCloud(

@@ -37,6 +37,8 @@ class GaussianCloud:
         notes: what the reader of the file left out or had to assume, one sentence each.
         channels: what else is known of each, by name.
         thinnest: the smallest ln scale that the format can hold; what is no thicker counts as flat.
+        normal_axis: the axis that is the normal, whatever the scales, where the format says so. None: the
+            smallest of three scales, or axis 0 where there are two.
     """
 
     means_world: Float32[np.ndarray, "n 3"]
@@ -47,6 +49,7 @@ class GaussianCloud:
     notes: tuple[str, ...] = ()
     channels: Channels = field(default_factory=Channels)
     thinnest: float = float(FLAT_LOG_SCALE)
+    normal_axis: Literal[0, 2] | None = None
 
     def __post_init__(self) -> None:
         """Make sure that channels have as many rows as there are Gaussians."""
@@ -84,9 +87,9 @@ class ImportReport:
 
 
 def flatten(
-    cloud: GaussianCloud, path: Path, *, two_scale_normal: Literal[0, 2] = 0, drop_invalid: bool = False
+    cloud: GaussianCloud, path: Path, *, drop_invalid: bool = False
 ) -> tuple[FlatGaussians, ImportReport]:
-    """Flatten each Gaussian along its smallest axis.
+    """Flatten each Gaussian along its smallest axis, or along ``cloud.normal_axis``.
 
     The axes are relabelled, which changes neither the directions of the other two nor their scales. Gaussians
     that have our own flat scale on axis 0 come out bit for bit.
@@ -94,8 +97,6 @@ def flatten(
     Args:
         cloud: what a file holds.
         path: names the file in errors.
-        two_scale_normal: which axis is the normal where there are two scales: 0 as GaMeS writes it, 2 as
-            2DGS does.
         drop_invalid: leave out Gaussians with values that are not finite, instead of refusing the file.
 
     Raises:
@@ -112,13 +113,16 @@ def flatten(
     if not valid.all():
         cloud = select_rows(cloud, valid)
     scale_count = cloud.log_scales.shape[1]
-    if scale_count == 3:
+    if scale_count == 3 and cloud.normal_axis is None:
         quats, in_plane, thickness = _flattened(
             cloud.quats_wxyz, cloud.log_scales, np.float32(max(cloud.thinnest, float(FLAT_LOG_SCALE)))
         )
     else:
-        axis = np.full(len(cloud.means_world), two_scale_normal)
-        quats, in_plane, thickness = turned(cloud.quats_wxyz, axis), cloud.log_scales, np.empty(0, np.float32)
+        normal = cloud.normal_axis or 0
+        quats = turned(cloud.quats_wxyz, np.full(len(cloud.means_world), normal))
+        in_plane, thickness = cloud.log_scales, np.empty(0, np.float32)
+        if scale_count == 3:
+            in_plane = np.ascontiguousarray(in_plane[:, [(normal + 1) % 3, (normal + 2) % 3]])
     gaussians = FlatGaussians(
         cloud.means_world, quats, in_plane, cloud.opacity_logits, cloud.sh, cloud.channels
     )

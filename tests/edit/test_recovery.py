@@ -388,3 +388,31 @@ def test_needles_survive(make_scene: Make, exported) -> None:
     assert result.is_finite() and len(result) == 100
     np.testing.assert_allclose(result.means_world, g.means_world @ turn.T, atol=2e-3)
     assert np.median(covariance_errors(result, turn @ covariances(g) @ turn.T)) < 0.01
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "scene.glb"])
+@pytest.mark.parametrize("least", [0.0, 0.3])
+def test_octagons_deleted_for_being_faint_stay_deleted(
+    make_scene: Make, exported, name: str, least: float
+) -> None:
+    g = make_scene(400)
+    g.opacity_logits[:] = np.linspace(-3.0, 3.0, 400)
+    mesh = exported(g, name, min_opacity=least)
+    faint = g.opacities[mesh.gid.astype(int)] < 0.5
+    result, report = recover(g, without(mesh, faint), Path(name))
+    deleted = int(((g.opacities >= least) & (g.opacities < 0.5)).sum())
+    assert report.deleted == deleted > 0
+    assert (result.opacities >= 0.5).sum() == (g.opacities >= 0.5).sum()
+    # What was never exported follows its neighbours: it is carried, or left out with those deleted.
+    never = int((g.opacities < least).sum())
+    assert report.carried + report.orphaned == never
+    assert len(result) == int((g.opacities >= 0.5).sum()) + report.carried
+
+
+def test_the_least_opacity_can_be_told_where_an_editor_lost_it(make_scene: Make, exported) -> None:
+    g = make_scene(200)
+    mesh = replace(exported(g, min_opacity=0.7), min_opacity=None)
+    assert recover(g, mesh)[1].deleted == int((g.opacities < 0.7).sum()) > 0
+    result, report = recover(g, mesh, min_opacity=0.7)
+    assert_same(result, g)
+    assert report.deleted == 0

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cloud_difference import difference
+from scipy.spatial import cKDTree
 
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import export_scene, exporter_for, importer_for, read_scene
@@ -122,6 +123,27 @@ def test_what_we_write_comes_back(tmp_path: Path, degree: int, count: int) -> No
     np.testing.assert_allclose(back.sh[:, 1:], scene.sh[:, 1:], atol=8 / 512 * 1.001)
     normals = np.abs(np.sum(back.rotations[:, :, 0] * scene.rotations[:, :, 0], axis=1))
     assert np.degrees(np.arccos(np.clip(normals, -1, 1))).max() < 0.25
+
+
+@pytest.mark.parametrize("far", [0, 1, 40])
+def test_few_gaussians_far_away_cost_the_others_no_precision(tmp_path: Path, far: int) -> None:
+    random = np.random.default_rng(5)
+    count, sigma = 20_000, 0.01
+    means = random.uniform(-1, 1, (count, 3))
+    means[:far] = 1e4 * random.standard_normal((far, 3))
+    scene = FlatGaussians(
+        means.astype(np.float32),
+        random.standard_normal((count, 4)).astype(np.float32),
+        np.full((count, 2), np.log(sigma), np.float32),
+        np.zeros(count, np.float32),
+        random.uniform(-1, 1, (count, 1, 3)).astype(np.float32),
+    )
+    export_scene(scene, tmp_path / "a.compressed.ply")
+    back, _ = read_scene(tmp_path / "a.compressed.ply")
+    errors, _ = cKDTree(back.means_world).query(scene.means_world[far:])
+    # 78 chunks share a cube of side 2: cells of about 0.5, whose steps are 0.5 / 2047 = 0.024 sigma.
+    assert np.median(errors) / sigma < 0.03
+    assert (errors > 0.1 * sigma).mean() < (0.0001 if far == 0 else 8 * 256 / count)
 
 
 def test_older_files_without_bounds_of_colours(make_cloud: Make, tmp_path: Path) -> None:

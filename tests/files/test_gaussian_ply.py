@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files import read_facts
+from octasplat.engine.files import read_facts, read_scene
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from octasplat.engine.files.ply_container import read_ply
 from octasplat.engine.gaussians.frames import rotation_matrices
@@ -160,12 +160,14 @@ def test_windows_line_ends_and_other_elements_are_accepted(make_gaussians: Make,
 def test_two_scales_are_those_in_the_plane(make_gaussians: Make, tmp_path: Path) -> None:
     g = make_gaussians(30)
     path = write_columns(tmp_path / "a.ply", columns_of(g, g.log_scales))
-    back, report = read_gaussian_ply(path)
+    back, report = read_gaussian_ply(path, dialect="games")
     assert_same_bits(back, g)
-    assert (report.scale_count, report.flattened) == (2, 0)
-    surfels, _ = read_gaussian_ply(path, two_scale_normal=2)  # as 2DGS means it
+    assert (report.scale_count, report.flattened, report.notes) == (2, 0, ())
+    surfels, report = read_scene(path)
     np.testing.assert_allclose(surfels.rotations, g.rotations[:, :, [2, 0, 1]], atol=1e-6)
     np.testing.assert_array_equal(surfels.log_scales, g.log_scales)
+    assert "read as 2DGS" in report.notes[0] and "--format games" in report.notes[0]
+    assert read_scene(path, "2dgs")[1].notes == ()
 
 
 def test_thick_gaussians_lose_only_their_smallest_axis(make_gaussians: Make, tmp_path: Path) -> None:

@@ -77,6 +77,36 @@ def test_obj_faces_whose_counts_add_up_by_chance(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("block", [16, 1 << 22])
+def test_obj_relative_numbers_count_back_from_their_own_line(tmp_path: Path, monkeypatch, block: int) -> None:
+    monkeypatch.setattr(mesh_obj, "BLOCK_BYTES", block)
+    lines = []
+    for k in range(3):  # triangles one after the other, each behind its own vertices
+        lines += [f"v {k} {corner} 0" for corner in range(3)]
+        lines += [f"vt {k / 4} {corner / 4}" for corner in range(3)]
+        lines += ["f -3/-3 -2/-2 -1/-1"]
+    lines += ["f -9// -8// -7//", "f -1 -2 -3 -4"]  # the slow way, and a polygon of relative numbers
+    mesh = read_mesh(obj(tmp_path, "\n".join([*lines, ""])))
+    expected = [[0, 1, 2], [3, 4, 5], [6, 7, 8], [0, 1, 2], [8, 7, 6], [8, 6, 5]]
+    assert mesh.triangles.tolist() == expected
+    assert mesh.uv is not None
+    np.testing.assert_allclose(mesh.uv[:, 0], np.repeat([0, 0.25, 0.5], 3))
+
+
+def test_obj_with_a_byte_order_mark_or_indented_lines_is_whole(tmp_path: Path) -> None:
+    path = obj(tmp_path, "\ufeffv 0 0 0\n  v 1 0 0\n\tv 0 1 0\n f 1 2 3\n")
+    mesh = read_mesh(path)
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert mesh.triangles.tolist() == [[0, 1, 2]]
+
+
+def test_mtl_with_a_byte_order_mark_is_whole(tmp_path: Path) -> None:
+    (tmp_path / "a.mtl").write_text("\ufeffnewmtl red\nKd 1 0 0\n", encoding="utf-8")
+    path = obj(tmp_path, "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n")
+    assert [material.name for material in read_mesh(path, looks=True).materials] == ["red"]
+    assert read_mesh(path, looks=True).materials[0].passed_over == ()
+
+
 def test_obj_rounding_follows_the_digits(tmp_path: Path) -> None:
     assert read_mesh(obj(tmp_path, "v 0.123 1.5 2\nv 0 0 0\n")).rounding == pytest.approx(5e-4)
     assert read_mesh(obj(tmp_path, "v 0.123456 1.5 2\n")).rounding == pytest.approx(5e-7)

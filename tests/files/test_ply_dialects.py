@@ -1,0 +1,98 @@
+"""PLY files made by the rules of other programs; each holds one disc whose normal and axes are known."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.files import read_scene
+from octasplat.engine.files.ply_container import PlyWriteElement, write_ply
+from octasplat.engine.gaussians.frames import quaternions
+from octasplat.engine.gaussians.model import FlatGaussians
+
+FIRST = np.array([0.6, 0.8, 0.0])
+SECOND = np.array([-0.48, 0.36, 0.8])
+NORMAL = np.cross(FIRST, SECOND)
+SIGMAS = (0.3, 0.05)
+"""Standard deviations along FIRST and SECOND."""
+OPACITY = 0.75
+
+
+def write_disc(path: Path, axes: list[np.ndarray], scales: list[float], **more: float) -> Path:
+    """Write a PLY whose rotation has these columns; its quaternion is not of unit length, as in training."""
+    matrix = np.stack(axes, axis=1)[None]
+    assert np.linalg.det(matrix[0]) == pytest.approx(1.0)
+    rotation = 1.7 * quaternions(matrix)[0]
+    rest = {f"f_rest_{k}": 0.01 * k for k in range(int(more.pop("rest", 0)))}
+    row = {"x": 1.0, "y": 2.0, "z": 3.0, "nx": 0.0, "ny": 0.0, "nz": 0.0}
+    row |= {"f_dc_0": 0.1, "f_dc_1": 0.2, "f_dc_2": 0.3, **rest, "opacity": np.log(OPACITY / (1 - OPACITY))}
+    row |= {f"scale_{k}": np.log(scale) for k, scale in enumerate(scales)}
+    row |= {f"rot_{k}": value for k, value in enumerate(rotation)} | more
+    table = np.array([tuple(row.values())], dtype=[(name, "<f4") for name in row])
+    write_ply(path, [PlyWriteElement("vertex", 1, table.dtype, [table])])
+    return path
+
+
+def assert_is_the_disc(scene: FlatGaussians, sigmas: tuple[float, float] = SIGMAS) -> None:
+    axes = scene.rotations[0].astype(np.float64)
+    assert abs(axes[:, 0] @ NORMAL) == pytest.approx(1.0, abs=1e-5)
+    legs = axes[:, 1:] * scene.scales[0]
+    expected = np.stack([FIRST * sigmas[0], SECOND * sigmas[1]], axis=1)
+    np.testing.assert_allclose(legs @ legs.T, expected @ expected.T, atol=1e-6)
+
+
+DIALECTS = {
+    # 2DGS: two scales, in the plane of the first two columns; the third is the normal.
+    "2dgs": ([FIRST, SECOND, NORMAL], [*SIGMAS], None),
+    # gsplat's 2DGS: likewise, and a third scale that nothing uses, here the largest.
+    "gsplat": ([FIRST, SECOND, NORMAL], [*SIGMAS, 0.9], "2dgs"),
+    # GaMeS: two scales, of the last two columns; the first is the normal.
+    "games": ([NORMAL, FIRST, SECOND], [*SIGMAS], "games"),
+    # PGSR: three scales, any of which may be the smallest; its axis is the normal.
+    "pgsr": ([SECOND, NORMAL, FIRST], [SIGMAS[1], 1e-5, SIGMAS[0]], None),
+    # SuGaR bound to a mesh: three scales, the first a thickness that all share.
+    "sugar": ([NORMAL, FIRST, SECOND], [1e-6, *SIGMAS], None),
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_the_disc_of_each_program_is_read_as_it_meant_it(dialect: str, tmp_path: Path) -> None:
+    axes, scales, name = DIALECTS[dialect]
+    scene, report = read_scene(write_disc(tmp_path / "a.ply", axes, scales), name)
+    assert_is_the_disc(scene)
+    assert report.thick == 0
+    assert scene.opacities[0] == pytest.approx(OPACITY)
+
+
+def test_the_filter_of_gaussian_opacity_fields_is_folded_in(tmp_path: Path) -> None:
+    filter_3d = 0.04
+    path = write_disc(tmp_path / "a.ply", [FIRST, SECOND, NORMAL], [*SIGMAS, 0.03], filter_3D=filter_3d)
+    scene, report = read_scene(path, channels="all")
+    wider = [float(np.hypot(sigma, filter_3d)) for sigma in (*SIGMAS, 0.03)]
+    assert_is_the_disc(scene, (wider[0], wider[1]))
+    kept = np.prod([*SIGMAS, 0.03]) / np.prod(wider)  # the integral over space stays the same
+    assert scene.opacities[0] == pytest.approx(OPACITY * kept, rel=1e-5)
+    assert any("filter_3D" in note for note in report.notes)
+    assert scene.channels.widths == {}
+
+
+def test_a_filter_of_zero_changes_nothing(tmp_path: Path) -> None:
+    path = write_disc(tmp_path / "a.ply", [NORMAL, FIRST, SECOND], [1e-5, *SIGMAS], filter_3D=0.0)
+    scene, _ = read_scene(path)
+    assert_is_the_disc(scene)
+    assert scene.opacities[0] == pytest.approx(OPACITY)
+
+
+def test_harmonics_of_degree_four_are_cut_and_told(tmp_path: Path) -> None:
+    path = write_disc(tmp_path / "a.ply", [NORMAL, FIRST, SECOND], [1e-5, *SIGMAS], rest=72)
+    scene, report = read_scene(path)
+    expected = 0.01 * np.array([[24 * colour + k for colour in range(3)] for k in range(15)])
+    np.testing.assert_allclose(scene.sh[0, 1:], expected, rtol=1e-6)
+    assert report.notes == ("Harmonics of degree 4 were left out; degree 3 is the highest here.",)
+
+
+def test_a_number_of_harmonics_of_no_degree_is_refused(tmp_path: Path) -> None:
+    path = write_disc(tmp_path / "a.ply", [NORMAL, FIRST, SECOND], [1e-5, *SIGMAS], rest=30)
+    with pytest.raises(SceneFileError, match="30 f_rest"):
+        read_scene(path)
