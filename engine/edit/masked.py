@@ -1,7 +1,7 @@
 """Gaussians chosen in pictures: those that show where masks are white."""
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -29,7 +29,8 @@ def under_masks(
     Args:
         source: folder of the run.
         gaussians: its scene.
-        masks: images of any size with the names of photographs, as ``0001.png`` or ``0001.jpg.png``.
+        masks: images of any size with the names of photographs, as ``0001.png`` or ``0001.jpg.png``; in
+            folders as the photographs are, where their file names alone do not tell them apart.
         threads: to use; 0 takes all.
 
     Raises:
@@ -76,10 +77,41 @@ def _weights(tracer: Tracer, rays: RayBatch, count: int) -> Float64[np.ndarray, 
 
 
 def _rays(viewpoints: Viewpoints, path: Path, near_world: float) -> ImageRays:
-    for number, view in enumerate(viewpoints.views):
-        if path.name in (f"{Path(view.name).name}.png", Path(view.name).with_suffix(path.suffix).name):
-            return view_shots(viewpoints, np.array([number]), near_world)[0].rays()
-    raise ConfigError(f"{path}: the run has no photograph of this name.")
+    number = masked_photograph(path, [view.name for view in viewpoints.views])
+    return view_shots(viewpoints, np.array([number]), near_world)[0].rays()
+
+
+def masked_photograph(mask: Path, photographs: Sequence[str]) -> int:
+    """Return the number of the photograph that a mask is of.
+
+    Args:
+        mask: its path ends in the photograph's relative path, with ``.png`` added or another suffix. Where
+            that is so of several, the longest counts; where it is of none, the one of this file name.
+        photographs: relative paths.
+
+    Raises:
+        ConfigError: none has this name, or several have.
+    """
+    parts = mask.parts
+    same_file: list[int] = []
+    same_path: list[tuple[int, int]] = []
+    for number, name in enumerate(photographs):
+        for candidate in {PurePosixPath(f"{name}.png"), PurePosixPath(name).with_suffix(mask.suffix)}:
+            if candidate.name == mask.name:
+                same_file.append(number)
+                if parts[-len(candidate.parts) :] == candidate.parts:
+                    same_path.append((len(candidate.parts), number))
+    longest = max((length for length, _ in same_path), default=0)
+    found = sorted({number for length, number in same_path if length == longest} or set(same_file))
+    if not found:
+        raise ConfigError(f"{mask}: the run has no photograph of this name.")
+    if len(found) > 1:
+        names = " and ".join(photographs[number] for number in found[:2])
+        raise ConfigError(
+            f"{mask}: may be a mask of {names}; name it as its photograph is named with .png added, in a "
+            "folder of the photograph's."
+        )
+    return found[0]
 
 
 def _mask(path: Path, image: ImageRays) -> Bool[np.ndarray, "h w"]:

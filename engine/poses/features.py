@@ -38,17 +38,26 @@ _LESS_CLEAR_RATIO = 0.9
 """A match may be so near in distance to the second best one; otherwise 0.8."""
 
 
-def make_database(database: Path, photographs: Path, names: Sequence[str], *, one_camera: bool) -> None:
+def make_database(
+    database: Path, photographs: Path, names: Sequence[str], *, one_camera: bool
+) -> tuple[str, ...]:
     """Make a database of photographs, without features.
 
     Args:
         database: does not exist yet.
         photographs: folder.
-        names: of the photographs in it; the first gets the number 1 in the database.
+        names: of the photographs in it.
         one_camera: all photographs were taken with one lens.
+
+    Returns:
+        The photographs as the database numbers them, from 1 on. COLMAP leaves out files that it cannot read
+        and gives their numbers to those that follow.
     """
     pycolmap.Database.open(database).close()  # COLMAP wants it to exist
     pycolmap.import_images(database, photographs, _mode(one_camera), list(names))
+    with pycolmap.Database.open(database) as made:
+        by_number = {image.image_id: image.name for image in made.read_all_images()}
+    return tuple(by_number[number] for number in range(1, len(by_number) + 1))
 
 
 def _mode(one_camera: bool) -> "pycolmap.CameraMode":

@@ -82,12 +82,10 @@ class _Hearing:
         self._sizes_px = [(info.width_px, info.height_px) for info in infos]
         self._one_camera = len(set(self._sizes_px)) == 1
         self._seen: set[int] = set()
-        make_database(self._database, self._photographs, self._aliases, one_camera=self._one_camera)
-        with pycolmap.Database.open(self._database) as made:
-            known = {image.name: image.image_id for image in made.read_all_images()}
-        numbers = [known.get(alias) for alias in self._aliases]
-        if numbers != list(range(1, len(numbers) + 1)):  # those after one that is missing would be others
-            unread = [name for name, number in zip(request.names, numbers, strict=True) if number is None]
+        read = make_database(self._database, self._photographs, self._aliases, one_camera=self._one_camera)
+        if read != self._aliases:  # those after one that is missing would be others
+            pairs = zip(request.names, self._aliases, strict=True)
+            unread = [name for name, alias in pairs if alias not in read]
             raise DatasetError(f"COLMAP cannot read {', '.join(unread[:3])}.")
 
     def ask(self, doubtful: Sequence[int], witnesses: Sequence[int]) -> None:

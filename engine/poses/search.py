@@ -1,5 +1,6 @@
 """The search for poses, from photographs to a model that can be trusted; runs in a process of its own."""
 
+import contextlib
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -31,6 +32,7 @@ from octasplat.engine.poses.folds import false_pairs, pair_votes, without_pairs
 from octasplat.engine.poses.mapping import map_photographs, rank
 from octasplat.engine.poses.pairs import Pair, all_pairs, pairs_with
 from octasplat.engine.poses.workshop import linked_photographs, stage_of
+from octasplat.engine.scene.image_info import ImageInfo
 from octasplat.engine.scene.images import read_image_info
 from octasplat.engine.writing import write_json
 
@@ -62,15 +64,24 @@ class Search:
         tell: Listener,
     ) -> None:
         self._images = images
-        self._names = tuple(names)
+        self._all_names = tuple(names)
+        self._infos = _readable(images, names)
+        self._names = tuple(self._infos)
         self._work = work
         self._config = config
         self._threads = threads or -1
         self._tell = tell
         self._photographs = work / "photographs"
         self._aliases = linked_photographs(images, self._names, self._photographs)
-        self._one_camera = self._look_at_sizes()
         pycolmap.logging.minloglevel = 2  # its warnings are of use to nobody here
+        self._leave_out_unread()
+        self._one_camera = self._has_one_size()
+        self._warn_of_small_photographs()
+
+    @property
+    def numbered(self) -> tuple[str, ...]:
+        """The photographs that are searched, in the order in which COLMAP numbers them."""
+        return self._names
 
     def run(self, found: Path) -> None:
         """Search, a second time if photographs are left out, and write the best model.
@@ -93,8 +104,9 @@ class Search:
             )
             best = max(best, self._search(thorough=True), key=rank)
         self._check(best)
+        names = dict(zip(self._aliases, self._names, strict=True))
         for image in best.images.values():
-            image.name = self._names[image.image_id - 1]
+            image.name = names[image.name]
         # One after the other: colours are sums.
         best.extract_colors_for_all_images(self._images, num_threads=1)
         found.mkdir()
@@ -103,9 +115,9 @@ class Search:
         write_json(
             found / RECORD,
             {
-                "photographs": count,
+                "photographs": len(self._all_names),
                 "placed": len(posed),
-                "left_out": [name for name in self._names if name not in posed],
+                "left_out": [name for name in self._all_names if name not in posed],
                 "points": best.num_points3D(),
                 "mean_reprojection_px": round(float(best.compute_mean_reprojection_error()), 4),
             },
@@ -208,12 +220,45 @@ class Search:
         again = map_photographs(database, self._photographs, self._config, counted=at, weak=True, start=start)
         return max(best, again, key=rank)
 
-    def _look_at_sizes(self) -> bool:
-        """Whether all photographs have one size.
+    def _leave_out_unread(self) -> None:
+        """Leave out photographs that COLMAP does not read, and warn of all that nobody could read.
+
+        COLMAP gives their numbers to those that follow, so that what is left out has to be known before
+        photographs are numbered.
+
+        Raises:
+            DatasetError: too few are left.
+        """
+        trial = self._work / "readable.db"
+        read = set(make_database(trial, self._photographs, self._aliases, one_camera=False))
+        trial.unlink()
+        kept = [k for k, alias in enumerate(self._aliases) if alias in read]
+        self._names = tuple(self._names[k] for k in kept)
+        self._aliases = tuple(self._aliases[k] for k in kept)
+        unread = [name for name in self._all_names if name not in set(self._names)]
+        if unread:
+            self._tell(
+                Warned(
+                    f"{len(unread)} of {len(self._all_names)} photographs cannot be read and are left out "
+                    f"({', '.join(unread[:3])}{', ...' if len(unread) > 3 else ''}); replace these files."
+                )
+            )
+        if len(self._names) < MIN_PHOTOGRAPHS:
+            raise DatasetError(
+                f"Only {len(self._names)} of {len(self._all_names)} photographs can be read; at least "
+                f"{MIN_PHOTOGRAPHS} are needed."
+            )
+
+    def _has_one_size(self) -> bool:
+        """Return whether all photographs have one size.
 
         That means one lens as a rule, and a lens shared by all is found far more surely.
         """
-        infos = [read_image_info(self._images / name) for name in self._names]
+        infos = [self._infos[name] for name in self._names]
+        return len({(info.width_px, info.height_px) for info in infos}) == 1
+
+    def _warn_of_small_photographs(self) -> None:
+        infos = [self._infos[name] for name in self._names]
         longest = max(max(info.width_px, info.height_px) for info in infos)
         if longest < SMALL_PX:
             self._tell(
@@ -222,7 +267,6 @@ class Search:
                     "wrong, so give them at full size."
                 )
             )
-        return len({(info.width_px, info.height_px) for info in infos}) == 1
 
     def _check(self, best: Any) -> None:
         """Refuse a result that would only waste the training."""
@@ -247,3 +291,12 @@ class Search:
             self._tell(
                 Warned(f"{count - posed} of {count} photographs could not be placed and are left out.")
             )
+
+
+def _readable(images: Path, names: Sequence[str]) -> dict[str, ImageInfo]:
+    """Return what the headers of photographs say, for those that can be read."""
+    found: dict[str, ImageInfo] = {}
+    for name in names:
+        with contextlib.suppress(DatasetError):
+            found[name] = read_image_info(images / name)
+    return found

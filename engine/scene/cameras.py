@@ -65,6 +65,11 @@ class Camera:
         angle = float(np.linalg.norm(np.cross(ways[0], ways[1])))
         return angle if np.isfinite(angle) else 0.0
 
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the picture shows the whole sphere; all other models show only what lies ahead."""
+        return self.model == "EQUIRECTANGULAR"
+
     def to_pycolmap(self) -> pycolmap.Camera:
         """The same camera as an object of pycolmap."""
         return pycolmap.Camera(

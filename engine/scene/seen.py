@@ -52,7 +52,9 @@ def turned(
 
 
 def is_shown(in_cam: Float64[np.ndarray, "n 3"], camera: Camera) -> Bool[np.ndarray, " n"]:
-    """Whether points before a camera lie in its picture."""
+    """Return whether points lie in a camera's picture, those behind it only in that of a panorama."""
+    if camera.is_panorama:
+        return np.asarray(np.isfinite(camera.project(in_cam).reshape(-1, 2)).all(axis=1))
     shown = in_cam[:, 2] > 0
     before = in_cam[shown]
     if camera.is_pinhole:

@@ -11,6 +11,15 @@ from octasplat.engine.scene import Camera, PosedView, Viewpoints
 
 MAX_SLOPE = 1.2
 """Lenses wider than this to a side (50 degrees) are cut there: a pinhole shows nothing well beyond."""
+_CUBE_TURNS = (
+    ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+    ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+)
+"""Right, down and forward of the faces of a cube: ahead, right, behind, left, below, above."""
 AROUND_COUNT = 96
 AROUND_FOV_DEGREES = 50.0
 
@@ -23,10 +32,17 @@ def photograph_cameras(
     They see nothing nearer than ``near_world``.
 
     A pinhole camera stays as it is but for its size; of a distorted image, the pinhole shows what lies
-    between the middles of its sides.
+    between the middles of its sides. A panorama is shown by the six faces of a cube, the one ahead first.
     """
-    views = [scene.views[index] for index in indices]
-    return tuple(_pinhole(view, scene.cameras[view.camera_index], max_side, near_world) for view in views)
+    cameras: list[RenderCamera] = []
+    for index in indices:
+        view = scene.views[index]
+        camera = scene.cameras[view.camera_index]
+        if camera.is_panorama:
+            cameras.extend(_cube_faces(view, camera, max_side, near_world))
+        else:
+            cameras.append(_pinhole(view, camera, max_side, near_world))
+    return tuple(cameras)
 
 
 def cameras_around(
@@ -58,6 +74,27 @@ def cameras_around(
 def _across(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
     """An axis that is not along ``direction``."""
     return np.eye(3)[int(np.argmin(np.abs(direction)))]
+
+
+def _cube_faces(
+    view: PosedView, camera: Camera, max_side: int, near_world: float
+) -> tuple[RenderCamera, ...]:
+    """Return square pinholes of 90 degrees that together see in all directions."""
+    side_px = max_side if camera.pixel_rad == 0 else max(1, min(max_side, round(2 / camera.pixel_rad)))
+    return tuple(
+        RenderCamera(
+            width_px=side_px,
+            height_px=side_px,
+            fx_px=side_px / 2,
+            fy_px=side_px / 2,
+            cx_px=side_px / 2,
+            cy_px=side_px / 2,
+            rotation_cam_from_world=turn @ view.rotation_cam_from_world,
+            translation_cam_from_world=turn @ view.translation_cam_from_world,
+            near_world=near_world,
+        )
+        for turn in np.array(_CUBE_TURNS, np.float64)
+    )
 
 
 def _pinhole(view: PosedView, camera: Camera, max_side: int, near_world: float) -> RenderCamera:

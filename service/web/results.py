@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import Any, cast
 
+from octasplat.engine.render.names import render_names
 from octasplat.workers.records.rows import Artifact, DatasetFile
 from octasplat.workers.store.errors import StorageError
 from octasplat.workers.store.protocol import Storage
@@ -154,8 +155,8 @@ def measured(
     results = {row.name for row in artifacts}
     files = {file.path for file in photographs}
     views = []
-    for name, row in rows.items():
-        render = f"renders/{PurePosixPath(name).with_suffix('.png')}"
+    for (name, row), rendered in zip(rows.items(), render_names(list(rows)), strict=True):
+        render = f"renders/{rendered}.png"
         photograph = f"images/{name}"
         shown = photograph in files and PurePosixPath(name).suffix.lower() in _SHOWN_BY_BROWSERS
         views.append(

@@ -17,7 +17,7 @@ from edit_scenes import (
 )
 
 from octasplat.engine.edit.deform import deform, deform_to, deformation_corners
-from octasplat.engine.edit.proxy import MeanValueBinding, Proxy, bind
+from octasplat.engine.edit.proxy import MeanValueBinding, NearTriangles, Proxy, bind
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.gaussians.harmonics import sh_basis
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -267,3 +267,21 @@ def test_what_is_not_kept_between_frames_is_the_same(make_scene: Make, monkeypat
     again = bind(Proxy(*cube(3)), corners, method, 0.3)
     np.testing.assert_array_equal(again.deform(moved), kept)
     np.testing.assert_array_equal(again.deform(moved), kept)
+
+
+@pytest.mark.parametrize("size", [30.0, 300.0, 3e4])
+def test_a_floor_of_two_triangles_is_nearest_beneath_a_dense_ball(size: float) -> None:
+    sphere, facets = ball(24)
+    radius, centre = 0.5, np.array([0.0, 0.0, 4.5])
+    sphere = centre + radius * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
+    floor = size * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    triangles = np.concatenate([facets, np.array([[0, 1, 2], [0, 2, 3]]) + len(sphere)])
+    near = NearTriangles(Proxy(np.concatenate([sphere, floor]), triangles))
+    random = np.random.default_rng(2)
+    points = random.uniform([-4, -4, 0.05], [4, 4, 6], (20_000, 3))
+    to_ball = np.linalg.norm(points - centre, axis=1) - radius
+    chosen, weights, distances = near.to(points)
+    np.testing.assert_allclose(distances, np.minimum(np.abs(to_ball), points[:, 2]), atol=0.01)
+    on_floor = np.where(chosen >= len(facets), weights, 0.0).sum(axis=1)
+    sure = np.abs(np.abs(to_ball) - points[:, 2]) > 0.2  # beyond where both are blended
+    np.testing.assert_allclose(on_floor[sure], (np.abs(to_ball) > points[:, 2])[sure], atol=1e-6)

@@ -3,10 +3,12 @@
 import json
 import shutil
 import signal
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import psutil
 import pycolmap
 import pytest
@@ -14,9 +16,10 @@ from jaxtyping import Float64
 
 from neighbouring_photographs import write_neighbours
 from octasplat.engine.errors import Cancelled, DatasetError, PosesCrashed
-from octasplat.engine.events import Event, StageFinished, StageProgress, StageStarted
+from octasplat.engine.events import Event, StageFinished, StageProgress, StageStarted, Warned
 from octasplat.engine.poses import find_poses
 from octasplat.engine.poses.find import PosesConfig
+from octasplat.engine.poses.search import Search
 from octasplat.engine.render.images import write_png
 
 pytestmark = pytest.mark.heavy
@@ -143,6 +146,60 @@ def test_a_result_of_other_photographs_is_refused(taken: Photographs, tmp_path: 
     (tmp_path / "poses" / "poses.json").write_text(json.dumps(record))
     with pytest.raises(DatasetError, match="other photographs"):
         find_poses(images, tmp_path / "poses")
+
+
+def unreadable(kind: str, good: Path) -> tuple[str, bytes]:
+    """Suffix and content of a file that COLMAP, or nobody, can read as a photograph."""
+    if kind == "truncated JPEG":
+        return ".jpg", b"\xff\xd8\xff\xe0\x00\x10JFIF\x00" + good.read_bytes()[:40]
+    if kind == "TIFF of nothing":
+        return ".tif", b"II*\x00" + b"nothing at all" * 4
+    if kind == "TIFF of five channels":  # which others can read
+        with tempfile.NamedTemporaryFile(suffix=".tif") as file:
+            assert oiio.ImageBuf(oiio.ImageSpec(48, 32, 5, oiio.UINT8)).write(file.name)
+            return ".tif", Path(file.name).read_bytes()
+    return ".png", b""
+
+
+@pytest.mark.parametrize("kind", ["truncated JPEG", "TIFF of nothing", "TIFF of five channels", "empty file"])
+@pytest.mark.parametrize("place", range(4))
+def test_a_file_that_cannot_be_read_takes_no_number_of_another(
+    taken: Photographs, tmp_path: Path, kind: str, place: int
+) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    good = sorted(taken.folder.iterdir())[:3]
+    for number, path in enumerate(good):
+        (images / f"{number}b.png").hardlink_to(path)
+    suffix, content = unreadable(kind, good[0])
+    bad = f"{place - 1}c{suffix}" if place else f"0a{suffix}"
+    (images / bad).write_bytes(content)
+    names = sorted(path.name for path in images.iterdir())
+    assert names.index(bad) == place
+    (tmp_path / "work").mkdir()
+    events: list[Event] = []
+    search = Search(images, names, tmp_path / "work", PosesConfig(), 1, events.append)
+    (warning,) = (event.message for event in events if isinstance(event, Warned))
+    assert warning.startswith("1 of 4 photographs cannot be read") and bad in warning
+    assert search.numbered == ("0b.png", "1b.png", "2b.png")
+
+
+def test_poses_go_to_the_photographs_they_are_of(taken: Photographs, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    shutil.copytree(taken.folder, images)
+    names = sorted(path.name for path in images.iterdir())
+    for kind, after in (("empty file", ""), ("TIFF of nothing", names[4]), ("truncated JPEG", names[9])):
+        suffix, content = unreadable(kind, images / names[0])
+        (images / f"{after or '0'}x{suffix}").write_bytes(content)
+    find_poses(images, tmp_path / "poses", threads=2)
+    found, truth = centres(tmp_path / "poses"), taken.centres_world
+    assert len(found) >= 0.8 * len(truth) and found.keys() <= truth.keys()
+    posed = sorted(found)
+    a, b = np.stack([found[n] for n in posed]), np.stack([truth[n] for n in posed])
+    errors = np.linalg.norm(aligned(a, b) - b, axis=1)
+    assert np.median(errors) < 0.03 * np.linalg.norm(b - b.mean(0), axis=1).mean()
+    record = json.loads((tmp_path / "poses" / "poses.json").read_text())
+    assert record["photographs"] == COUNT + 3 and len(record["left_out"]) == COUNT + 3 - len(found)
 
 
 def test_death_of_colmap_is_told(taken: Photographs, tmp_path: Path) -> None:

@@ -269,3 +269,11 @@ def test_views_are_worst_first_and_odd_figures_do_no_harm() -> None:
     assert [view.render for view in found.views] == ["renders/a.png", "renders/b.png", None]
     assert [metric.key for metric in found.columns] == ["psnr", "ssim"] and found.interval is None
     assert measured({}, [], []) is None and measured({"mean": [1], "views": 3}, [], []) is None
+
+
+def test_views_that_differ_in_their_suffix_alone_have_their_own_renders() -> None:
+    metrics = {"mean": {"psnr": 25.0}, "views": {"s/a.jpg": {"psnr": 1.0}, "s/a.png": {"psnr": 2.0}}}
+    names = ["renders/s/a.jpg.png", "renders/s/a.png.png"]
+    found = measured(metrics, [artifact(name) for name in names], [])
+    assert found is not None
+    assert [view.render for view in found.views] == names

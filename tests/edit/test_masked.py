@@ -1,0 +1,36 @@
+from pathlib import Path
+
+import pytest
+
+from octasplat.engine.edit.masked import masked_photograph
+from octasplat.engine.errors import ConfigError
+
+PHOTOGRAPHS = ["0001.jpg", "left/0001.jpg", "right/0001.jpg", "right/0002.jpg", "right/0002.png", "far/9.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("mask", "photograph"),
+    [
+        ("masks/left/0001.png", "left/0001.jpg"),
+        ("masks/right/0001.png", "right/0001.jpg"),
+        ("masks/right/0001.jpg.png", "right/0001.jpg"),
+        ("masks/0001.png", "0001.jpg"),
+        ("masks/0001.jpg.png", "0001.jpg"),
+        ("masks/right/0002.jpg.png", "right/0002.jpg"),
+        ("masks/right/0002.png.png", "right/0002.png"),
+        ("anywhere/9.png", "far/9.jpg"),  # no other has this name
+    ],
+)
+def test_a_mask_belongs_to_the_photograph_in_its_own_folder(mask: str, photograph: str) -> None:
+    assert PHOTOGRAPHS[masked_photograph(Path(mask), PHOTOGRAPHS)] == photograph
+    back = PHOTOGRAPHS[::-1]
+    assert back[masked_photograph(Path(mask), back)] == photograph
+
+
+def test_masks_that_could_be_of_several_photographs_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"may be a mask of left/0001\.jpg and right/0001\.jpg"):
+        masked_photograph(Path("0001.png"), PHOTOGRAPHS[1:])
+    with pytest.raises(ConfigError, match=r"right/0002\.jpg and right/0002\.png"):
+        masked_photograph(Path("masks/right/0002.png"), PHOTOGRAPHS)
+    with pytest.raises(ConfigError, match="no photograph of this name"):
+        masked_photograph(Path("masks/0003.png"), PHOTOGRAPHS)
