@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 
 from octasplat.engine.errors import OctasplatError
 from octasplat.engine.light.stage_file import stage_complaint, stage_keys
+from octasplat.engine.operations.base import complaint
 from octasplat.service.intake.faults import IntakeRefused
 from octasplat.workers.records.errors import Conflict, Missing
 from octasplat.workers.records.quotas import QuotaExceeded
@@ -228,4 +229,4 @@ def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
     escaped = (str(part).replace("~", "~0").replace("/", "~1") for part in path)
     pointer = "#" + prefix + "".join(f"/{part}" for part in escaped)
     named = {"pointer": pointer} if where == "body" else {"parameter": "/".join(str(p) for p in path)}
-    return {"code": str(fault["type"]), "detail": str(fault["msg"]), **named}
+    return {"code": str(fault["type"]), "detail": complaint(str(fault["msg"])), **named}

@@ -140,8 +140,13 @@ def first_complaint(error: ValidationError, place: Callable[[str], str] = lambda
     """Return the first complaint of a validation as one sentence that names the field."""
     first = error.errors()[0]
     path = ".".join(str(part) for part in first["loc"])
-    message = first["msg"].removeprefix("Value error, ").removesuffix(".")
+    message = complaint(first["msg"])
     return f"{place(path)}: {message}." if path else f"{message}."
+
+
+def complaint(message: str) -> str:
+    """Return pydantic's message as it was raised by a validator, without a full stop."""
+    return message.removeprefix("Value error, ").removesuffix(".")
 
 
 def warn(progress: Listener, message: str) -> None:
@@ -162,6 +167,7 @@ __all__ = [
     "SceneRequest",
     "ScenesWritten",
     "build",
+    "complaint",
     "first_complaint",
     "ignore",
     "never",
