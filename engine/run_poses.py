@@ -67,7 +67,8 @@ def place_misfits(
     with stage("check", tell, CHECK_ITERATIONS):
         doubtful = doubtful_views(
             dataset,
-            config.train,
+            background=config.train.background,
+            seed=config.train.seed,
             threads=threads,
             should_stop=should_stop,
             progress=lambda done: tell(StageProgress("check", done, CHECK_ITERATIONS)),

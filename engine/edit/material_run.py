@@ -63,7 +63,7 @@ def change_materials(
     if not follows(source):
         return changed
     settings = read_config(source / CONFIG).train.materials
-    light = LearntLight(settings)
+    light = LearntLight(settings.environment_height)
     light.put(read_environment(source / ENVIRONMENT))
     frame = environment_frame(np.array(settings.up_world, np.float64))
     return with_harmonics_following(gaussians, changed, chosen, light.levels, frame)

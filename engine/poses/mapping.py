@@ -11,7 +11,7 @@ from typing import Any
 
 import pycolmap
 
-from octasplat.engine.poses.config import MIN_PHOTOGRAPHS, PosesConfig
+from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
 
 Counted = Callable[[int], None]
 
@@ -24,8 +24,8 @@ _BRIDGE_FIRST_INLIERS = 50
 def map_photographs(
     database: Path,
     photographs: Path,
-    config: PosesConfig,
     *,
+    seed: int,
     counted: Counted,
     weak: bool = False,
     start: Path | None = None,
@@ -35,7 +35,7 @@ def map_photographs(
     Args:
         database: with matches.
         photographs: folder.
-        config: settings.
+        seed: of everything random.
         counted: hears of photographs of the largest model so far.
         weak: place photographs by fewer matches, too.
         start: folder of a model to go on from.
@@ -45,9 +45,9 @@ def map_photographs(
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
-    options.random_seed = config.seed
-    options.mapper.random_seed = config.seed
-    options.triangulation.random_seed = config.seed
+    options.random_seed = seed
+    options.mapper.random_seed = seed
+    options.triangulation.random_seed = seed
     options.ba_use_gpu = False
     options.min_model_size = MIN_PHOTOGRAPHS
     options.extract_colors = False
@@ -71,7 +71,7 @@ def map_photographs(
     folder = database.with_name("models")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    pycolmap.set_random_seed(config.seed)
+    pycolmap.set_random_seed(seed)
     models: dict[int, Any] = pycolmap.incremental_mapping(
         database,
         photographs,

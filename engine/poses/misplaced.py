@@ -127,7 +127,7 @@ class _Hearing:
         matches = self._matches(k)
         if matches is None:
             return None
-        return placed_anew(matches, self._given(k), self._within(k), self._config)
+        return placed_anew(matches, self._given(k), self._within(k), seed=self._config.seed)
 
     def _matches(self, k: int) -> Matches | None:
         asked = {k, *self._seen} - (self._doubtful - {k})

@@ -21,8 +21,6 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from octasplat.engine.poses.config import PosesConfig
-
 Pose = tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]
 """Rotation and translation, camera from world."""
 
@@ -186,14 +184,14 @@ def fits(pose: Pose, matches: Matches, within: float) -> bool:
     return len(agrees) >= FEWEST_MATCHES and float(agrees.mean()) > GIVEN_SHARE
 
 
-def placed_anew(matches: Matches, given: Pose, within: float, config: PosesConfig) -> Pose | None:
+def placed_anew(matches: Matches, given: Pose, within: float, *, seed: int) -> Pose | None:
     """Where the matches say that the photograph was taken, if they contradict the given pose.
 
     Args:
         matches: of the photograph.
         given: the pose that they may contradict.
         within: distance at which a match agrees with a pose, see :func:`sampson_distances`.
-        config: settings.
+        seed: of the search for it.
 
     Returns:
         The new pose; None where the given one stays.
@@ -211,7 +209,7 @@ def placed_anew(matches: Matches, given: Pose, within: float, config: PosesConfi
     ]
     options = pycolmap.RANSACOptions()
     options.max_error = within
-    options.random_seed = config.seed
+    options.random_seed = seed
     options.max_num_trials = _MOST_TRIALS
     found = pycolmap.estimate_generalized_relative_pose(
         matches.partner_rays_cam[:, :2],

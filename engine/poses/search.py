@@ -130,7 +130,7 @@ class Search:
         count = len(self._names)
         with stage_of(STAGE, count, self._tell) as at:
             best = self._unfolded(
-                database, map_photographs(database, self._photographs, self._config, counted=at), at
+                database, map_photographs(database, self._photographs, seed=self._config.seed, counted=at), at
             )
             if rank(best)[0] < count:
                 best = self._place_the_rest(database, best, matched, at)
@@ -186,7 +186,7 @@ class Search:
             trial = database.with_name("trial.db")
             shutil.copy(database, trial)
             without_pairs(trial, false)
-            again = map_photographs(trial, self._photographs, self._config, counted=at)
+            again = map_photographs(trial, self._photographs, seed=self._config.seed, counted=at)
             if rank(again)[0] < rank(model)[0]:
                 break
             if pair_votes(again, trial).kept.sum() <= votes.kept.sum():
@@ -217,7 +217,9 @@ class Search:
             start = self._work / "start"
             start.mkdir(exist_ok=True)
             best.write_binary(start)
-        again = map_photographs(database, self._photographs, self._config, counted=at, weak=True, start=start)
+        again = map_photographs(
+            database, self._photographs, seed=self._config.seed, counted=at, weak=True, start=start
+        )
         return max(best, again, key=rank)
 
     def _leave_out_unread(self) -> None:

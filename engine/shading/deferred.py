@@ -68,7 +68,12 @@ class Deferred:
     def __init__(self, settings: MaterialSettings, *, extent_world: float, sided: bool = False) -> None:
         self.settings = settings
         self._sided = sided
-        self.light = LearntLight(settings)
+        self.light = LearntLight(
+            settings.environment_height,
+            hdr=settings.hdr and settings.recipe != "seed",
+            white_weight=settings.white_weight,
+            even_weight=settings.even_weight,
+        )
         self.frame = environment_frame(np.array(settings.up_world, np.float64))
         self._gap = settings.start * extent_world
         self._leaving = Leaving(self._gap, settings.leaves * extent_world)

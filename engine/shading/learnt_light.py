@@ -7,7 +7,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.shading.environment_levels import LightLevels, prefilter, resampled, solid_angles
 from octasplat.engine.shading.map_steps import adam_change, unevenness
-from octasplat.engine.shading.material_settings import ENVIRONMENT_EVERY, MaterialSettings
+from octasplat.engine.shading.material_settings import ENVIRONMENT_EVERY
 
 FIRST_RADIANCE = 0.5
 _DARKEST, _BRIGHTEST = np.log(1e-4), np.log(1e4)
@@ -23,6 +23,12 @@ class LearntLight:
     Args:
         settings: its size, rate and priors.
 
+    Args:
+        height: texels from up to down; there are twice as many around.
+        hdr: whether the radiance may be more than 1.
+        white_weight: weight of the distance of the colours to grey.
+        even_weight: weight of differences between neighbouring texels.
+
     Attributes:
         log_radiance: logarithm of the linear radiance.
         first: first moments of Adam; ``second`` holds the second ones.
@@ -30,10 +36,12 @@ class LearntLight:
         steps: iterations so far.
     """
 
-    def __init__(self, settings: MaterialSettings) -> None:
-        self._settings = settings
-        self._prefilter = prefilter(settings.environment_height)
-        height = settings.environment_height
+    def __init__(
+        self, height: int, *, hdr: bool = True, white_weight: float = 0.0, even_weight: float = 0.0
+    ) -> None:
+        self._brightest = _BRIGHTEST if hdr else 0.0
+        self._white_weight, self._even_weight = white_weight, even_weight
+        self._prefilter = prefilter(height)
         shape = (height, 2 * height, 3)
         self.log_radiance: Float32[np.ndarray, "h w 3"] = np.full(shape, np.log(FIRST_RADIANCE), np.float32)
         self.first: Float32[np.ndarray, "h w 3"] = np.zeros(shape, np.float32)
@@ -77,8 +85,7 @@ class LearntLight:
         self.sums[:] = 0
         count = self.steps[0] // ENVIRONMENT_EVERY
         self.first, self.second, change = adam_change(self.first, self.second, gradient, int(count))
-        brightest = _BRIGHTEST if self._settings.hdr and self._settings.recipe != "seed" else 0.0
-        radiance = np.clip(self.log_radiance - rate * change, _DARKEST, brightest)
+        radiance = np.clip(self.log_radiance - rate * change, _DARKEST, self._brightest)
         self.log_radiance = radiance.astype(np.float32)
         self._levels = None
 
@@ -87,8 +94,7 @@ class LearntLight:
         x = self.log_radiance.astype(np.float64)
         angles = solid_angles(len(x))[:, None, None] / (4 * np.pi)
         white = x - x.mean(axis=2, keepdims=True)
-        weights = self._settings
-        return angles * (weights.white_weight * white + weights.even_weight * unevenness(x))
+        return angles * (self._white_weight * white + self._even_weight * unevenness(x))
 
     def state(self) -> dict[str, np.ndarray]:
         """Radiance, moments and sums."""

@@ -25,6 +25,7 @@ PROPAGATION_UNTIL = 0.4
 """Share of the training at which that ends."""
 FIRST_ALBEDO, FIRST_METALLIC, FIRST_ROUGHNESS = 0.5, 0.5, 0.3
 """Materials that all Gaussians begin with: in the middle, and smooth enough to show what they reflect."""
+Recipe = Literal["split_sum", "seed"]
 
 
 class MaterialSettings(Settings):
@@ -35,7 +36,7 @@ class MaterialSettings(Settings):
         description="Learn materials and the light around the scene; nothing else of materials matters if "
         "not. For scenes that reflect; it takes longer and brings settings of its own.",
     )
-    recipe: Annotated[Literal["split_sum", "seed"], EXPERIMENTAL] = Field(
+    recipe: Annotated[Recipe, EXPERIMENTAL] = Field(
         "split_sum",
         description='split_sum is the way of octasplat; seed does what the code of "Reflective Gaussian '
         'Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a colour of its '

@@ -10,15 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from octasplat.engine.colour import composited
 from octasplat.engine.scene import Camera
 from octasplat.engine.scene.flow import flow_by_pose
 from octasplat.engine.scene.seen import turned
-from octasplat.engine.train.batches import still_background
-from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.pixel_sampler import Pixels
 
 STEPS = 2
@@ -107,10 +105,11 @@ class _Compared:
     noise: float
 
 
-def photograph_of(dataset: Pixels, view: int, size_px: tuple[int, int], config: TrainConfig) -> Photograph:
+def photograph_of(
+    dataset: Pixels, view: int, size_px: tuple[int, int], background_srgb: Float32[np.ndarray, "3"]
+) -> Photograph:
     """A view's photograph as a smooth function: its pixels are the coefficients of cubic B-splines."""
     width, height = size_px
-    background = still_background(config)
 
     def look(xy_px: Float64[np.ndarray, "n 2"]) -> Shown:
         known = (np.abs(xy_px) < FAR_PX).all(axis=1)
@@ -122,7 +121,7 @@ def photograph_of(dataset: Pixels, view: int, size_px: tuple[int, int], config: 
         y = np.minimum(first[:, None, None, 1] + np.arange(4)[None, :, None], height - 1)
         which, y, x = (np.broadcast_to(a, (len(xy_px), 4, 4)).reshape(-1) for a in (np.array(view), y, x))
         rgb, alpha, weight = dataset.pixels(*_contiguous(which, y, x))
-        colours = composited(rgb, alpha, background).reshape(-1, 4, 4, 3).astype(np.float64)
+        colours = composited(rgb, alpha, background_srgb).reshape(-1, 4, 4, 3).astype(np.float64)
         valid = inside & (weight.reshape(-1, 16) > 0).all(axis=1)
         share = np.clip(within - first - 1, 0.0, 1.0)
         (by_x, slope_x), (by_y, slope_y) = _spline(share[:, 0]), _spline(share[:, 1])

@@ -12,7 +12,13 @@ from octasplat.engine.colour import composited
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.shading.ray_windows import RayWindows
-from octasplat.engine.train.config import SIGHT_LINE_MARGIN, TrainConfig, most_gaussians, window_side_px
+from octasplat.engine.train.config import (
+    SIGHT_LINE_MARGIN,
+    Background,
+    TrainConfig,
+    most_gaussians,
+    window_side_px,
+)
 from octasplat.engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
 from octasplat.engine.train.shown import shown_share
 from octasplat.engine.train.sight_lines import PhotographsOfPoints, SightLines
@@ -129,12 +135,12 @@ class BatchSource:
         return count
 
     def _background(self, rng: np.random.Generator) -> Float32[np.ndarray, "3"]:
-        name = self._config.background
+        name: Background = self._config.background
         if name == "auto":
             name = "random" if self._dataset.has_alpha else "black"
         if name == "random":
             return rng.random(3, dtype=np.float32)
-        return still_background(self._config)
+        return still_background(name)
 
 
 class DrawnAhead:
@@ -167,9 +173,9 @@ class DrawnAhead:
         return self._source.draw(rng, turn) if begun is None else begun.result()
 
 
-def still_background(config: TrainConfig) -> Float32[np.ndarray, "3"]:
-    """The background that stays the same: white if asked for, else black."""
-    return np.full(3, 1.0 if config.background == "white" else 0.0, np.float32)
+def still_background(background: Background) -> Float32[np.ndarray, "3"]:
+    """Return the colour behind everything when views are compared: white if asked for, else black."""
+    return np.full(3, 1.0 if background == "white" else 0.0, np.float32)
 
 
 def grid_pixels(

@@ -16,7 +16,8 @@ from octasplat.engine.errors import Cancelled
 from octasplat.engine.scene import Dataset
 from octasplat.engine.threads import use_threads
 from octasplat.engine.trace.make import make_tracer
-from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.batches import still_background
+from octasplat.engine.train.config import Background, TrainConfig
 from octasplat.engine.train.first_state import first_state
 from octasplat.engine.train.misfits import LEAST_VIEWS, misfits, view_fits
 from octasplat.engine.train.trainer import Trainer
@@ -39,8 +40,9 @@ _SETTINGS: dict[str, object] = {
 
 def doubtful_views(
     dataset: Dataset,
-    config: TrainConfig,
     *,
+    background: Background,
+    seed: int,
     threads: int,
     should_stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda _done: None,
@@ -49,7 +51,8 @@ def doubtful_views(
 
     Args:
         dataset: the photographs.
-        config: of the training to come, whose background and seed are taken.
+        background: of the training to come.
+        seed: of the training to come.
         threads: of the training; 0 means all cores.
         should_stop: asked between iterations.
         progress: told the iterations done, of :data:`ITERATIONS`.
@@ -59,8 +62,8 @@ def doubtful_views(
     """
     if len(dataset.train_indices) < LEAST_VIEWS:
         return np.zeros(0, np.int64)
-    background = "auto" if config.background == "learnt" else config.background
-    trial = TrainConfig().model_copy(update={**_SETTINGS, "background": background, "seed": config.seed})
+    behind: Background = "auto" if background == "learnt" else background
+    trial = TrainConfig().model_copy(update={**_SETTINGS, "background": behind, "seed": seed})
     try:
         with tempfile.TemporaryDirectory() as folder:
             trainer = Trainer(
@@ -82,7 +85,9 @@ def doubtful_views(
         ) from None
     tracer = make_tracer(trial.trace, threads=threads)
     tracer.build(gaussians, trainer.shading.features(gaussians))
-    fits = view_fits(dataset, np.arange(len(dataset.views)), trial, tracer, trainer.shading)
+    fits = view_fits(
+        dataset, np.arange(len(dataset.views)), still_background(behind), tracer, trainer.shading
+    )
     doubtful = misfits(fits, dataset.views, dataset.train_indices, DOUBT_SIGMAS)
     most = min(MOST_IN_DOUBT, int(MOST_SHARE_IN_DOUBT * len(dataset.views)))
     return np.sort(doubtful[:most])

@@ -8,15 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from octasplat.engine.colour import composited
 from octasplat.engine.psnr import colour_corrected, psnr
 from octasplat.engine.scene import View
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.batches import still_background
-from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.pixel_sampler import TrainingData
 from octasplat.engine.train.view_grids import shown_on_grids
 
@@ -51,16 +49,17 @@ class ViewFits:
 def view_fits(
     dataset: TrainingData,
     indices: Int64[np.ndarray, " v"],
-    config: TrainConfig,
+    background_srgb: Float32[np.ndarray, "3"],
     tracer: Tracer,
     shading: ShadingModel,
 ) -> ViewFits:
     """Measure the Gaussians that ``tracer`` holds on the views ``indices``; changes nothing."""
     plain, corrected = [], []
-    background = still_background(config)
-    for grids in shown_on_grids(dataset, indices, background, tracer, shading, tiles=TILES, exposed=True):
+    for grids in shown_on_grids(
+        dataset, indices, background_srgb, tracer, shading, tiles=TILES, exposed=True
+    ):
         rgb, alpha, weight = dataset.pixels(*grids.pixels)
-        target = composited(rgb, alpha, background).reshape(grids.rgb_srgb.shape)
+        target = composited(rgb, alpha, background_srgb).reshape(grids.rgb_srgb.shape)
         counts = (weight > 0).astype(np.float32).reshape(len(target), -1)
         for shown, photograph, valid in zip(grids.rgb_srgb, target, counts, strict=True):
             plain.append(psnr(shown, photograph, valid))
@@ -172,12 +171,12 @@ class ViewJudge:
 
     Args:
         dataset: the photographs.
-        config: says what is behind them.
+        background_srgb: what is behind them.
     """
 
-    def __init__(self, dataset: TrainingData, config: TrainConfig) -> None:
+    def __init__(self, dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"]) -> None:
         self._dataset = dataset
-        self._config = config
+        self._background_srgb = background_srgb
 
     def misfits(
         self, tracer: Tracer, shading: ShadingModel, left_out: Int64[np.ndarray, " k"]
@@ -185,7 +184,7 @@ class ViewJudge:
         """Training views to leave out besides others, as the Gaussians that ``tracer`` holds show them."""
         train = self._dataset.train_indices
         used = np.setdiff1d(train, left_out)
-        fits = view_fits(self._dataset, used, self._config, tracer, shading)
+        fits = view_fits(self._dataset, used, self._background_srgb, tracer, shading)
         room = int(MOST_LEFT_OUT * len(train)) - len(left_out)
         return np.sort(misfits(fits, self._dataset.views, used)[: max(0, room)])
 
@@ -196,7 +195,7 @@ class ViewJudge:
         dataset = self._dataset
         used = np.setdiff1d(dataset.train_indices, left_out)
         indices = np.concatenate([used, dataset.test_indices])
-        fits = view_fits(dataset, indices, self._config, tracer, shading)
+        fits = view_fits(dataset, indices, self._background_srgb, tracer, shading)
         found = misfits(fits, dataset.views, used)
         names = [view.name for view in dataset.views]
         psnr = dict(zip(fits.indices.tolist(), fits.psnr.tolist(), strict=True))

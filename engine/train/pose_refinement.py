@@ -12,14 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.scene.seen import turned
 from octasplat.engine.shading.protocol import ShadingModel, Sight
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.engine.train.alignment import Motion, Rendered, aligned, photograph_of
-from octasplat.engine.train.batches import grid_pixels, still_background
-from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.batches import grid_pixels
 from octasplat.engine.train.corrected_views import CorrectedViews, PosedPhotographs, without_common
 from octasplat.engine.train.pixel_sampler import view_sizes_px
 
@@ -80,15 +79,15 @@ class PoseRefiner:
 
     Args:
         dataset: the photographs with the poses that are given.
-        config: says what is behind them.
+        background_srgb: what is behind them.
 
     Attributes:
         dataset: the photographs as they are to be trained on.
     """
 
-    def __init__(self, dataset: PosedPhotographs, config: TrainConfig) -> None:
+    def __init__(self, dataset: PosedPhotographs, background_srgb: Float32[np.ndarray, "3"]) -> None:
         self.dataset = CorrectedViews(dataset)
-        self._config = config
+        self._background_srgb = background_srgb
 
     def refine(
         self,
@@ -105,7 +104,8 @@ class PoseRefiner:
         used = np.setdiff1d(dataset.train_indices, left_out)
         for index, rendered in self._rendered(used, tracer, shading):
             view = dataset.views[index]
-            photograph = photograph_of(dataset, index, (view.width_px, view.height_px), self._config)
+            size_px = (view.width_px, view.height_px)
+            photograph = photograph_of(dataset, index, size_px, self._background_srgb)
             motion = aligned(rendered, photograph, dataset.cameras[view.camera_index])
             if motion is not None:
                 found[index] = motion.share(TAKEN).after(Motion.of(found[index])).numbers
@@ -150,7 +150,7 @@ class PoseRefiner:
             rays = dataset.rays(view, y, x)
             seen = tracer.trace(rays)
             developed = shading.develop(Sight(rays, seen, tracer, view))
-            rgb = np.clip(developed.over(still_background(self._config)), 0, 1)
+            rgb = np.clip(developed.over(self._background_srgb), 0, 1)
             met = (seen.depth_median > 0) & (seen.alpha >= OPAQUE)
             points_world = seen.depth_median[:, None].astype(np.float64) * rays.directions_world
             for index in some.tolist():

@@ -12,9 +12,7 @@ from octasplat.engine.events import HeldOutMeasured, Listener, Warned
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.shading.protocol import ShadingModel, Sight
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.batches import still_background
 from octasplat.engine.train.checkpoint import BestState, load_best, save_best
-from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.pixel_sampler import PixelSampler, TrainingData, view_sizes_px
 from octasplat.engine.train.shading import exposures_of
 from octasplat.engine.train.state import TrainState
@@ -36,13 +34,16 @@ class Probe:
 
 
 def draw_probe(
-    dataset: TrainingData, indices: Int64[np.ndarray, " v"], config: TrainConfig, rng: np.random.Generator
+    dataset: TrainingData,
+    indices: Int64[np.ndarray, " v"],
+    count: int,
+    background_srgb: Float32[np.ndarray, "3"],
+    rng: np.random.Generator,
 ) -> Probe:
-    """``config.probe_rays`` pixels of the views ``indices``."""
-    view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, config.probe_rays)
+    """Draw ``count`` pixels of the views ``indices``."""
+    view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, count)
     rgb, alpha, weight = dataset.pixels(view, y, x)
-    background = still_background(config)
-    return Probe(view, y, x, composited(rgb, alpha, background), weight, background)
+    return Probe(view, y, x, composited(rgb, alpha, background_srgb), weight, background_srgb)
 
 
 def measure(
@@ -76,21 +77,35 @@ class Judge:
 
     Args:
         dataset: the photographs; probes are drawn from it.
-        config: their size and seed.
         folder: the best state goes here.
         listener: hears of the held-out views.
+        rays: number of rays of a probe.
+        background_srgb: what is behind the photographs.
+        step_back_db: the best state is chosen where the last one is so much worse.
+        seed: of the choice of rays.
     """
 
-    def __init__(self, dataset: TrainingData, config: TrainConfig, folder: Path, listener: Listener) -> None:
+    def __init__(
+        self,
+        dataset: TrainingData,
+        folder: Path,
+        listener: Listener,
+        *,
+        rays: int,
+        background_srgb: Float32[np.ndarray, "3"],
+        step_back_db: float,
+        seed: int,
+    ) -> None:
         # A generator of its own, so that measuring never changes the training.
-        rng = np.random.Generator(np.random.PCG64([config.seed, 1]))
-        self._probe = draw_probe(dataset, dataset.train_indices, config, rng)
+        rng = np.random.Generator(np.random.PCG64([seed, 1]))
+        self._probe = draw_probe(dataset, dataset.train_indices, rays, background_srgb, rng)
         self._held_out = None
         if len(dataset.test_indices):
-            self._held_out = draw_probe(dataset, dataset.test_indices, config, rng)
+            self._held_out = draw_probe(dataset, dataset.test_indices, rays, background_srgb, rng)
         self._dataset = dataset
         self._folder = folder
-        self._config = config
+        self._background_srgb = background_srgb
+        self._step_back_db = step_back_db
         self._tell = listener
 
     def inspect(self, state: TrainState, tracer: Tracer, shading: ShadingModel) -> None:
@@ -104,7 +119,7 @@ class Judge:
                 f"Parameters became not-a-number by iteration {state.iteration}; nothing is exported. "
                 "The last checkpoint is kept."
             )
-        guess_exposures(self._dataset, self._config, tracer, shading)
+        guess_exposures(self._dataset, self._background_srgb, tracer, shading)
         psnr, alpha = measure(self._probe, self._dataset, tracer, shading)
         if alpha < EMPTY_ALPHA and state.iteration > 0:
             raise TrainingFailure(
@@ -125,7 +140,7 @@ class Judge:
         The shading and the pose corrections of ``state`` become theirs, too.
         """
         last, _ = measure(self._probe, self._dataset, tracer, shading)
-        if last >= state.best_psnr - self._config.step_back_db:
+        if last >= state.best_psnr - self._step_back_db:
             return state.gaussians
         self._tell(
             Warned(

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 
 from octasplat.engine.errors import Cancelled, ConfigError, TrainingFailure
 from octasplat.engine.events import CheckpointWritten, Listener, TrainingProgress, Warned
@@ -16,7 +16,7 @@ from octasplat.engine.scene.seen import SeenSpace
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.make import make_tracer
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.batches import BatchSource, DrawnAhead
+from octasplat.engine.train.batches import BatchSource, DrawnAhead, still_background
 from octasplat.engine.train.checkpoint import save_checkpoint
 from octasplat.engine.train.config import TrainConfig, most_gaussians
 from octasplat.engine.train.corrected_views import PosedPhotographs
@@ -103,7 +103,8 @@ class Trainer:
         self._should_stop = should_stop
         self._extent = dataset.extent
         self._threads = threads
-        self._refiner = _refiner(dataset, config)
+        self._background_srgb = still_background(config.background)
+        self._refiner = _refiner(dataset, self._background_srgb) if config.refine_poses else None
         if self._refiner is not None:
             dataset = self._refiner.dataset
             if len(state.pose_corrections):
@@ -122,7 +123,7 @@ class Trainer:
             max_gaussians=most_gaussians(config, pixels, shown),
         )
         if config.materials.learn and config.materials.propagation:
-            densifier = Propagating(densifier, config.materials, iterations=self.schedule.iterations)
+            densifier = Propagating(densifier, config.materials.recipe, iterations=self.schedule.iterations)
         if state.hastened_after is not None:
             self.schedule = self.schedule.hastened(state.hastened_after)
         self.shading = shading or make_shading(config, len(dataset.views), dataset.extent)
@@ -132,9 +133,17 @@ class Trainer:
             self.shading.restore(state.shading)
         self._given_tracer = tracer
         self._machinery = Machinery(tracer or self._make_tracer(), self.shading, densifier)
-        self._judge = Judge(dataset, config, folder, listener)
+        self._judge = Judge(
+            dataset,
+            folder,
+            listener,
+            rays=config.probe_rays,
+            background_srgb=self._background_srgb,
+            step_back_db=config.step_back_db,
+            seed=config.seed,
+        )
         self._names = [view.name for view in dataset.views]
-        self._view_judge = ViewJudge(dataset, config)
+        self._view_judge = ViewJudge(dataset, self._background_srgb)
         self.views: TrainingViews | None = None
         self.poses: RefinedPoses | None = None
         if len(state.left_out):
@@ -199,7 +208,7 @@ class Trainer:
             if self._refiner is not None:
                 self._refiner.dataset.put(state.pose_corrections)
             machinery.tracer.build(chosen, machinery.shading.features(chosen))
-        guess_exposures(self._dataset, self._config, machinery.tracer, machinery.shading)
+        guess_exposures(self._dataset, self._background_srgb, machinery.tracer, machinery.shading)
         self.views = self._view_judge.conclude(machinery.tracer, machinery.shading, state.left_out)
         if (complaint := self.views.complaint()) is not None:
             self._tell(Warned(complaint))
@@ -382,9 +391,7 @@ class Trainer:
         )
 
 
-def _refiner(dataset: TrainingData, config: TrainConfig) -> PoseRefiner | None:
-    if not config.refine_poses:
-        return None
+def _refiner(dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"]) -> PoseRefiner:
     if not isinstance(dataset, PosedPhotographs):
         raise ConfigError("refine_poses projects into the photographs, but these come without cameras.")
-    return PoseRefiner(dataset, config)
+    return PoseRefiner(dataset, background_srgb)

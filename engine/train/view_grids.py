@@ -8,8 +8,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from octasplat.engine.shading.protocol import ShadingModel, Sight
 from octasplat.engine.trace.protocol import Tracer
-from octasplat.engine.train.batches import grid_pixels, still_background
-from octasplat.engine.train.config import TrainConfig
+from octasplat.engine.train.batches import grid_pixels
 from octasplat.engine.train.pixel_sampler import TrainingData, view_sizes_px
 from octasplat.engine.train.shading import exposures_of
 
@@ -65,21 +64,21 @@ def shown_on_grids(
 
 
 def guess_exposures(
-    dataset: TrainingData, config: TrainConfig, tracer: Tracer, shading: ShadingModel
+    dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"], tracer: Tracer, shading: ShadingModel
 ) -> None:
     """Give held-out views the exposures that a camera would choose there, where exposures are learnt."""
     exposures = exposures_of(shading)
     if exposures is not None and exposures.steps.any():
         names = [view.name for view in dataset.views]
-        exposures.guess_others(names, _brightness(dataset, config, tracer, shading))
+        exposures.guess_others(names, _brightness(dataset, background_srgb, tracer, shading))
 
 
 def _brightness(
-    dataset: TrainingData, config: TrainConfig, tracer: Tracer, shading: ShadingModel
+    dataset: TrainingData, background_srgb: Float32[np.ndarray, "3"], tracer: Tracer, shading: ShadingModel
 ) -> Float64[np.ndarray, " v"]:
     """The mean display value that each view would have with the mean exposure."""
     shown = shown_on_grids(
-        dataset, np.arange(len(dataset.views)), still_background(config), tracer, shading,
+        dataset, np.arange(len(dataset.views)), background_srgb, tracer, shading,
         tiles=BRIGHTNESS_TILES, exposed=False,
     )  # fmt: skip
     return np.concatenate([grids.rgb_srgb.mean(axis=(1, 2), dtype=np.float64) for grids in shown])

@@ -153,7 +153,7 @@ def test_a_render_that_is_right_tells_the_pose_in_whatever_exposure() -> None:
         plane = origins - ways * (origins[:, 2:] / ways[:, 2:])
         given = world.views[index]
         shown = 0.7 * world.shown(rays)[0].astype(np.float64) + 0.1
-        look = photograph_of(world, index, (SIDE_PX, SIDE_PX), small_config())
+        look = photograph_of(world, index, (SIDE_PX, SIDE_PX), np.zeros(3, np.float32))
         motion = aligned(Rendered(points_in_cam(plane, given), shown), look, world.cameras[0])
         assert motion is not None
         found[given.name] = corrected(given, motion)

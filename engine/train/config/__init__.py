@@ -17,6 +17,7 @@ from octasplat.engine.train.config.photographs import (
     BACKGROUND_SMOOTHNESS,
     MISFITS_AFTER,
     SIGHT_LINE_MARGIN,
+    Background,
     PhotographSettings,
 )
 from octasplat.engine.train.config.presets import preset, with_materials
@@ -29,6 +30,7 @@ __all__ = [
     "MISFITS_AFTER",
     "MOST_PLANNED_ITERATIONS",
     "SIGHT_LINE_MARGIN",
+    "Background",
     "LearningRates",
     "LossWeights",
     "McmcConfig",

@@ -13,12 +13,13 @@ MISFITS_AFTER = 0.3
 """Share of the iterations after which checkpoints look for views that do not fit: earlier, all misfit."""
 SIGHT_LINE_MARGIN = 0.003
 """Distance before its sparse point at which a line of sight ends, of its length."""
+Background = Literal["auto", "black", "white", "random", "learnt"]
 
 
 class PhotographSettings(Settings):
     """Background, exposure, and views that do not fit the others."""
 
-    background: Annotated[Literal["auto", "black", "white", "random", "learnt"], BASIC] = Field(
+    background: Annotated[Background, BASIC] = Field(
         "auto",
         description="What is behind everything: auto is random for photographs with alpha, else black; "
         "learnt is a map of what is infinitely far away, such as the sky, for captures outdoors.",

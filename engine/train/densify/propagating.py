@@ -16,7 +16,12 @@ from scipy.spatial import cKDTree
 from octasplat.engine.gaussians.frames import quaternions
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
-from octasplat.engine.shading.material_settings import PROPAGATION_EVERY, PROPAGATION_UNTIL, MaterialSettings
+from octasplat.engine.shading.material_settings import (
+    PROPAGATION_EVERY,
+    PROPAGATION_UNTIL,
+    SEED_SECOND_STAGE,
+    Recipe,
+)
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.densify.protocol import Densifier
 from octasplat.engine.train.optimiser import Adam
@@ -38,14 +43,14 @@ class Propagating:
 
     Args:
         inner: the strategy.
-        settings: when, and how.
+        recipe: how.
         iterations: of the whole training.
     """
 
-    def __init__(self, inner: Densifier, settings: MaterialSettings, *, iterations: int) -> None:
+    def __init__(self, inner: Densifier, recipe: Recipe, *, iterations: int) -> None:
         self.wants_errors = inner.wants_errors
         self._inner = inner
-        self._settings = settings
+        self._recipe = recipe
         self._every = max(1, round(PROPAGATION_EVERY * iterations))
         self._until = PROPAGATION_UNTIL * iterations
         self._total = iterations
@@ -70,7 +75,7 @@ class Propagating:
         if self._inner.due(iteration):
             gaussians, adam = self._inner.apply(gaussians, adam, rng, extent=extent)
         if self._propagates(iteration) and len(gaussians) > NEIGHBOURS:
-            if self._settings.recipe == "seed":
+            if self._recipe == "seed":
                 self._spread(gaussians, rng, progress=iteration / self._total)
             else:
                 propagate_normals(gaussians)
@@ -98,7 +103,7 @@ class Propagating:
         metallic = gaussians.channels[METALLIC][:, 0] >= SEED_METALLIC
         smooth = gaussians.channels[ROUGHNESS][:, 0] <= SEED_ROUGHNESS
         gaussians.log_scales[metallic & smooth] += np.float32(np.log(SEED_GROWTH))
-        if self._settings.is_seed_deferred(progress):
+        if progress >= SEED_SECOND_STAGE:
             matt = np.flatnonzero(~metallic)
             noise = rng.uniform(-SEED_NOISE, SEED_NOISE, (len(matt), 3)) / SH_C0
             gaussians.sh[matt, 0] += noise.astype(np.float32)
