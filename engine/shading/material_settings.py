@@ -44,7 +44,7 @@ class MaterialSettings(Settings):
         "values, visibility is yes or no, and materials start over when deferred shading "
         "begins.",
     )
-    up_world: Annotated[tuple[float, float, float], Unit("world direction"), BASIC] = Field(
+    up_world: Annotated[tuple[float, float, float], Unit("world direction"), ADVANCED] = Field(
         (0.0, 0.0, 1.0),
         description="Direction that is up in the world; it says which way the environment lies. Set it "
         "where the model of the cameras is turned.",

@@ -23,7 +23,7 @@ from octasplat.service.schemas.jobs import JobChange, RetryRequest
 from octasplat.service.state import Service, ServiceDep
 from octasplat.service.threads import Threads, in_thread
 from octasplat.service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
-from octasplat.service.web.forms import WITHOUT_FORM, options_form
+from octasplat.service.web.forms import WITH_ANOTHER_FORM, options_form
 from octasplat.service.web.light import light_form
 from octasplat.service.web.reading import job_counts, job_detail, job_lines, photographs_of
 from octasplat.service.web.relight import relight_form
@@ -96,7 +96,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
     extra = [
         kind
         for kind in job_kinds()
-        if kind.needs == "result" and kind.name not in WITHOUT_FORM and _fits(kind.source_files, by_name)
+        if kind.needs == "result" and kind.name not in WITH_ANOTHER_FORM and _fits(kind.source_files, by_name)
     ]
     return page(
         request,
@@ -119,6 +119,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         background=config.get("reconstruction", {}).get("evaluate_background", "black"),
         photograph=shown if any(file.path == shown for file in photographs) else None,
         further=[options_form(kind, unwritable) for kind in extra] if who.may("write") else [],
+        max_file_bytes=service.settings.max_upload_bytes,
     )
 
 

@@ -5,12 +5,14 @@ from itertools import chain
 
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.preset_names import PRESETS
-from octasplat.service.web.forms import Field, OptionsForm, options_form
+from octasplat.service.web.form_fields import Field
+from octasplat.service.web.forms import OptionsForm, options_form
 from octasplat.workers.work.kinds import job_kinds, kind_named
 
 
 def fields_of(form: OptionsForm) -> dict[str, Field]:
-    return {f.path: f for f in chain(form.first, *(section.fields for section in form.more))}
+    folded = chain(*(section.fields for section in form.more), form.experimental)
+    return {f.path: f for f in chain(form.first, folded)}
 
 
 def leaves(values: dict, prefix: str = "") -> set[str]:
@@ -45,7 +47,7 @@ def test_limits_choices_and_words() -> None:
     assert fields["train.patch_fraction"].high == 1 and fields["train.patch_fraction"].control == "number"
     assert [choice.value for choice in fields["poses"].choices] == ["given", "auto", "missing"]
     assert fields["held_out"].control == "list"
-    assert "hold out" in fields["held_out"].help.lower()  # from the docstring
+    assert "hold out" in fields["held_out"].help.lower()
     assert fields["train.rays"].help == TrainConfig.model_fields["rays"].description
     assert fields["train.densify.growth"].help.startswith("Only for mcmc")
     assert not fields["train.densify.start"].help.startswith("Only for")
@@ -65,3 +67,28 @@ def test_every_kind_has_a_form() -> None:
         form = options_form(kind)
         names = list(fields_of(form))
         assert len(names) == len(set(names))
+
+
+def test_basic_fields_are_open_others_folded() -> None:
+    form = options_form(kind_named("reconstruct"))
+    assert {"train.iterations", "train.background", "train.materials.learn"} <= {f.path for f in form.first}
+    assert {f.group for f in form.first} == {"basic"}
+    assert {f.group for section in form.more for f in section.fields} == {"advanced"}
+    assert "train.lift_unseen" in {f.path for f in form.experimental}
+
+
+def test_fields_have_units() -> None:
+    fields = fields_of(options_form(kind_named("reconstruct")))
+    assert fields["max_side"].unit == "px" and fields["train.stop_early"].unit == "dB"
+
+
+def test_values_of_several_types_are_chosen_where_all_are_known() -> None:
+    exposure = fields_of(options_form(kind_named("reconstruct")))["train.exposure"]
+    assert exposure.control == "choice"
+    assert [choice.value for choice in exposure.choices] == ["true", "false", "auto"]
+
+
+def test_boxes_are_numbers_and_files_are_sent() -> None:
+    fields = fields_of(options_form(kind_named("material")))
+    assert fields["box"].control == "numbers"
+    assert fields["mesh"].control == "upload" and fields["masks"].control == "uploads"

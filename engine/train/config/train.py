@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from octasplat.engine.fields import ADVANCED, BASIC, EXPERIMENTAL, Unit
+from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.trace.protocol import TraceSettings
 from octasplat.engine.train.config.densify import McmcConfig, PaperConfig
@@ -102,7 +102,7 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
         description="The best state is exported where the last one's probe is so much worse. Lower it where "
         "trainings get worse towards their end.",
     )
-    seed: Annotated[int, BASIC] = Field(
+    seed: Annotated[int, ADVANCED] = Field(
         0, ge=0, description="Seed of everything random; the same seed gives the same bytes."
     )
 

@@ -24,13 +24,6 @@ export function holds(needs, values) {
     return wanted === "*" ? Boolean(values[name]) : wanted.split(" ").includes(String(values[name]));
 }
 
-/** What a file is called by options: plain letters, which every system takes; null where there is none. */
-export function plainName(file, otherwise) {
-    if (!file) return null;
-    const clean = file.name.replace(/[^A-Za-z0-9._-]+/g, "_").replace(/^[._-]+/, "").slice(-80);
-    return clean.replace(/\.[^.]*$/, (suffix) => suffix.toLowerCase()) || otherwise;
-}
-
 /** Files sent as a dataset that holds files, once for as long as they are the same. */
 export class SentFiles {
     constructor(title, largest, say) {

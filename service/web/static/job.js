@@ -4,7 +4,7 @@ import { Charts, Training } from "./charts.js";
 import { comparison } from "./compare.js";
 import { thousands } from "./numbers.js";
 import "./table.js";
-import "./options.js";
+import "./job_forms.js";
 
 const about = document.getElementById("about");
 const api = `/v1/jobs/${about.dataset.job}`;

@@ -1,6 +1,6 @@
 // Forms of options: what is filled in becomes the options of a job; what is left empty stays as it is.
 
-import { notify } from "./app.js";
+import { plainName } from "./file_names.js";
 
 /** The options that a form asks for, nested. */
 export function readOptions(form) {
@@ -16,13 +16,31 @@ export function readOptions(form) {
 }
 
 function valueOf(field) {
+    if (field.dataset.type.startsWith("upload")) return uploadNames(field);
     if (field.dataset.type === "files") return [...field.querySelectorAll("input:checked")].map((box) => box.value);
     const text = field.value.trim();
     if (text === "") return undefined;
     if (field.dataset.type === "number") return Number(text);
     if (field.dataset.type === "yes_no") return text === "true";
+    if (field.dataset.type === "numbers") return text.split(/[\s,]+/).map(Number);
+    if (field.dataset.type === "json") return JSON.parse(text);
     if (field.dataset.type === "list") return text.split(",").map((part) => part.trim()).filter(Boolean);
     return text;
+}
+
+/** The names by which options know the files of a field; undefined where none was chosen. */
+function uploadNames(field) {
+    const names = [...field.files].map((file) => plainName(file, "file"));
+    if (!names.length) return undefined;
+    return field.dataset.type === "uploads" ? names : names[0];
+}
+
+/** The files that a form sends, as [{name, file}]. */
+export function filesOf(form) {
+    const files = [...form.querySelectorAll("[data-type^=upload]")].flatMap((field) => [...field.files].map((file) => ({ name: plainName(file, "file"), file })));
+    const double = files.find(({ name }, place) => files.some((other, before) => before < place && other.name === name));
+    if (double) throw new Error(`Two of the files are called ${double.name}; give one another name.`);
+    return files;
 }
 
 /** Defaults that depend on the preset follow it. */
@@ -63,22 +81,4 @@ export async function answer(response) {
         return problem.type?.endsWith(":options") ? `${where}: ${fault.detail}` : fault.detail;
     });
     throw error;
-}
-
-for (const form of document.querySelectorAll("form.options[data-source]")) {
-    form.addEventListener("submit", async (event) => {
-        event.preventDefault();
-        const fault = form.querySelector(".fault"), button = form.querySelector("[type=submit]");
-        button.disabled = true;
-        fault.hidden = true;
-        try {
-            const body = { kind: form.dataset.kind, source_id: form.dataset.source, options: readOptions(form) };
-            location.href = `/jobs/${await queueJob(body, crypto.randomUUID?.() ?? String(Math.random()))}`;
-        } catch (error) {
-            fault.textContent = [error.message, ...(error.faults ?? [])].join(" ");
-            fault.hidden = false;
-            button.disabled = false;
-            notify("It was not queued.", true);
-        }
-    });
 }

@@ -1,6 +1,7 @@
 // The form of a stage on a finished job's page: what it says becomes a stage, which is shown, tried and rendered.
 
-import { SentFiles, fieldValues, holds, plainName, showFields } from "../form_parts.js";
+import { plainName } from "../file_names.js";
+import { SentFiles, fieldValues, holds, showFields } from "../form_parts.js";
 import { answer, queueJob } from "../options.js";
 import { Trials, sentences } from "../trial.js";
 import { meshExtent } from "./mesh_extent.js";

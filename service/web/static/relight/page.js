@@ -1,6 +1,7 @@
 // The form of another light on the page of a finished job with materials.
 
-import { SentFiles, fieldValues, holds, plainName, showFields } from "../form_parts.js";
+import { plainName } from "../file_names.js";
+import { SentFiles, fieldValues, holds, showFields } from "../form_parts.js";
 import { answer, queueJob } from "../options.js";
 import { Trials, sentences } from "../trial.js";
 import { readHdr } from "../viewer/environment.js";

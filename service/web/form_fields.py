@@ -1,0 +1,280 @@
+"""Fields of forms, made from the JSON Schema of options: one for each setting."""
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
+
+from octasplat.engine.fields import Level
+from octasplat.engine.files import exporters
+
+Control = Literal[
+    "choice", "yes_no", "whole", "number", "text", "document", "list", "numbers", "json", "files",
+    "upload", "uploads",
+]  # fmt: skip
+
+FILE_NAMES = {
+    "glb": "mesh.glb",
+    "mesh-ply": "mesh.ply",
+    "obj": "mesh.obj",
+    "spz": "scene.spz",
+    "sog": "scene.sog",
+    "splat": "scene.splat",
+    "khr-glb": "scene.splats.glb",
+    "usd": "scene.usdz",
+}
+"""A file name by format."""
+_LABELS = {
+    "max_side": "Longest side",
+    "minutes": "Minutes of training",
+    "max_gaussians": "Most Gaussians",
+    "test_every": "Hold out every n-th view",
+    "exports": "Files to write",
+    "files": "Files to write",
+    "sh_degree": "Spherical harmonics, degree",
+    "fps": "Images per second",
+    "q": "Squared octagon radius",
+    "where": "Where",
+    "materials.learn": "Learn materials and light",
+    "set.albedo": "Base colour",
+    "scale.albedo": "Base colour, times",
+    "scale.metallic": "Metallic, times",
+    "scale.roughness": "Roughness, times",
+}
+_LOADED = ("stage", "photographs", "camera_path")
+"""Options that forms of their own, or the viewer, ask for."""
+_SHORT = re.compile(r"\b(sh|ssim|l1|l2|fov)\b", re.IGNORECASE)
+_UNIT_IN_NAME = re.compile(r" (px|degrees|db|gb)$")
+_CHOICES = {
+    ("poses", "given"): "use the COLMAP model",
+    ("poses", "auto"): "find them",
+    ("poses", "missing"): "use the model, else find them",
+}
+
+Presets = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of several values: what is sent, what is shown, and whether nobody can do it."""
+
+    value: str
+    text: str
+    lacking: bool = False
+
+
+@dataclass(frozen=True)
+class Field:
+    """One setting.
+
+    Attributes:
+        path: where it goes in the options, with dots.
+        label: its name for people.
+        control: how it is asked for.
+        help: what it does.
+        unit: unit of a number.
+        group: how many users need it.
+        choices: for ``choice`` and ``files``.
+        default: as text; an empty field means it.
+        defaults: JSON of the default by preset, where that differs.
+        low: smallest value.
+        high: largest value.
+        required: whether it has to be given.
+    """
+
+    path: str
+    label: str
+    control: Control
+    help: str
+    unit: str = ""
+    group: Level = "basic"
+    choices: tuple[Choice, ...] = ()
+    default: str = ""
+    defaults: str = ""
+    low: float | None = None
+    high: float | None = None
+    required: bool = False
+
+    @property
+    def name(self) -> str:
+        """For ids in the page."""
+        return self.path.replace(".", "-")
+
+
+def fields_of(schema: Mapping[str, Any], presets: Presets) -> Iterator[Field]:
+    """Yield the field of each setting of a JSON Schema.
+
+    Args:
+        schema: of the options.
+        presets: values of the options by preset, for options that begin from one.
+    """
+    yield from _walk(schema, schema, "", presets)
+
+
+def label_of(name: str) -> str:
+    """Return a name of the program as words."""
+    words = _UNIT_IN_NAME.sub("", name.replace("_", " ")).capitalize()
+    return _SHORT.sub(lambda found: found[0].upper(), words)
+
+
+def _walk(
+    root: Mapping[str, Any], schema: Mapping[str, Any], prefix: str, presets: Presets
+) -> Iterator[Field]:
+    required = set(schema.get("required", ()))
+    for name, raw in schema["properties"].items():
+        given = _resolved(root, raw)
+        path = f"{prefix}{name}"
+        if path in _LOADED:
+            continue
+        if "oneOf" in given:  # one of several sections, told apart by their kind
+            yield from _variants(root, given, path, presets)
+        elif "properties" in given:
+            yield from _walk(root, given, f"{path}.", presets)
+        elif "const" not in given:
+            yield _field(path, given, raw.get("default"), presets, name in required)
+
+
+def _variants(
+    root: Mapping[str, Any], given: Mapping[str, Any], path: str, presets: Presets
+) -> Iterator[Field]:
+    kinds: list[Choice] = []
+    inner: dict[str, tuple[Field, list[str]]] = {}
+    for reference in given["oneOf"]:
+        variant = _resolved(root, reference)
+        kind = str(variant["properties"]["kind"]["const"])
+        kinds.append(Choice(kind, kind))
+        for item in _walk(root, variant, f"{path}.", presets):
+            inner.setdefault(item.path, (item, []))[1].append(kind)
+    values = {name: _at(values, f"{path}.kind") for name, values in presets.items()}
+    yield Field(
+        f"{path}.kind",
+        path.rpartition(".")[2].capitalize(),
+        "choice",
+        _sentence(given.get("description", "")),
+        group="advanced",
+        choices=tuple(kinds),
+        defaults=_json(values),
+    )
+    for item, users in inner.values():
+        only = "" if len(users) == len(kinds) else f"Only for {' and '.join(users)}"
+        yield replace(item, help=": ".join(text for text in (only, item.help) if text))
+
+
+def _field(path: str, schema: Mapping[str, Any], default: object, presets: Presets, required: bool) -> Field:
+    name = path.rpartition(".")[2]
+    by_preset = {key: _at(values, path) for key, values in presets.items()}
+    by_preset = {key: value for key, value in by_preset.items() if value is not _MISSING}
+    control, values = _control(name, schema)
+    choices = _file_choices() if control == "files" else tuple(_choice(name, value) for value in values)
+    return Field(
+        path=path,
+        label=_LABELS.get(path) or _LABELS.get(name) or label_of(name),
+        control=control,
+        help=_sentence(schema.get("description", "")),
+        unit=schema.get("unit", ""),
+        group=cast(Level, schema.get("group", "basic")),
+        choices=choices,
+        default=_shown(default),
+        defaults=_json(by_preset) if len(set(map(_shown, by_preset.values()))) > 1 else "",
+        low=schema.get("minimum", schema.get("exclusiveMinimum")),
+        high=schema.get("maximum", schema.get("exclusiveMaximum")),
+        required=required,
+    )
+
+
+def _control(name: str, schema: Mapping[str, Any]) -> tuple[Control, Sequence[str]]:
+    """How a value is asked for, and the values to choose from."""
+    if "enum" in schema:
+        return "choice", [str(value) for value in schema["enum"]]
+    if "anyOf" in schema:
+        return _control_of_several(schema["anyOf"])
+    kind = schema.get("type")
+    if kind == "array":
+        return _control_of_array(name, schema), ()
+    if schema.get("format") == "octasplat-file":
+        return "upload", ()
+    plain: Mapping[Any, Control] = {"boolean": "yes_no", "integer": "whole", "number": "number"}
+    return plain.get(kind, "text"), ()
+
+
+def _control_of_array(name: str, schema: Mapping[str, Any]) -> Control:
+    items = schema.get("prefixItems") or [schema.get("items", {})]
+    kinds = {item.get("type") for item in items}
+    if items[0].get("format") == "octasplat-file":
+        return "uploads"
+    if name in ("exports", "files"):
+        return "files"
+    if kinds <= {"number", "integer"}:
+        return "numbers"
+    return "list" if kinds == {"string"} else "json"
+
+
+def _control_of_several(options: Sequence[Mapping[str, Any]]) -> tuple[Control, Sequence[str]]:
+    """How one of several types is asked for: by a choice where all values are known, else as text."""
+    values: list[str] = []
+    for option in options:
+        if option.get("type") == "null":
+            continue
+        if option.get("type") == "boolean":
+            values += ["true", "false"]
+        elif "const" in option or "enum" in option:
+            values += map(str, option.get("enum", [option.get("const")]))
+        else:
+            return ("document" if any("$ref" in other for other in options) else "text"), ()
+    return "choice", values
+
+
+def _sentence(text: str) -> str:
+    """Words of the program as words of a form, where None is an empty field."""
+    return text[:1].upper() + re.sub(r"\bNone\b", "empty", text[1:])
+
+
+def _choice(name: str, value: str) -> Choice:
+    yes_no = {"true": "yes", "false": "no"}
+    return Choice(value, _CHOICES.get((name, value)) or yes_no.get(value) or value.replace("_", " "))
+
+
+def _file_choices() -> tuple[Choice, ...]:
+    found = {exporter.name: exporter.description for exporter in exporters()}
+    return tuple(Choice(file, found[name]) for name, file in FILE_NAMES.items() if name in found)
+
+
+def _resolved(root: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The schema with its reference followed, and with the null of an optional value left out."""
+    if "$ref" in schema:
+        target: Mapping[str, Any] = root["$defs"][schema["$ref"].rpartition("/")[2]]
+        return {**target, **{key: value for key, value in schema.items() if key != "$ref"}}
+    if "anyOf" in schema:
+        others = [option for option in schema["anyOf"] if option.get("type") != "null"]
+        if len(others) == 1:
+            rest = {key: value for key, value in schema.items() if key != "anyOf"}
+            return {**_resolved(root, others[0]), **rest}
+    return schema
+
+
+_MISSING = object()
+
+
+def _at(values: Mapping[str, Any], path: str) -> Any:
+    """The value at a dotted path."""
+    found: Any = values
+    for part in path.split("."):
+        if not isinstance(found, Mapping) or part not in found:
+            return _MISSING
+        found = found[part]
+    return found
+
+
+def _shown(value: object) -> str:
+    if value is None or isinstance(value, dict):
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(str(item) for item in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _json(values: Mapping[str, object]) -> str:
+    return json.dumps({name: _shown(value) for name, value in values.items() if value is not _MISSING})
