@@ -17,7 +17,8 @@ from octasplat.service.guards import BodyGuard, HostGuard, OriginGuard, SafeHead
 from octasplat.service.guesses import Guesses
 from octasplat.service.hub import EventHub
 from octasplat.service.making_room import RoomMaker
-from octasplat.service.problems import ProblemDocument, add_problem_handlers
+from octasplat.service.openapi import describe_fully
+from octasplat.service.problems import add_problem_handlers
 from octasplat.service.routes import (
     artifacts,
     audit,
@@ -96,7 +97,7 @@ def create_app(settings: ServiceSettings | None = None) -> FastAPI:
         app.include_router(module_router)
     mount_pages(app)
     add_problem_handlers(app)
-    _describe_problems(app)
+    describe_fully(app)
     app.add_middleware(AuditTrail)
     app.add_middleware(BodyGuard, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(OriginGuard)
@@ -149,20 +150,3 @@ def _checks(settings: ServiceSettings) -> Gate:
     """Lets in those whose datasets are checked; half of the places are there for other owners."""
     at_once, waiting = settings.max_checks, settings.max_waiting_checks
     return Gate("datasets", at_once=at_once, waiting=waiting, of_one_owner=-(-(at_once + waiting) // 2))
-
-
-def _describe_problems(app: FastAPI) -> None:
-    """Put the problem document into the schemas, in the place of FastAPI's own errors."""
-    original = app.openapi
-
-    def openapi() -> dict[str, object]:
-        if app.openapi_schema is None:
-            schema = original()
-            schemas = schema["components"]["schemas"]
-            schemas["ProblemDocument"] = ProblemDocument.model_json_schema()
-            for name in ("HTTPValidationError", "ValidationError"):
-                schemas.pop(name, None)
-            app.openapi_schema = schema
-        return app.openapi_schema
-
-    app.openapi = openapi  # type: ignore[method-assign]
