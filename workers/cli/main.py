@@ -42,6 +42,7 @@ _COMMANDS = {
     "crop": ("crop", "Keep part of a scene."),
     "merge": ("merge", "Put scenes together."),
     "clean": ("clean", "Remove faint Gaussians, oversized ones and floaters."),
+    "verbs": ("verbs", "The verbs as commands, jobs and Python calls."),
     "demo": ("demo", "Try everything on a generated scene."),
     "backup": ("backup", "Copy a service, tables and store, while it runs."),
     "restore": ("backup", "Put a backup into an empty service."),
@@ -63,6 +64,11 @@ _COMMANDS = {
 }
 """Each command: its module in :mod:`octasplat.workers.cli.commands`, imported when the command runs, and its
 line in the help."""
+
+
+def has_command(name: str) -> bool:
+    """Return whether there is a command of that name."""
+    return name in _COMMANDS
 
 
 class _Commands(click.Group):
