@@ -1,9 +1,9 @@
 """The verbs: each as a command, a kind of job, a request over HTTP and a call in Python."""
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
-import octasplat
 from octasplat.engine.operations.base import Operation
 from octasplat.engine.operations.registry import operations
 from octasplat.workers.cli.main import has_command
@@ -71,7 +71,8 @@ def verbs_page() -> str:
 
 
 def _python_call(entry: Operation[Any, Any]) -> str:
-    if entry.name in octasplat.__all__:
+    # The public names alone are read: what they stand for lies above the commands.
+    if entry.name in import_module("octasplat").__all__:
         return f"osp.{entry.name}(...)"
     module = entry.request.__module__.rpartition(".")[2]
     return f"{module}.run({module}.{entry.request.__name__}(...))"
