@@ -96,6 +96,28 @@ def test_a_job_gives_the_bytes_of_the_command(shiny_run, changed, tmp_path):
             kind_named("material").resolve(wrong)
 
 
+def test_a_job_takes_masks_that_were_sent(shiny_run, octasplat, tmp_path):
+    mask = np.zeros((96, 128), np.uint8)
+    mask[:, :64] = 255
+    (tmp_path / "attempt" / "files").mkdir(parents=True)
+    Image.fromarray(mask).save(tmp_path / "attempt" / "files" / f"{VIEW}.png")
+    done = octasplat(
+        "material", shiny_run, "-o", tmp_path / "new", "--set", "metallic=0", "--inverse",
+        "--mask", tmp_path / "attempt" / "files" / f"{VIEW}.png",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    shutil.copytree(shiny_run, tmp_path / "attempt" / "run")
+    kind = kind_named("material")
+    options = kind.resolve({"set": ["metallic=0"], "inverse": True, "masks": [f"{VIEW}.png"]})
+    assert list(kind.named_files(options)) == [("masks.0", f"{VIEW}.png")] and kind.takes_files
+    run_operation(Task(tmp_path / "attempt", options.model_dump(mode="json"), threads=1, kind="material"))
+    for name in ("scene.ply", "edits.json"):
+        changed = (tmp_path / "attempt" / "results" / name).read_bytes()
+        assert changed == (tmp_path / "new" / name).read_bytes(), name
+    without = kind.resolve({"set": {"metallic": 0}}).model_dump(mode="json")
+    assert not {"mesh", "masks"} & without.keys()  # which workers of the last version do not know
+
+
 def test_harmonics_follow_and_come_back(changed, shiny_run, octasplat, tmp_path):
     """What is changed back looks as before, and in white light white metal is brighter than black."""
     light = np.full((16, 32, 3), 0.5, np.float32)

@@ -129,7 +129,7 @@ def derive(
     kind: str, job_id: str, stage: Path | None, environments: tuple[Path, ...], on: Path | None, wait: bool,
     output: Path | None, server: str | None, quiet: bool, **given: Any,
 ) -> None:  # fmt: skip
-    """Queue a job of the KIND evaluate, export, render, relight or material on the results of JOB.
+    """Queue a job of a KIND such as render, surface or material on the results of JOB.
 
     'last' is the newest job. For example: octasplat derive render last --stage stage.toml --set frames=60,
     or: octasplat derive material last --set set.roughness=0.3 --set where="metallic > 0.5" --wait

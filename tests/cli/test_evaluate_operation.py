@@ -1,0 +1,78 @@
+"""Runs measured by request: figures as typed values, smaller sizes, all views, another background."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from octasplat.engine.errors import Cancelled, ConfigError
+from octasplat.engine.events import StageFinished
+from octasplat.engine.operations.base import build
+from octasplat.engine.operations.evaluate import OPERATION, EvaluateRequest
+from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.work.programs import run_operation
+from octasplat.workers.work.task import Task
+
+
+@pytest.fixture
+def copy(run, tmp_path) -> Path:
+    """The run of the other tests, to be measured anew."""
+    return shutil.copytree(run.output, tmp_path / "run", ignore=shutil.ignore_patterns("on", "cache"))
+
+
+def test_result_holds_the_figures_of_the_metrics_file(copy):
+    heard = []
+    result = OPERATION.run(EvaluateRequest(source=copy), progress=heard.append, threads=1)
+    metrics = json.loads((copy / "metrics.json").read_text())
+    assert result.psnr == metrics["mean"]["psnr"] > 10
+    assert result.ssim == metrics["mean"]["ssim"] and result.flip == metrics["mean"]["flip"]
+    assert result.views == metrics["views"] and len(result.views) == 2
+    assert result.files[0] == copy / "metrics.json" and result.report == copy / "report.html"
+    assert {path.name for path in result.files} >= {f"{Path(name).stem}.png" for name in result.views}
+    assert any(f"PSNR {result.psnr:.2f} dB" in line for line in result.lines())
+    assert [event.stage for event in heard if isinstance(event, StageFinished)] == ["evaluate"]
+
+
+def test_smaller_sizes_are_the_same_by_command_and_job(copy, run, octasplat, tmp_path):
+    done = octasplat("evaluate", copy, "--scene", run.scene, "--scales", "4,2,2", "--threads", 1)
+    assert done.exit_code == 0, done.output
+    found = json.loads((copy / "scales.json").read_text())
+    assert list(found) == ["1/2", "1/4"] and f"{found['1/2']['4']:.2f} dB with 4" in done.output
+    shutil.copytree(run.output, tmp_path / "attempt" / "run", ignore=shutil.ignore_patterns("on", "cache"))
+    kind = kind_named("evaluate")
+    options = kind.resolve({"scales": [2, 4]}).model_dump(mode="json")
+    assert options == {"all_views": False, "scales": [2, 4]}
+    run_operation(Task(tmp_path / "attempt", options, scene=run.scene, threads=1, kind="evaluate"))
+    results = tmp_path / "attempt" / "results"
+    assert [path.name for path in results.iterdir()] == ["scales.json"]
+    assert (results / "scales.json").read_bytes() == (copy / "scales.json").read_bytes()
+
+
+def test_all_views_and_another_background(copy, run, octasplat):
+    before = (copy / "metrics.json").read_bytes()
+    done = octasplat("evaluate", copy, "--all-views", "--background", "white", "--threads", 1)
+    assert done.exit_code == 0, done.output
+    metrics = json.loads((copy / "on" / run.scene.name / "metrics.json").read_text())
+    assert len(metrics["views"]) == 8 and metrics["background"] == "white"
+    assert "Mean over 8" in done.output and (copy / "metrics.json").read_bytes() == before
+
+
+def test_a_wish_to_stop_is_heard(copy):
+    with pytest.raises(Cancelled, match="Stopped while evaluating"):
+        OPERATION.run(EvaluateRequest(source=copy), should_stop=lambda: True, threads=1)
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"scales": "2,none"}, "scales: scales are whole numbers from 1 on"),
+        ({"scales": [0, 2]}, "scales: scales are whole numbers from 1 on"),
+        ({"scales": "2", "on": "a"}, "leave out on"),
+        ({"scales": "2", "all_views": True}, "leave out all_views"),
+        ({"on": "a", "dataset": "b"}, "choose one of dataset"),
+    ],
+)
+def test_what_contradicts_is_refused_in_a_sentence(values, told):
+    with pytest.raises(ConfigError, match=told):
+        build(EvaluateRequest, {"source": "run", **values})
