@@ -92,6 +92,14 @@ class CheckpointWritten(Event):
 
 
 @dataclass(frozen=True)
+class ImagesKept(Event):
+    """So many images of a render are safe on disk; a render that is stopped goes on with the others."""
+
+    kind: ClassVar[str] = "images_kept"
+    count: int
+
+
+@dataclass(frozen=True)
 class Warned(Event):
     """Something the user should know, in one sentence; the work goes on."""
 

@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.light.companions import companions
 from octasplat.engine.light.stage import Stage
 from octasplat.engine.writing import write_text
 
@@ -65,6 +66,17 @@ def named_files(stage: Stage) -> Iterator[tuple[str, str]]:
             texture = getattr(mesh.material, key, None)
             if texture is not None:
                 yield f"meshes[{number}].material.{key}", texture
+
+
+def stage_identity(stage: Stage, folder: Path) -> tuple[object, ...]:
+    """Return what of a stage decides how a picture looks: itself, and the files that it brings.
+
+    Args:
+        stage: the stage.
+        folder: where the names of its files are relative to.
+    """
+    files = [folder / name for _, name in named_files(stage)]
+    return stage, files, [path.parent / name for path in files for name in companions(path)]
 
 
 def with_files(stage: Stage, names: Mapping[str, str]) -> Stage:

@@ -4,6 +4,9 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+IMAGE_SUFFIXES = (".png", ".exr")
+"""Of names that mean images; other names mean a folder, or a film."""
+
 
 def render_names(photographs: Sequence[str]) -> tuple[str, ...]:
     """For each photograph's relative path the path of its render, without a suffix; no two are the same.

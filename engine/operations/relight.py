@@ -1,0 +1,200 @@
+"""``relight``: a scene with materials in other light."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import InputFile, Spelling, Unit
+from octasplat.engine.operations.axes import light_up
+from octasplat.engine.operations.base import Operation, never
+from octasplat.engine.operations.pictures import PictureOptions, PictureRequest
+from octasplat.engine.operations.render import RenderResult
+
+if TYPE_CHECKING:
+    from octasplat.engine.light.relighting import Relighter
+    from octasplat.engine.operations.render_source import RenderSource
+    from octasplat.engine.render.jobs import Shot
+    from octasplat.engine.shading.material_settings import MaterialSettings
+
+SPLIT_SUM_RAYS = 4
+PATHS = 64
+Angle = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class RelightOptions(PictureOptions):
+    """A scene with materials in other light, as images or a video."""
+
+    environments: Annotated[tuple[InputFile, ...], Spelling(("--environment",), metavar="MAP")] = Field(
+        min_length=1,
+        max_length=20,
+        description="Equirectangular HDR or EXR image of the light; several are done one after another.",
+    )
+    by: Literal["split-sum", "path"] = Field(
+        "split-sum",
+        description="Method: split-sum is fast, as in training, with traced visibility; path is right, by "
+        "paths of light.",
+    )
+    samples: Annotated[int | None, Unit("per pixel")] = Field(
+        None,
+        ge=1,
+        le=65536,
+        description=f"Rays or paths per pixel.  [default: {SPLIT_SUM_RAYS} rays of split-sum, {PATHS} paths]",
+    )
+    depth: Annotated[int, Unit("surfaces")] = Field(
+        6, ge=1, le=64, description="Most surfaces that a path of light meets."
+    )
+    rotation_degrees: Annotated[Angle, Unit("degrees"), Spelling(("--rotate",), metavar="DEG")] = Field(
+        0.0, description="Turn the light about the vertical by this angle in degrees."
+    )
+    clamp: Annotated[float | None, Unit("radiance"), Spelling(metavar="MOST")] = Field(
+        None,
+        gt=0,
+        description="Cut the light of the environments off at this radiance: fewer bright specks by paths, "
+        "and weaker lamps.",
+    )
+    spin: bool = Field(False, description="Turn the light once round from the first image to the last.")
+    background: Literal["black", "white", "transparent", "environment"] | None = Field(
+        None,
+        description="Behind the scene; transparent gives images alpha.  [default: that of the run's "
+        "evaluation, or black]",
+    )
+
+    @property
+    def samples_per_pixel(self) -> int:
+        """Rays or paths per pixel under one environment."""
+        return self.samples or (PATHS if self.by == "path" else SPLIT_SUM_RAYS)
+
+    @property
+    def is_single(self) -> bool:
+        """Whether there is one image, whatever the scene."""
+        return super().is_single and len(self.environments) == 1
+
+
+class RelightRequest(RelightOptions, PictureRequest):
+    """Show a scene with materials in other light: the folder of a run, or a file of Gaussians.
+
+    Without other cameras: the held-out views of a run, a turntable of a file. Of several environments each
+    has a folder of its name, or its turn in one video.
+    """
+
+    on: Annotated[Path | None, Spelling(metavar="FOLDER")] = Field(
+        None,
+        description="Render the views of the photographs of another folder (images/ and sparse/0).",
+    )
+
+    @classmethod
+    def _mode_of(cls, given: dict[str, Any]) -> str:
+        if "on" not in given:
+            return super()._mode_of(given)
+        if any(name in given for name in ("views", "photographs", "camera_path", "camera")):
+            raise ValueError("choose one of views, another folder, a turntable, a camera path and a camera")
+        return "views"
+
+    @model_validator(mode="after")
+    def _on_fits(self) -> "RelightRequest":
+        if self.on is not None and self.mode != "views":
+            raise ValueError("`on` gives views; leave out other cameras")
+        return self
+
+    @property
+    def _has_views(self) -> bool:
+        return self.on is not None or super()._has_views
+
+
+class RelightResult(RenderResult):
+    """The pictures that were written."""
+
+
+def run(
+    request: RelightRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> RelightResult:
+    """Show a scene in other light; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        ConfigError: the scene has no materials, or an environment cannot be used; or there are images of
+            another render where this one is to go on.
+        OctasplatError: the source cannot be read or the output not written.
+        Cancelled: it was asked to stop.
+    """
+    from octasplat.engine.config import read_config
+    from octasplat.engine.gaussians.materials import require_materials
+    from octasplat.engine.light.relit_pictures import RelitPaint, lit_shots, read_environments
+    from octasplat.engine.operations.render_source import read_render_source, requested_cameras
+    from octasplat.engine.render.identity import identity_of
+    from octasplat.engine.render.jobs import camera_shots
+    from octasplat.engine.render.output import RenderOutput, Resumption
+    from octasplat.engine.run_folder import CONFIG, SCENE, is_run
+    from octasplat.engine.stages import stopping
+
+    tell = stopping(progress, should_stop)
+    of_run = is_run(request.source)
+    environments = read_environments(request.environments, request.clamp)
+    source = read_render_source(request.source, tell, dataset=request.dataset, max_side=request.max_side)
+    require_materials(source.gaussians, request.source / SCENE if of_run else request.source)
+    learnt = read_config(request.source / CONFIG).train.materials if of_run else None
+    up = light_up(request.source, request.up)
+    cameras = None if request.on is not None else requested_cameras(request, source)
+    shots = _views(request, source) if cameras is None else camera_shots(cameras)
+    lightings = lit_shots(list(environments), shots, request.rotation_degrees, spin=request.spin)
+    resumption = Resumption(request.resume, request.or_anew, request.frames_folder)
+    output = RenderOutput(request.output, request.frame_rate, request.format == "exr", resumption)
+    output.check_count(len(lightings))
+    background = request.background or source.background
+    # Where the views of photographs are is said by the rays of the first and last of them.
+    ends = [shots[k].rays() for k in (0, -1)]
+    kept = output.kept_images(
+        identity_of(
+            "relight", source.gaussians, source.settings, list(environments), list(environments.values()), up,
+            cameras, len(shots), [(rays.origin_world, rays.directions_world) for rays in ends], request.by,
+            request.samples_per_pixel, request.depth, request.rotation_degrees, request.spin, background,
+            request.format,
+        )
+    )  # fmt: skip
+    relighter = _relighter(request, source, learnt, threads)
+    paint = RelitPaint(relighter, environments, up, background, lightings)
+    files = output.write(tuple(lightings), paint, kept, tell)
+    return RelightResult(files=files, folder=output.folder, images=len(lightings))
+
+
+def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Shot, ...]":
+    import numpy as np
+
+    from octasplat.engine.operations.render_source import requested_views
+    from octasplat.engine.render.jobs import view_shots
+    from octasplat.engine.scene import load_scene
+
+    if request.on is None:
+        return requested_views(request, source)
+    max_side = request.max_side or source.max_side
+    others = load_scene(request.on, max_side=max_side, least_views=1, for_training=False)
+    return view_shots(others, np.arange(len(others.views)), source.near_world)
+
+
+def _relighter(
+    request: RelightRequest, source: "RenderSource", learnt: "MaterialSettings | None", threads: int
+) -> "Relighter":
+    from octasplat.engine.light.relighting import PathRelighter
+    from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
+    from octasplat.engine.light.stage import Integrator
+
+    samples = request.samples_per_pixel
+    if request.by == "split-sum":
+        return SplitSumRelighter(
+            source.gaussians, source.settings, learnt, extent_world=source.extent_world,
+            side=1 if samples < 4 else math.isqrt(samples), threads=threads,
+        )  # fmt: skip
+    integrator = Integrator(samples=samples, max_depth=request.depth, roulette_depth=request.depth)
+    return PathRelighter(source.gaussians, source.settings, integrator, threads=threads)
+
+
+OPERATION = Operation(
+    "relight", "Show a scene with materials in other light.", RelightRequest, RelightOptions, run
+)

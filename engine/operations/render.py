@@ -1,0 +1,258 @@
+"""``render``: new views of a scene, plain or on a stage."""
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from octasplat.engine.events import Listener, Warned, ignore
+from octasplat.engine.fields import Spelling
+from octasplat.engine.light.stage import Stage
+from octasplat.engine.light.stage_file import read_stage
+from octasplat.engine.operations.base import Operation, Result, never
+from octasplat.engine.operations.pictures import PictureOptions, PictureRequest, check_layers
+
+if TYPE_CHECKING:
+    from octasplat.engine.operations.render_source import RenderSource
+    from octasplat.engine.render.cameras import RenderCamera
+    from octasplat.engine.render.jobs import Shot
+    from octasplat.engine.render.output import RenderOutput
+
+PREVIEW_SIDE_PX = 480
+STAGE_LACKS_BACKGROUND = (
+    "The background that was learnt is left out on a stage; to show it, and to be lit by it, name the run's "
+    "background.exr as the stage's environment."
+)
+
+
+def parse_stage_text(value: object) -> object:
+    """Return what a TOML text says; anything else as it is. Raises ValueError where it is no TOML."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return tomllib.loads(value)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ValueError(f"the stage is no TOML: {error}") from None
+
+
+class RenderOptions(PictureOptions):
+    """New views of a scene, as images or a video."""
+
+    background: Literal["black", "white", "transparent"] | None = Field(
+        None,
+        description="Behind the scene; transparent gives images alpha.  [default: that of the run's "
+        "evaluation, or black]",
+    )
+    stage: Annotated[
+        Stage | None,
+        BeforeValidator(parse_stage_text, json_schema_input_type=Stage | str | None),
+        Spelling(hidden=True),
+    ] = Field(
+        None,
+        description="Meshes, lights and materials that the scene is rendered with, as docs/light.md "
+        "describes: an object, or the text of a stage file. The files that it names are those of the job's "
+        "files_id.",
+    )
+    preview: bool = Field(
+        False, description="Stage: render the first image only, to one file, finer and finer."
+    )
+    layers: bool = Field(
+        False, description="Stage: write EXR files with background, shadow and things, for a compositor."
+    )
+    denoise: bool = Field(
+        False, description="Stage: remove the noise of the light from the images; needs the extra denoise."
+    )
+
+    @model_validator(mode="after")
+    def _stage_fits(self) -> "RenderOptions":
+        if self.stage is None:
+            for name in ("preview", "layers", "denoise"):
+                if getattr(self, name):
+                    raise ValueError(f"`{name}` goes with `stage`")
+            return self
+        if self.background == "transparent":
+            raise ValueError("a stage is transparent in EXR only, which has alpha on any background")
+        if (self.layers or self.stage.integrator.layers) and self.format != "exr":
+            raise ValueError("layers are kept by EXR only; choose the format exr")
+        if self.preview and self.format == "mp4":
+            raise ValueError("a preview is one image; choose the format png or exr (name an image)")
+        return self
+
+    @property
+    def staged(self) -> Stage | None:
+        """The stage, with what the options say of its integrator."""
+        if self.stage is None:
+            return None
+        asked = {name: True for name in ("layers", "denoise") if getattr(self, name)}
+        return self.stage.model_copy(update={"integrator": self.stage.integrator.model_copy(update=asked)})
+
+
+class RenderRequest(RenderOptions, PictureRequest):
+    """Render new views of a scene, the folder of a run or a file of Gaussians in any splat format.
+
+    Without other cameras: the held-out views of a run, a turntable of a file. Ctrl-C stops after the image
+    under way has come to a safe point; the same command with --resume goes on.
+    """
+
+    stage_file: Annotated[Path | None, Spelling(("--stage",), metavar="STAGE.toml")] = Field(
+        None,
+        description="Render with the meshes, lights and materials of a stage, which docs/light.md describes.",
+    )
+    stage_folder: Annotated[Path, Spelling(hidden=True)] = Field(
+        Path(),
+        description="Where the names of the stage's files are relative to.  [default: the folder of the "
+        "stage file]",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_stage(cls, values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        given = dict(values)
+        if given.get("stage_file") is not None and given.get("stage") is None:
+            given["stage"] = read_stage(Path(given["stage_file"]))
+            given["stage_folder"] = Path(given["stage_file"]).parent
+        stage = given.get("stage")
+        layers = given.get("layers") or (isinstance(stage, Stage) and stage.integrator.layers)
+        if layers and stage is not None and "output" in given and given.get("format") is None:
+            check_layers(Path(given["output"]))
+            given["format"] = "exr"
+        return given
+
+    @model_validator(mode="after")
+    def _preview_fits(self) -> "RenderRequest":
+        if self.preview and not self._is_image:
+            raise ValueError("a preview is one .png or .exr; name it as `output`")
+        return self
+
+    @property
+    def _needs_pattern(self) -> bool:
+        return self._is_image and not self.preview
+
+
+class RenderResult(Result):
+    """The pictures that were written.
+
+    Attributes:
+        images: number of images that were rendered, those of a video among them.
+    """
+
+    images: int
+
+    def lines(self) -> tuple[str, ...]:
+        """Return a sentence that says where they are."""
+        more = f" and {len(self.files) - 1} more." if len(self.files) > 1 else "."
+        return (f"Wrote {self.files[0]}{more}",)
+
+
+def run(
+    request: RenderRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> RenderResult:
+    """Render new views; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        OctasplatError: the scene or the stage cannot be used, or the output not written; or there are images
+            of another render where this one is to go on.
+        Cancelled: it was asked to stop.
+    """
+    from octasplat.engine.operations.render_source import (
+        read_render_source,
+        requested_cameras,
+        requested_views,
+    )
+    from octasplat.engine.render.jobs import camera_shots
+    from octasplat.engine.render.output import RenderOutput, Resumption
+    from octasplat.engine.stages import stopping
+
+    told = "Stopped; the preview is as fine as it was." if request.preview else None
+    tell = stopping(progress, should_stop, told)
+    max_side = request.max_side or (PREVIEW_SIDE_PX if request.preview else None)
+    source = read_render_source(request.source, tell, dataset=request.dataset, max_side=max_side)
+    cameras = requested_cameras(request, source)
+    shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
+    resumption = Resumption(request.resume, request.or_anew, request.frames_folder)
+    output = RenderOutput(request.output, request.frame_rate, request.format == "exr", resumption)
+    output.check_count(1 if request.preview else len(shots))
+    render = _render_plain if request.stage is None else _render_on_stage
+    files = render(request, source, cameras, shots, output, tell, threads)
+    return RenderResult(files=files, folder=output.folder, images=1 if request.preview else len(shots))
+
+
+def _render_plain(
+    request: RenderRequest,
+    source: "RenderSource",
+    cameras: "tuple[RenderCamera, ...] | None",
+    shots: "tuple[Shot, ...]",
+    output: "RenderOutput",
+    progress: Listener,
+    threads: int,
+) -> tuple[Path, ...]:
+    from octasplat.engine.render.identity import identity_of
+    from octasplat.engine.render.jobs import scene_paint
+    from octasplat.engine.render.renderer import background_colour
+    from octasplat.engine.shading.plain import PLAIN
+    from octasplat.engine.trace.make import make_tracer
+
+    transparent = request.background == "transparent"
+    background = background_colour("black" if transparent else request.background or source.background)
+    learnt = None if request.background else source.learnt  # another colour was asked for, or alpha
+    views = None if cameras is not None else (source.viewpoints, source.near_world)
+    kept = output.kept_images(
+        identity_of(
+            source.gaussians, source.settings, background, transparent, cameras, None, views,
+            source.trained_rad, None if learnt is None else learnt.rgb_srgb,
+        )
+    )  # fmt: skip
+    tracer = make_tracer(source.settings, threads=threads, build_quality=2)
+    tracer.build(source.gaussians)
+    paint = scene_paint(
+        tracer, background, transparent=transparent, trained_rad=source.trained_rad, shading=learnt or PLAIN
+    )
+    return output.write(shots, paint, kept, progress)
+
+
+def _render_on_stage(
+    request: RenderRequest,
+    source: "RenderSource",
+    cameras: "tuple[RenderCamera, ...] | None",
+    shots: "tuple[Shot, ...]",
+    output: "RenderOutput",
+    progress: Listener,
+    threads: int,
+) -> tuple[Path, ...]:
+    from octasplat.engine.light.rendering import compile_stage
+    from octasplat.engine.light.stage_file import stage_identity
+    from octasplat.engine.operations.render_source import stage_scene
+    from octasplat.engine.render.identity import identity_of
+    from octasplat.engine.render.renderer import background_colour
+
+    stage = request.staged
+    assert stage is not None
+    if source.learnt is not None and request.background is None and stage.environment is None:
+        progress(Warned(STAGE_LACKS_BACKGROUND))
+    background = background_colour(request.background or source.background)
+    scene = stage_scene(
+        request.source, source, request.stage_folder, background, progress,
+        dataset=request.dataset, threads=threads,
+    )  # fmt: skip
+    if request.preview:
+        compile_stage(stage, scene, shots).preview(shots[0], request.output, progress)
+        return (request.output,)
+    views = None if cameras is not None else (source.viewpoints, source.near_world)
+    kept = output.kept_images(
+        identity_of(
+            source.gaussians, source.settings, background, False, cameras,
+            stage_identity(stage, request.stage_folder), views, scene.photographs,
+        )
+    )  # fmt: skip
+    return output.write(shots, compile_stage(stage, scene, shots).paint, kept, progress)
+
+
+OPERATION = Operation("render", "Render new views of a scene.", RenderRequest, RenderOptions, run)

@@ -1,0 +1,225 @@
+"""The scene that a render shows, with what a run knows beside it, and the cameras that are asked for."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from octasplat.engine.config import read_config
+from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.events import Listener, Warned
+from octasplat.engine.files import read_facts
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.light.stage_scene import StageScene
+from octasplat.engine.operations.axes import axis_named
+from octasplat.engine.operations.pictures import PictureRequest
+from octasplat.engine.operations.scenes import open_scene
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.engine.render.jobs import Shot, gaussian_turntable, view_shots
+from octasplat.engine.render.orbit import (
+    Orbit,
+    PinholeLens,
+    lens_fov_y_degrees,
+    orbit_cameras,
+    single_camera,
+)
+from octasplat.engine.render.path_file import path_cameras
+from octasplat.engine.render.renderer import background_colour
+from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_background, run_viewpoints
+from octasplat.engine.scene.model import Viewpoints
+from octasplat.engine.scene.views_file import SplitViewpoints
+from octasplat.engine.shading.learnt_background import LearntBackground
+from octasplat.engine.trace.protocol import TraceSettings
+
+ANY_SIDE_PX = 1 << 30
+"""A cap that no photograph reaches."""
+
+
+@dataclass(frozen=True)
+class RenderSource:
+    """A scene to render; what only a run knows is None, or 0, for a file of Gaussians.
+
+    Attributes:
+        gaussians: the scene.
+        settings: where rays are cut off.
+        near_world: distance of the cameras from which on anything is seen.
+        background: display colour behind the scene, by name.
+        viewpoints: where the photographs were taken from.
+        max_side: longer side of the photographs in the training, px.
+        trained_rad: angle of a pixel of the training.
+        learnt: background that the run has learnt.
+    """
+
+    gaussians: FlatGaussians
+    settings: TraceSettings
+    near_world: float = 0.0
+    background: str = "black"
+    viewpoints: SplitViewpoints | None = None
+    max_side: int | None = None
+    trained_rad: float = 0.0
+    learnt: LearntBackground | None = None
+
+    @property
+    def extent_world(self) -> float:
+        """Radius of the cameras, or of a turntable that fits."""
+        if self.viewpoints is not None:
+            return self.viewpoints.extent
+        return gaussian_turntable(self.gaussians).radius
+
+
+def read_render_source(
+    source: Path, progress: Listener, *, dataset: Path | None = None, max_side: int | None = None
+) -> RenderSource:
+    """Read a scene to render.
+
+    Args:
+        source: the folder of a run, or a file.
+        progress: told what reading lost.
+        dataset: folder of photographs whose cameras to take, instead of those that the run keeps.
+        max_side: cap on the longer side of the views, px; None takes the run's.
+
+    Raises:
+        OctasplatError: it cannot be read.
+    """
+    if not is_run(source):
+        gaussians, facts = open_scene(source, progress), read_facts(source)
+        settings = TraceSettings(turned_beyond=facts.turned_beyond)
+        return RenderSource(gaussians, settings, facts.near_world, trained_rad=facts.pixel_rad)
+    config = read_config(source / CONFIG)
+    if not (source / SCENE).exists():
+        raise OutputError(
+            f"{source} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume."
+        )
+    viewpoints = run_viewpoints(source, scene=dataset, max_side=max_side)
+    return RenderSource(
+        read_gaussian_ply(source / SCENE)[0],
+        config.train.trace,
+        config.train.near * viewpoints.extent,
+        config.evaluate_background,
+        viewpoints,
+        config.max_side,
+        read_facts(source).pixel_rad,
+        run_background(source),
+    )
+
+
+def requested_cameras(request: PictureRequest, source: RenderSource) -> tuple[RenderCamera, ...] | None:
+    """Return the cameras of a turntable, of a path or of a single image; None for the photographs' views.
+
+    Raises:
+        ConfigError: a camera cannot stand or look as asked, or the path cannot be used.
+    """
+    if request.mode == "views":
+        return None
+    if request.camera_path is not None:
+        found = path_cameras(request.camera_path, str(request.path_file or "of the options")).cameras
+    else:
+        lens = PinholeLens(
+            request.width_px,
+            request.height_px,
+            lens_fov_y_degrees(request.fov_y_degrees, source.viewpoints),
+        )
+        orbit = Orbit(
+            axis_named(request.up or "-y"),
+            None if request.look_at is None else np.array(request.look_at, dtype=np.float64),
+            request.distance,
+            request.elevation_degrees,
+        )
+        if request.camera is not None:
+            position = np.array(request.camera)
+            found = (single_camera(source.gaussians, source.viewpoints, lens, orbit, position),)
+        else:
+            found = orbit_cameras(source.gaussians, source.viewpoints, lens, orbit, request.frame_count)
+    return tuple(replace(camera, near_world=source.near_world) for camera in found)
+
+
+def requested_views(request: PictureRequest, source: RenderSource) -> tuple[Shot, ...]:
+    """Return the views of a run's photographs that are asked for.
+
+    Raises:
+        ConfigError: there is no such photograph, or no run.
+        OutputError: there are no such views.
+    """
+    viewpoints = source.viewpoints
+    if viewpoints is None:
+        raise ConfigError(f"{request.source}: a file has no photographs; choose a turntable, or cameras.")
+    if request.photographs is not None:
+        numbers = {view.name: number for number, view in enumerate(viewpoints.views)}
+        missing = [name for name in request.photographs if name not in numbers]
+        if missing:
+            raise ConfigError(f"{missing[0]}: the run has no photograph of this name.")
+        return view_shots(
+            viewpoints, np.array([numbers[name] for name in request.photographs]), source.near_world
+        )
+    indices = {
+        "train": viewpoints.train_indices,
+        "all": np.arange(len(viewpoints.views)),
+        "held-out": viewpoints.test_indices,
+    }[request.views]
+    if len(indices) == 0:
+        raise OutputError("The run held out no views; ask for the views train or all.")
+    return view_shots(viewpoints, indices, source.near_world)
+
+
+def photographs_at_full_size(source: Path, dataset: Path | None) -> Viewpoints | None:
+    """Return where the photographs of a run were taken from, at their full size; None of a file."""
+    if not is_run(source):
+        return None
+    return run_viewpoints(source, scene=dataset, max_side=ANY_SIDE_PX)
+
+
+def stage_scene(
+    request_source: Path,
+    source: RenderSource,
+    folder: Path,
+    background_srgb: Float32[np.ndarray, "3"],
+    progress: Listener,
+    *,
+    dataset: Path | None = None,
+    threads: int = 0,
+) -> StageScene:
+    """Return the scene as a stage is put into it.
+
+    Args:
+        request_source: the folder of the run, or the file.
+        source: what was read there.
+        folder: where the names of the stage's files are relative to.
+        background_srgb: display colour behind everything.
+        progress: told what reading files of the stage loses.
+        dataset: folder of the photographs, if the run does not keep their cameras.
+        threads: to use; 0 takes all.
+
+    Raises:
+        OctasplatError: the cameras of the photographs cannot be read.
+    """
+    return StageScene(
+        source.gaussians,
+        source.settings,
+        photographs_at_full_size(request_source, dataset),
+        folder,
+        lambda path: open_scene(path, progress),
+        background_srgb,
+        threads,
+        lambda message: progress(Warned(message)),
+    )
+
+
+def open_stage_scene(
+    source: Path, progress: Listener, *, dataset: Path | None = None, threads: int = 0
+) -> StageScene:
+    """Read a run or a file as the scene that a stage is put into.
+
+    Args:
+        source: the folder of a run, or a file.
+        progress: told what reading lost.
+        dataset: folder of the photographs, if the run does not keep their cameras.
+        threads: to use; 0 takes all.
+
+    Raises:
+        OctasplatError: it cannot be read.
+    """
+    found = read_render_source(source, progress, dataset=dataset)
+    background = background_colour(found.background)
+    return stage_scene(source, found, source.parent, background, progress, dataset=dataset, threads=threads)

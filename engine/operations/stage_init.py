@@ -1,0 +1,87 @@
+"""``stage init``: the first stage of a scene, to start from."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from pydantic import Field
+
+from octasplat.engine.errors import OutputError
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import DatasetFolder, Output, Source
+from octasplat.engine.operations.axes import Axis, axis_named
+from octasplat.engine.operations.base import Operation, Options, Request, Result, never
+from octasplat.engine.operations.pictures import Point
+
+
+class StageInitOptions(Options):
+    """What a first stage is fitted to, beside the scene itself."""
+
+    up: Axis | None = Field(
+        None, description="The axis of a file that points up; a run knows its own.  [default: -y]"
+    )
+
+
+class StageInitRequest(StageInitOptions, Request):
+    """Write a stage that fits a scene, the folder of a run or a file of Gaussians, to start from.
+
+    It knows what is up, has a glass ball on what seems to be the floor, and a light from where the scene's
+    own seems to come. What else there is stands in it as comments.
+    """
+
+    source: Source = Field(description="The scene: the folder of a run, or a file of any format.")
+    output: Output = Field(description="The TOML file to write.")
+    dataset: DatasetFolder = Field(
+        None,
+        description="Take the cameras of the photographs in this folder.  [default: those that the run "
+        "keeps]",
+    )
+
+
+class StageInitResult(Result):
+    """The stage that was written.
+
+    Attributes:
+        up: the direction in the world that is up in it.
+        has_floor: whether the scene shows a floor, on which the ball stands.
+    """
+
+    up: Point
+    has_floor: bool
+
+    def lines(self) -> tuple[str, ...]:
+        """Return a sentence that says where the stage is and what is up."""
+        return (f"Wrote {self.files[0]}; up is {' '.join(f'{x:.3g}' for x in self.up)}.",)
+
+
+def run(
+    request: StageInitRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> StageInitResult:
+    """Write a first stage; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        OutputError: there is such a file already, or it cannot be written.
+        OctasplatError: the scene cannot be read.
+    """
+    from octasplat.engine.light.stage_file import write_first_stage
+    from octasplat.engine.light.stage_scene import first_stage_facts
+    from octasplat.engine.operations.render_source import open_stage_scene
+
+    output: Path = request.output
+    if output.exists():
+        raise OutputError(f"{output} is there already; name another file, or remove it.")
+    scene = open_stage_scene(request.source, progress, dataset=request.dataset, threads=threads)
+    facts = first_stage_facts(scene, None if request.up is None else axis_named(request.up))
+    try:
+        write_first_stage(output, facts)
+    except OSError as error:
+        raise OutputError(f"Cannot write {output}: {error.strerror or error}.") from error
+    return StageInitResult(files=(output,), up=facts.up, has_floor=facts.has_floor)
+
+
+OPERATION = Operation(
+    "stage-init", "Write a commented stage that fits a scene.", StageInitRequest, StageInitOptions, run
+)

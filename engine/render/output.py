@@ -1,0 +1,106 @@
+"""Where the images of a render go: files of their own or a film, and what of them an earlier try has left."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.events import ImagesKept, Listener
+from octasplat.engine.render.jobs import Paint, Shot
+from octasplat.engine.render.kept import RECORD, KeptImages
+from octasplat.engine.render.names import IMAGE_SUFFIXES, names_by_number
+from octasplat.engine.render.series import render_film, render_series
+from octasplat.engine.stages import counted_stage
+
+
+@dataclass(frozen=True)
+class Resumption:
+    """How a render goes on with the images of an earlier one that was stopped.
+
+    Attributes:
+        resume: go on with them; else they are refused.
+        or_anew: where they are of another render, forget them rather than refuse.
+        frames_folder: folder of a film's frames; None puts them beside the film.
+    """
+
+    resume: bool = False
+    or_anew: bool = False
+    frames_folder: Path | None = None
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """Images or a film to write.
+
+    Attributes:
+        path: a folder, an image, a pattern such as ``frame_%04d.png``, or a film (``.mp4``).
+        fps: images per second of a film.
+        exr: whether images in a folder are EXR files; else they are PNG files.
+        resumption: how the render goes on after a stop.
+    """
+
+    path: Path
+    fps: float
+    exr: bool
+    resumption: Resumption = Resumption()
+
+    @property
+    def is_film(self) -> bool:
+        """Whether it is a film."""
+        return self.path.suffix.lower() == ".mp4"
+
+    @property
+    def is_named_image(self) -> bool:
+        """Whether the path names images rather than a folder or a film."""
+        return self.path.suffix.lower() in IMAGE_SUFFIXES
+
+    @property
+    def folder(self) -> Path:
+        """The folder in which the files lie."""
+        return self.path.parent if self.is_film or self.is_named_image else self.path
+
+    def check_count(self, images: int) -> None:
+        """Refuse the name of one image where there are several.
+
+        Raises:
+            ConfigError: they would all be one file.
+        """
+        if images > 1 and self.is_named_image and not names_by_number(self.path):
+            pattern = f"{self.path.stem}_%04d{self.path.suffix}"
+            raise ConfigError(f"{self.path} names one image for {images}; write a pattern such as {pattern}.")
+
+    def file_of(self, number: int, shot: Shot) -> Path:
+        """Return the file of a shot: by number in a pattern, by name in a folder."""
+        if not self.is_named_image:
+            return self.path / f"{shot.name}{'.exr' if self.exr else '.png'}"
+        return self.path.with_name(self.path.name % number) if names_by_number(self.path) else self.path
+
+    def kept_images(self, identity: str) -> KeptImages:
+        """Return what there is already of images that look as ``identity`` says.
+
+        Raises:
+            ConfigError: there are images of another render, or of one that is not to be gone on with.
+        """
+        how, folder, record = self.resumption, self.path, RECORD
+        if self.is_named_image:
+            folder, record = self.path.parent, f"{self.path.name}.{RECORD}"
+        if self.is_film:
+            folder = how.frames_folder or self.path.with_name(f"{self.path.name}.frames")
+        return KeptImages(folder, identity, resume=how.resume, or_anew=how.or_anew, record=record)
+
+    def write(
+        self, shots: tuple[Shot, ...], paint: Paint, kept: KeptImages, progress: Listener
+    ) -> tuple[Path, ...]:
+        """Render the shots that are not kept yet, write all, and return the files.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
+
+        def on_kept(count: int) -> None:
+            progress(ImagesKept(count))
+
+        with counted_stage("render", progress) as count:
+            if self.is_film:
+                render_film(shots, self.path, self.fps, paint, kept, count, on_kept)
+                return (self.path,)
+            return render_series(shots, self.file_of, paint, kept, count, on_kept)

@@ -1,0 +1,130 @@
+"""What a camera path file says, checked; see ``docs/cameras.md``. Imports neither torch nor numba."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from octasplat.engine.errors import ConfigError
+
+MAX_FRAMES = 100_000
+_RIGID_TOLERANCE = 1e-3
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Row = tuple[_Finite, _Finite, _Finite, _Finite]
+
+
+class PathFrame(BaseModel):
+    """One camera of a path: its pose, and its lens by field of view or in pixels."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    camera_to_world: tuple[_Row, _Row, _Row, _Row]
+    fov_y_degrees: Annotated[float, Field(gt=0, lt=180)] | None = None
+    fx: _Positive | None = None
+    fy: _Positive | None = None
+    cx: _Finite | None = None
+    cy: _Finite | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "PathFrame":
+        if (self.fov_y_degrees is None) == (self.fy is None) or (self.fx is None) != (self.fy is None):
+            raise ValueError("needs either fov_y_degrees or both fx and fy")
+        pose = np.array(self.camera_to_world)
+        rotation = pose[:3, :3]
+        rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID_TOLERANCE)
+        if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1]):
+            raise ValueError(
+                "camera_to_world must be a rotation without scale or mirroring, a position, "
+                "and a last row of 0 0 0 1"
+            )
+        return self
+
+
+class PathDocument(BaseModel):
+    """The content of a camera path file: every camera, or keys between which cameras are made.
+
+    Attributes:
+        width: of all images, px.
+        height: of all images, px.
+        fps: images per second.
+        frames: the cameras, in the order in which they are rendered.
+        keys: cameras that the path passes in equal steps of time, instead of ``frames``.
+        seconds: how long the path through the keys takes.
+        closed: whether the path goes back from the last key to the first.
+        ease: ``in-out`` starts and ends slowly.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    width: Annotated[int, Field(gt=0, le=16384)]
+    height: Annotated[int, Field(gt=0, le=16384)]
+    fps: _Positive = 30.0
+    frames: Annotated[tuple[PathFrame, ...] | None, Field(min_length=1, max_length=MAX_FRAMES)] = None
+    keys: Annotated[tuple[PathFrame, ...] | None, Field(min_length=2, max_length=MAX_FRAMES)] = None
+    seconds: _Positive | None = None
+    closed: bool = False
+    ease: Literal["none", "in-out"] = "none"
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> "PathDocument":
+        if (self.frames is None) == (self.keys is None):
+            raise ValueError("needs either frames or keys")
+        if (self.keys is None) != (self.seconds is None):
+            raise ValueError("keys need seconds, and frames have none")
+        if self.frames is not None and (self.closed or self.ease != "none"):
+            raise ValueError("closed and ease go with keys")
+        if self.closed and self.ease != "none":
+            raise ValueError(
+                "a closed path goes on where it began, so it cannot slow down there; leave out ease"
+            )
+        if self.seconds is not None and self.seconds * self.fps > MAX_FRAMES:
+            raise ValueError(f"seconds and fps make more than {MAX_FRAMES:,} frames")
+        return self
+
+    @property
+    def frame_count(self) -> int:
+        """Number of images."""
+        if self.frames is not None:
+            return len(self.frames)
+        assert self.seconds is not None
+        return max(2, round(self.seconds * self.fps))
+
+
+def read_path_document(path: Path) -> PathDocument:
+    """Read what a camera path file says.
+
+    Raises:
+        ConfigError: the file is missing or not as described; the message names the field.
+    """
+    try:
+        return PathDocument.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"Cannot read the camera path {path}: {error.strerror or error}.") from error
+    except ValidationError as error:
+        raise ConfigError(
+            f"The camera path {path} is not valid: {_first(error)} (docs/cameras.md tells the format)."
+        ) from error
+
+
+def parse_path_text(value: object) -> object:
+    """Return what a JSON text says; anything else as it is. Raises ValueError where it is no JSON."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return json.loads(value)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the camera path is no JSON: {error}") from None
+
+
+def _first(error: ValidationError) -> str:
+    """The first fault, as ``frames[3].fx: Input should be ...``."""
+    details = error.errors()[0]
+    place = ""
+    for part in details["loc"]:
+        place += f"[{part}]" if isinstance(part, int) else f".{part}" if place else str(part)
+    message = details["msg"].removeprefix("Value error, ").rstrip(".")
+    return f"{place}: {message}" if place else message
