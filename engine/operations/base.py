@@ -1,5 +1,6 @@
 """What the requests, results and operations of all verbs have in common."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,6 +118,10 @@ class Operation(Generic[RequestT, ResultT_co]):
     run: Run[RequestT, ResultT_co]
 
 
+class ContradictoryRequest(ConfigError):
+    """What is asked for is not complete, or contradicts itself."""
+
+
 def build(
     model: type[OptionsT], values: Mapping[str, Any], place: Callable[[str], str] = lambda path: path
 ) -> OptionsT:
@@ -128,19 +133,24 @@ def build(
         place: what users call the field at a path with dots, such as ``--max-side`` for ``max_side``.
 
     Raises:
-        ConfigError: a name is unknown, or a value is out of range or contradicts another; one sentence.
+        ContradictoryRequest: the values do not go together, or something is missing; one sentence.
+        ConfigError: a name is unknown, or a value is out of range; one sentence.
     """
     try:
         return model.model_validate({name: value for name, value in values.items() if value is not None})
     except ValidationError as error:
-        raise ConfigError(first_complaint(error, place)) from None
+        of_all = not error.errors()[0]["loc"]
+        raise (ContradictoryRequest if of_all else ConfigError)(first_complaint(error, place)) from None
 
 
 def first_complaint(error: ValidationError, place: Callable[[str], str] = lambda path: path) -> str:
-    """Return the first complaint of a validation as one sentence that names the field."""
+    """Return the first complaint of a validation as one sentence that names the field.
+
+    Fields that the sentence itself names stand in it as ```name```.
+    """
     first = error.errors()[0]
     path = ".".join(str(part) for part in first["loc"])
-    message = complaint(first["msg"])
+    message = re.sub(r"`([\w.]+)`", lambda match: place(match[1]), complaint(first["msg"]))
     return f"{place(path)}: {message}." if path else f"{message}."
 
 
@@ -155,6 +165,7 @@ def warn(progress: Listener, message: str) -> None:
 
 
 __all__ = [
+    "ContradictoryRequest",
     "Event",
     "Listener",
     "Operation",

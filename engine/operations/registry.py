@@ -11,6 +11,9 @@ _MODULES = {
     "evaluate": "evaluate",
     "surface": "surface",
     "material": "material",
+    "render": "render",
+    "relight": "relight",
+    "stage-init": "stage_init",
     "crop": "crop",
 }
 """Module of each verb, in the order in which users meet them."""

@@ -14,7 +14,14 @@ from pydantic_core import PydanticUndefined
 
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.fields import Positional, Spelling
-from octasplat.engine.operations.base import Operation, Result, build, first_complaint, never
+from octasplat.engine.operations.base import (
+    ContradictoryRequest,
+    Operation,
+    Result,
+    build,
+    first_complaint,
+    never,
+)
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import Stopped, orderly_termination, stop_on_signals
@@ -69,10 +76,14 @@ def request_of(model: type[Any], given: dict[str, Any]) -> Any:
     """Return the request with what the user gave; what was not given keeps its default.
 
     Raises:
-        ConfigError: a value is out of range or contradicts another; the sentence names the option.
+        UsageError: what is asked for is not complete, or contradicts itself.
+        ConfigError: a value is out of range; the sentence names the option.
     """
     values = {name: value for name, value in given.items() if value is not None and value != ()}
-    return build(model, values, functools.partial(option_name, model))
+    try:
+        return build(model, values, functools.partial(option_name, model))
+    except ContradictoryRequest as error:
+        raise click.UsageError(str(error)) from None
 
 
 def run_operation(

@@ -3,18 +3,13 @@
 import json
 import os
 import shutil
-import time
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from octasplat.engine.config import read_config
-from octasplat.engine.errors import Cancelled, CheckpointError, ConfigError, ExportFailed
+from octasplat.engine.errors import CheckpointError, ConfigError, ExportFailed
 from octasplat.engine.events import (
-    CheckpointWritten,
     Event,
-    Listener,
     Noted,
     StageFinished,
     StageProgress,
@@ -24,33 +19,22 @@ from octasplat.engine.events import (
 from octasplat.engine.files import ExportOptions
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.files.several import export_files
-from octasplat.engine.light.stage_file import named_files
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
 from octasplat.engine.plain_colours import PlainScene
 from octasplat.engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE, not_exported
 from octasplat.engine.stages import counted_stage, stopping
 from octasplat.engine.writing import write_json
-from octasplat.workers.store.names import check_name
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
     ExportJobOptions,
-    PictureOptions,
     ReconstructOptions,
-    RelightJobOptions,
-    RenderJobOptions,
 )
 from octasplat.workers.work.places import Places
 from octasplat.workers.work.preview import Previews
-from octasplat.workers.work.task import FRAMES, Task
-
-if TYPE_CHECKING:
-    from octasplat.workers.rendering.views import Keeping
+from octasplat.workers.work.task import Task
 
 REPORT = "report.html"
-KEEP_SECONDS = 5.0
-KEEP_SECONDS_OF_FRAME = 0.03
-"""Finished frames are stored so long after one another, or so long for each of them if that is longer."""
 
 
 def reconstruct(task: Task) -> None:
@@ -137,133 +121,22 @@ def export(task: Task) -> None:
         raise ExportFailed(failed)
 
 
-def render(task: Task) -> None:
-    """New views of the scene of a reconstruction."""
-    from octasplat.workers.rendering.views import Keeping, SetStage, render_files
-
-    options = RenderJobOptions.model_validate(task.options)
-    arguments = {**_picture_arguments(task, options), "background": options.background}
-    stage = None
-    if options.stage is not None:
-        for _, name in named_files(options.stage):
-            check_name(name)  # as the service did
-        stage = SetStage(options.stage, task.files)
-
-    def work(tell: Listener, say: Callable[[str], None], keeping: Keeping) -> tuple[Path, ...]:
-        return render_files(options.mode, arguments, tell, say, stage, keeping)
-
-    _make_pictures(task, options, work)
-
-
-def relight(task: Task) -> None:
-    """The scene of a reconstruction with materials in other light."""
-    from octasplat.workers.rendering.relighting import relight_files
-    from octasplat.workers.rendering.views import Keeping
-
-    options = RelightJobOptions.model_validate(task.options)
-    for name in options.environments:
-        check_name(name)  # as the service did
-    arguments = {
-        **_picture_arguments(task, options),
-        "background": options.background,
-        "environment": tuple(task.files / name for name in options.environments),
-        "on": None,
-        "by": options.by,
-        "samples": options.samples,
-        "depth": options.depth,
-        "rotate": options.rotation_degrees,
-        "clamp": options.clamp,
-        "spin": options.spin,
-    }
-
-    def work(tell: Listener, say: Callable[[str], None], keeping: Keeping) -> tuple[Path, ...]:
-        return relight_files(options.mode, arguments, tell, say, keeping)
-
-    _make_pictures(task, options, work)
-
-
 def run_operation(task: Task) -> None:
     """What the job's kind says, by the operation of the engine; publishes what it writes."""
     kind = kind_named(task.kind)
     assert isinstance(kind, OperationKind)
     options = kind.resolve(task.options)
-    tell = stopping(task.listener, task.should_stop)
-    whole = nullcontext() if kind.tells_stages else counted_stage(kind.stages(options)[0], tell, 0)
-    with whole:
-        result = kind.operation.run(
-            kind.request(task), progress=tell, should_stop=task.should_stop, threads=task.threads
-        )
+    with kind.listening(task) as tell:
+        whole = nullcontext() if kind.tells_stages else counted_stage(kind.stages(options)[0], tell, 0)
+        with whole:
+            result = kind.operation.run(
+                kind.request(task), progress=tell, should_stop=task.should_stop, threads=task.threads
+            )
     for path in result.files:
         if not path.is_relative_to(task.results):
-            _publish(task, path, path.relative_to(result.folder or task.run).as_posix())
+            _publish(task, path, kind.result_name(path.relative_to(result.folder or task.run)))
     for line in result.lines():
-        tell(Noted(_places(task).named(line)))
-
-
-def _picture_arguments(task: Task, options: PictureOptions) -> dict[str, Any]:
-    """Options as the commands have them."""
-    is_film = options.format == "mp4"
-    return {
-        "source": task.run,
-        "scene": None,
-        "output": task.results / "turntable.mp4" if is_film else task.run / FRAMES,
-        "views": options.views if options.mode == "views" else None,
-        "photographs": options.photographs,
-        "frames": options.frames,
-        "seconds": None,
-        "fps": options.fps,
-        "width": options.width_px,
-        "height": options.height_px,
-        "fov": options.fov_y_degrees,
-        "up": None,
-        "exr": options.format == "exr",
-        "max_side": options.max_side,
-        "threads": task.threads,
-    }
-
-
-def _make_pictures(
-    task: Task,
-    options: PictureOptions,
-    work: "Callable[[Listener, Callable[[str], None], Keeping], tuple[Path, ...]]",
-) -> None:
-    """Let ``work`` make the pictures, those of an earlier attempt kept, and publish them."""
-    from octasplat.workers.rendering.views import Keeping
-
-    tell = stopping(task.listener, task.should_stop)
-    kept, frames = _KeptFrames(task.listener), task.run / FRAMES
-    keeping = Keeping(resume=True, or_anew=True, frames=frames, on_kept=kept)
-    try:
-        paths = work(tell, lambda line: tell(Warned(line)), keeping)
-    except Cancelled:
-        kept.tell()
-        raise
-    if options.format != "mp4":
-        for path in paths:
-            _publish(task, path, f"views/{path.relative_to(frames).as_posix()}")
-
-
-class _KeptFrames:
-    """Asks for finished frames to be stored, not too often."""
-
-    def __init__(self, listener: Listener) -> None:
-        self._listener = listener
-        self._count = self._told = 0
-        self._due = 0.0
-
-    def __call__(self, count: int) -> None:
-        """Hear that so many are done."""
-        self._count = count
-        if time.monotonic() >= self._due:
-            self.tell()
-
-    def tell(self) -> None:
-        """Ask now, if there are new ones."""
-        if self._count > self._told:
-            self._listener(CheckpointWritten(self._count, FRAMES))
-            self._told = self._count
-        # All their names are written each time.
-        self._due = time.monotonic() + max(KEEP_SECONDS, KEEP_SECONDS_OF_FRAME * self._count)
+        task.listener(Noted(_places(task).named(line)))
 
 
 def _places(task: Task) -> Places:

@@ -13,7 +13,7 @@ from octasplat.workers.cli.camera_options import AXES
 from octasplat.workers.cli.options import threads_option
 
 if TYPE_CHECKING:
-    from octasplat.workers.rendering.facts import Found
+    from octasplat.engine.operations.scene_inspection import Found
 
 BAR = 24
 WIDTH = 60
@@ -39,15 +39,15 @@ def info(
     Counts, bounds, the direction that is up, harmonics, opacities, sizes, memory, and how many Gaussians a
     ray meets. On a terminal it shows a small picture.
     """
-    from dataclasses import replace
-
+    from octasplat.engine.operations.axes import axis_named
+    from octasplat.engine.operations.render_source import open_stage_scene
+    from octasplat.engine.operations.scene_inspection import find_facts
     from octasplat.engine.render.images import write_png
-    from octasplat.workers.cli.scene_files import speaker_of_losses
-    from octasplat.workers.rendering.facts import find_facts
-    from octasplat.workers.rendering.views import stage_place
+    from octasplat.workers.cli.progress import show_progress
 
-    place, up_world = stage_place(source, scene, up, speaker_of_losses(as_json))
-    found = find_facts(replace(place, threads=threads), up_world)
+    with show_progress(quiet=as_json) as progress:
+        opened = open_stage_scene(source, progress, dataset=scene, threads=threads)
+    found = find_facts(opened, None if up is None else axis_named(up))
     if picture is not None:
         write_png(picture, found.picture_srgb)
     if as_json:

@@ -1,36 +1,32 @@
 """The kinds that octasplat brings."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.light.stage_file import named_files
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.crop import OPERATION as CROP
 from octasplat.engine.operations.evaluate import OPERATION as EVALUATE
 from octasplat.engine.operations.material import OPERATION as MATERIAL
+from octasplat.engine.operations.relight import OPERATION as RELIGHT
+from octasplat.engine.operations.render import OPERATION as RENDER
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
 from octasplat.workers.work.kinds.estimates import (
     Estimate,
     estimate_reconstruction,
-    estimate_relight,
-    estimate_render,
-    image_bytes,
     reconstruction_bytes,
-    rendered_pixels,
     training_pixels,
 )
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
     ExportJobOptions,
     ReconstructOptions,
-    RelightJobOptions,
-    RenderJobOptions,
     resolve_reconstruction,
     revise_reconstruction,
 )
+from octasplat.workers.work.kinds.pictures import Relight, Render
 from octasplat.workers.work.kinds.surface import Surface
 from octasplat.workers.work.kinds.table import JobKind, register
 from octasplat.workers.work.task import Task
@@ -129,58 +125,6 @@ class Export(JobKind[ExportJobOptions]):
         return (Demand("files", "exports", len(options.files)),)
 
 
-class Render(JobKind[RenderJobOptions]):
-    """New views."""
-
-    takes_files = True
-
-    def named_files(self, options: RenderJobOptions) -> Iterator[tuple[str, str]]:
-        """Return the files of the stage."""
-        for key, name in named_files(options.stage) if options.stage is not None else ():
-            yield f"stage.{key.replace('[', '.').replace(']', '')}", name
-
-    def demands(self, options: RenderJobOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
-        """Return the pixels and paths of all images."""
-        path = "frames" if options.mode == "turntable" else "max_side"
-        pixels = rendered_pixels(options, sizes)
-        always = (
-            Demand(path, "render_pixels", pixels),
-            Demand("format", "workspace_bytes", image_bytes(options, sizes)),
-        )
-        if options.stage is None:
-            return always
-        samples = options.stage.integrator.samples
-        return (*always, Demand("stage.integrator.samples", "render_paths", pixels * samples))
-
-    def estimate(self, options: RenderJobOptions, sizes: Sequence[Sizes], cores: int) -> Estimate:
-        """Return the time and memory that it takes."""
-        return estimate_render(options, sizes, cores)
-
-
-class Relight(JobKind[RelightJobOptions]):
-    """Other light."""
-
-    takes_files = True
-
-    def named_files(self, options: RelightJobOptions) -> Iterator[tuple[str, str]]:
-        """Return the environments."""
-        return ((f"environments.{place}", name) for place, name in enumerate(options.environments))
-
-    def demands(self, options: RelightJobOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
-        """Return the pixels and paths of all images."""
-        path = "frames" if options.mode == "turntable" else "max_side"
-        pixels, count = rendered_pixels(options, sizes), len(options.environments)
-        return (
-            Demand(path, "render_pixels", pixels * count),
-            Demand("format", "workspace_bytes", image_bytes(options, sizes, count)),
-            Demand("samples", "render_paths", pixels * options.rays),
-        )
-
-    def estimate(self, options: RelightJobOptions, sizes: Sequence[Sizes], cores: int) -> Estimate:
-        """Return the time and memory that it takes."""
-        return estimate_relight(options, sizes, cores)
-
-
 class Material(OperationKind):
     """Other materials."""
 
@@ -222,23 +166,15 @@ def register_all() -> None:
     )
     register(
         Render(
-            name="render",
+            RENDER,
             title="New views of the scene of a reconstruction, as a video or images",
-            needs="result",
-            options=RenderJobOptions,
-            program="octasplat.workers.work.programs:render",
-            stages=("render",),
             source_files=(*_RUN_FILES[:4], _BACKGROUND),
         )
     )
     register(
         Relight(
-            name="relight",
+            RELIGHT,
             title="The scene of a reconstruction with materials in other light",
-            needs="result",
-            options=RelightJobOptions,
-            program="octasplat.workers.work.programs:relight",
-            stages=("render",),
             source_files=(_LIGHT, *_RUN_FILES[:4]),
         )
     )

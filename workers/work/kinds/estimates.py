@@ -10,14 +10,12 @@ from collections.abc import Sequence
 from pydantic import BaseModel, computed_field
 
 from octasplat.engine.durations import duration
+from octasplat.engine.operations.pictures import PictureOptions
+from octasplat.engine.operations.relight import RelightOptions
+from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
-from octasplat.workers.work.kinds.options import (
-    PictureOptions,
-    ReconstructOptions,
-    RelightJobOptions,
-    RenderJobOptions,
-)
+from octasplat.workers.work.kinds.options import ReconstructOptions
 
 _START_CPU_SECONDS = 16.0
 _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
@@ -148,7 +146,7 @@ def training_pixels(options: ReconstructOptions, photographs: Sequence[Sizes]) -
     return round(pixels * (1 - _held_out(options, count) / max(count, 1)))
 
 
-def estimate_render(options: RenderJobOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
+def estimate_render(options: RenderOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
     """The estimate of new views; of views, all photographs are reckoned with."""
     pixels = rendered_pixels(options, photographs)
     each = _RENDER_CPU_SECONDS_PER_PIXEL
@@ -159,9 +157,9 @@ def estimate_render(options: RenderJobOptions, photographs: Sequence[Sizes], cor
     return _estimate(cpu_seconds, memory, cores, disk_bytes=image_bytes(options, photographs))
 
 
-def estimate_relight(options: RelightJobOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
+def estimate_relight(options: RelightOptions, photographs: Sequence[Sizes], cores: int) -> Estimate:
     """The estimate of a scene in other light; a ray of the split sum counts as a path."""
-    each = _PATH_CPU_SECONDS * options.rays
+    each = _PATH_CPU_SECONDS * options.samples_per_pixel * len(options.environments)
     cpu_seconds = _RENDER_START_CPU_SECONDS + each * rendered_pixels(options, photographs)
     memory = _START_BYTES + _gaussian_bytes(2) * _TYPICAL_RENDER_GAUSSIANS
     disk = image_bytes(options, photographs, len(options.environments))
@@ -170,8 +168,11 @@ def estimate_relight(options: RelightJobOptions, photographs: Sequence[Sizes], c
 
 def rendered_pixels(options: PictureOptions, photographs: Sequence[Sizes]) -> int:
     """Pixels of all images together that a render makes at most."""
-    if options.mode == "turntable":
-        return options.frames * options.width_px * options.height_px
+    if options.mode == "path" and options.camera_path is not None:
+        path = options.camera_path
+        return path.frame_count * path.width * path.height
+    if options.mode != "views":
+        return options.frame_count * options.width_px * options.height_px
     shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
     if options.photographs is not None:
         largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)

@@ -1,11 +1,14 @@
 """Kinds of jobs that do an operation of the engine."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
+from octasplat.engine.events import Listener
 from octasplat.engine.fields import map_named_files, named_files, takes_files
-from octasplat.engine.operations.base import Operation, Options, Request
+from octasplat.engine.operations.base import Operation, Request
+from octasplat.engine.stages import stopping
 from octasplat.workers.store.names import check_name
 from octasplat.workers.work.kinds.table import JobKind
 from octasplat.workers.work.task import SCENE_FILE, Task
@@ -54,7 +57,7 @@ class OperationKind(JobKind[Any]):
         self.tells_stages = tells_stages
         self._output = output
 
-    def named_files(self, options: Options) -> Iterable[tuple[str, str]]:
+    def named_files(self, options: Any) -> Iterable[tuple[str, str]]:
         """Return the files that the options name."""
         return ((place, path.as_posix()) for place, path in named_files(options))
 
@@ -70,7 +73,16 @@ class OperationKind(JobKind[Any]):
         request: Request = self.operation.request.model_validate({**known, **self.places(task, options)})
         return request
 
-    def places(self, task: Task, options: Any) -> dict[str, Path]:
+    @contextmanager
+    def listening(self, task: Task) -> Iterator[Listener]:
+        """Yield what hears the events of the operation."""
+        yield stopping(task.listener, task.should_stop)
+
+    def result_name(self, path: Path) -> str:
+        """Return the name among the results of a file, by its path in the folder of the result."""
+        return path.as_posix()
+
+    def places(self, task: Task, options: Any) -> dict[str, Any]:
         """Return where a job reads and writes, by the names of the request."""
         places = {"source": task.source, "output": task.results / self._output}
         if task.scene is not None and "dataset" in self.operation.request.model_fields:

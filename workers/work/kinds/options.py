@@ -1,17 +1,15 @@
 """Options of the job kinds, as users give them and as they are kept. Imports neither torch nor numba."""
 
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from octasplat.engine.config import ReconstructionConfig
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import exporter_for
-from octasplat.engine.light.stage import Stage
 from octasplat.engine.train.config import preset, with_materials
 from octasplat.engine.train.preset_names import PRESETS
 
@@ -37,19 +35,6 @@ def check_export_name(name: str) -> str:
 
 
 ExportName = Annotated[str, AfterValidator(check_export_name)]
-
-
-def read_toml(value: object) -> object:
-    """What a TOML text says; anything else as it is. Raises ValueError where it is no TOML."""
-    if not isinstance(value, str):
-        return value
-    try:
-        return tomllib.loads(value)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ValueError(f"the stage is no TOML: {error}") from None
-
-
-PhotographName = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class ReconstructOptions(ReconstructionConfig):
@@ -78,97 +63,6 @@ class ExportJobOptions(BaseModel):
     min_opacity: float = Field(0.0, ge=0, lt=1)
     q: float | None = Field(None, gt=0, le=100)
     sh_pad_degree: int | None = Field(None, ge=0, le=3)
-
-
-class PictureOptions(BaseModel):
-    """What pictures of a scene are made.
-
-    Attributes:
-        mode: a turntable, or the views of the photographs.
-        views: with ``mode`` views: which.
-        format: ``mp4`` is a video of a turntable, ``png`` and ``exr`` are images.
-        frames: images of one turn.
-        fps: images per second of a video.
-        width_px: width of a turntable's images.
-        height_px: height of a turntable's images.
-        fov_y_degrees: angle of a turntable's images from top to bottom; None takes that of the photographs.
-        max_side: longer side of the images of views, px.
-        photographs: with ``mode`` views: those of the photographs with these names, not ``views``.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    mode: Literal["turntable", "views"] = "turntable"
-    views: Literal["held-out", "train", "all"] = "held-out"
-    format: Literal["mp4", "png", "exr"] = "mp4"
-    frames: int = Field(120, ge=1, le=3600)
-    fps: float = Field(30.0, gt=0, le=240)
-    width_px: int = Field(640, ge=16, le=4096)
-    height_px: int = Field(480, ge=16, le=4096)
-    fov_y_degrees: float | None = Field(None, ge=1, le=170)
-    max_side: int | None = Field(None, ge=16)
-    photographs: tuple[PhotographName, ...] | None = Field(None, min_length=1, max_length=1000)
-
-    @model_validator(mode="after")
-    def _fits(self) -> "PictureOptions":
-        if self.mode == "views" and self.format == "mp4":
-            raise ValueError("views are images; choose the format png or exr")
-        if self.mode == "turntable" and self.photographs is not None:
-            raise ValueError("photographs are views; choose the mode views")
-        return self
-
-
-class RenderJobOptions(PictureOptions):
-    """Options of ``render``.
-
-    Attributes:
-        background: behind the scene; None takes that of the reconstruction's evaluation.
-        stage: things, lights and mirrors that the scene is rendered with, as ``docs/light.md`` describes:
-            an object, or the text of a stage file. The files that it names are those of the job's
-            ``files_id``.
-    """
-
-    background: Literal["black", "white"] | None = None
-    stage: Annotated[Stage | None, BeforeValidator(read_toml, json_schema_input_type=Stage | str | None)] = (
-        None
-    )
-
-    @model_validator(mode="after")
-    def _layers_fit(self) -> "RenderJobOptions":
-        if self.stage is not None and self.stage.integrator.layers and self.format != "exr":
-            raise ValueError("layers are kept by EXR only; choose the format exr")
-        return self
-
-
-class RelightJobOptions(PictureOptions):
-    """Options of ``relight``: a scene with materials in other light.
-
-    Attributes:
-        environments: equirectangular HDR or EXR images, files of the job's ``files_id``; each has its turn.
-        by: ``split-sum`` is fast, as in training; ``path`` is right, by paths of light.
-        samples: rays or paths a pixel; None takes 4 rays or 64 paths.
-        depth: most surfaces on a path.
-        rotation_degrees: turns the light about the vertical.
-        clamp: radiance at which the light of the environments is cut off; None takes all of it.
-        spin: turn the light once round from the first image to the last.
-        background: behind the scene; None takes that of the reconstruction's evaluation.
-    """
-
-    environments: tuple[Annotated[str, Field(min_length=1, max_length=1000)], ...] = Field(
-        min_length=1, max_length=20
-    )
-    by: Literal["split-sum", "path"] = "split-sum"
-    samples: int | None = Field(None, ge=1, le=4096)
-    depth: int = Field(6, ge=1, le=64)
-    rotation_degrees: float = Field(0.0, ge=-360, le=360)
-    clamp: float | None = Field(None, gt=0)
-    spin: bool = False
-    background: Literal["black", "white", "environment"] | None = None
-
-    @property
-    def rays(self) -> int:
-        """Rays or paths a pixel, under all environments together."""
-        return len(self.environments) * (self.samples or (64 if self.by == "path" else 4))
 
 
 def _learns_materials(train: object) -> bool:

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from octasplat.engine.evaluate.scene_facts import HitFacts, SceneFacts, hit_facts, scene_facts
+from octasplat.engine.light.stage_scene import StageScene
 from octasplat.engine.render.jobs import turntable_cameras
 from octasplat.engine.render.renderer import render_rays
 from octasplat.engine.surface.cameras import photograph_cameras
 from octasplat.engine.trace.make import make_tracer
-from octasplat.workers.rendering.stages import StagePlace
 
 SIDE_PX = 160
 
@@ -34,25 +34,25 @@ class Found:
     photographs: int | None
 
 
-def find_facts(place: StagePlace, up_world: Float64[np.ndarray, "3"] | None) -> Found:
+def find_facts(scene: StageScene, up_world: Float64[np.ndarray, "3"] | None) -> Found:
     """Look at a scene; ``up_world`` is what the user says of a file.
 
     Raises:
         ConfigError: the cameras of the photographs share no centre or no up direction.
     """
-    table = place.turntable(up_world)
-    if place.photographs is None:
+    table = scene.turntable(up_world)
+    if scene.photographs is None:
         (camera,) = turntable_cameras(table, 1, SIDE_PX, SIDE_PX)
         image = camera.rays()
     else:
-        image = photograph_cameras(place.photographs, np.array([0]), SIDE_PX)[0].rays()
-    tracer = make_tracer(place.settings, threads=place.threads)
-    tracer.build(place.gaussians)
-    picture = render_rays(tracer, image, place.background_srgb)
+        image = photograph_cameras(scene.photographs, np.array([0]), SIDE_PX)[0].rays()
+    tracer = make_tracer(scene.settings, threads=scene.threads)
+    tracer.build(scene.gaussians)
+    picture = render_rays(tracer, image, scene.background_srgb)
     return Found(
-        scene_facts(place.gaussians, table.up_world),
+        scene_facts(scene.gaussians, table.up_world),
         hit_facts(tracer, image),
         table.up_world,
         picture.rgb_srgb,
-        None if place.photographs is None else len(place.photographs.views),
+        None if scene.photographs is None else len(scene.photographs.views),
     )
