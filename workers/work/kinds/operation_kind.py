@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from octasplat.engine.events import Listener
 from octasplat.engine.fields import map_named_files, named_files, takes_files
-from octasplat.engine.operations.base import Operation, Request
+from octasplat.engine.operations.base import Operation, Options, Request
 from octasplat.engine.stages import stopping
 from octasplat.workers.store.names import check_name
 from octasplat.workers.work.kinds.table import JobKind
