@@ -1,21 +1,24 @@
-"""Axes of the world by name, such as ``-y``."""
+"""Axes of the world by name, such as ``-y``. Imports numpy when it is needed only."""
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-from jaxtyping import Float64
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float64
 
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
 
-def axis_named(name: str) -> Float64[np.ndarray, "3"]:
+def axis_named(name: str) -> "Float64[np.ndarray, '3']":
     """Return the unit vector of ``x``, ``-x``, ``y`` and so on."""
+    import numpy as np
+
     axis = np.eye(3)["xyz".index(name[-1])]
     return -axis if name.startswith("-") else axis
 
 
-def light_up(source: Path, name: str | None) -> Float64[np.ndarray, "3"]:
+def light_up(source: Path, name: str | None) -> "Float64[np.ndarray, '3']":
     """Return the direction in the world that is up for the light on a scene with materials.
 
     Args:
@@ -25,6 +28,8 @@ def light_up(source: Path, name: str | None) -> Float64[np.ndarray, "3"]:
     Raises:
         ConfigError: the run's settings cannot be read.
     """
+    import numpy as np
+
     from octasplat.engine.config import read_config
     from octasplat.engine.run_folder import CONFIG, is_run
 

@@ -255,4 +255,6 @@ def _render_on_stage(
     return output.write(shots, compile_stage(stage, scene, shots).paint, kept, progress)
 
 
-OPERATION = Operation("render", "Render new views of a scene.", RenderRequest, RenderOptions, run)
+OPERATION = Operation(
+    "render", "Render new views of a scene as images or a video.", RenderRequest, RenderOptions, run
+)

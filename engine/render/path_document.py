@@ -1,10 +1,9 @@
-"""What a camera path file says, checked; see ``docs/cameras.md``. Imports neither torch nor numba."""
+"""What a camera path file says, checked; see ``docs/cameras.md``. Imports numpy when it is needed only."""
 
 import json
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from octasplat.engine.errors import ConfigError
@@ -33,6 +32,8 @@ class PathFrame(BaseModel):
     def _check(self) -> "PathFrame":
         if (self.fov_y_degrees is None) == (self.fy is None) or (self.fx is None) != (self.fy is None):
             raise ValueError("needs either fov_y_degrees or both fx and fy")
+        import numpy as np
+
         pose = np.array(self.camera_to_world)
         rotation = pose[:3, :3]
         rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID_TOLERANCE)
