@@ -38,6 +38,7 @@ from octasplat.service.web.results import (
     measured,
     read_json,
     read_names,
+    shown_mesh,
 )
 from octasplat.service.web.routing import PageRoute, go_to, is_part
 from octasplat.service.web.templating import page
@@ -112,6 +113,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         ],
         groups=downloads(artifacts),
         scene=by_name.get(SCENE),
+        mesh=shown_mesh(artifacts),
         report=by_name.get(REPORT),
         video=next((row for row in artifacts if row.media_type == "video/mp4"), None),
         q=_octagon_q(config),

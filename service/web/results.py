@@ -194,6 +194,12 @@ def mean_psnr(metrics: Mapping[str, Any]) -> float | None:
     return _number(_mapping(metrics.get("mean")).get("psnr"))
 
 
+def shown_mesh(artifacts: Sequence[Artifact]) -> Artifact | None:
+    """Return the result that is a mesh which the page can show; None if there is none."""
+    meshes = [row for row in artifacts if row.name.lower().endswith(".glb") and not _holds_splats(row.name)]
+    return min(meshes, key=lambda row: (_rank(row.name), row.name), default=None)
+
+
 def downloads(artifacts: Sequence[Artifact]) -> list[DownloadGroup]:
     """The results by what they are for."""
     groups = {title: DownloadGroup(title, [], folded) for title, folded in _GROUPS.items()}
@@ -250,11 +256,15 @@ def _use_of(name: str) -> tuple[str, str]:
     lower = name.lower()
     if name in _NAMED:
         return _NAMED[name]
-    if lower.endswith((".splats.glb", "_splats.glb", "-splats.glb")):
+    if _holds_splats(name):
         return _SCENE, "three.js, PlayCanvas, Babylon.js: Gaussians by KHR_gaussian_splatting"
     if lower.endswith("mesh.ply"):
         return _NAMED["mesh.ply"]
     return _SUFFIXES.get(PurePosixPath(lower).suffix, _OTHER)
+
+
+def _holds_splats(name: str) -> bool:
+    return name.lower().endswith((".splats.glb", "_splats.glb", "-splats.glb"))
 
 
 def _rank(name: str) -> int:

@@ -1,0 +1,26 @@
+"""Which results of a job its page shows."""
+
+import uuid
+
+import pytest
+
+from octasplat.service.web.results import shown_mesh
+from octasplat.workers.records.rows import Artifact
+
+
+def artifact(name: str) -> Artifact:
+    return Artifact(uuid.uuid4(), name, "0" * 64, 10, "application/octet-stream")
+
+
+@pytest.mark.parametrize(
+    ("names", "shown"),
+    [
+        (["surface.glb", "views.json"], "surface.glb"),
+        (["a.glb", "mesh.glb"], "mesh.glb"),
+        (["scene.splats.glb", "mesh.obj"], None),
+        ([], None),
+    ],
+)
+def test_mesh_that_is_shown(names: list[str], shown: str | None) -> None:
+    found = shown_mesh([artifact(name) for name in names])
+    assert (found.name if found else None) == shown
