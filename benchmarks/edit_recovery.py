@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from octasplat.engine.edit.choices import MeshRecovery
 from octasplat.engine.edit.local_maps import legs_world
-from octasplat.engine.edit.recovery import EditOptions, recover_edit
+from octasplat.engine.edit.recovery import recover_edit
 from octasplat.engine.files import Mesh, export_scene, read_mesh, read_scene
 from octasplat.engine.gaussians.model import FlatGaussians
 
@@ -77,7 +78,7 @@ def row(name: str, gaussians: FlatGaussians, mesh: Mesh, move: Map) -> None:
     means = gaussians.means_world.astype(np.float64)
     legs = derivatives(move, means) @ legs_world(gaussians)
     for method in ("least-squares", "three-point"):
-        options = EditOptions.model_validate({"method": method, "axes": "x0"})
+        options = MeshRecovery.model_validate({"method": method, "axes": "x0"})
         result, report = recover_edit(gaussians, mesh, Path("mesh.ply"), options)
         expected = covariances(legs)
         error = np.linalg.norm(covariances(legs_world(result)) - expected, axis=(1, 2))

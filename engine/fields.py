@@ -86,7 +86,8 @@ InputFile = Annotated[Path, NamedFile()]
 """A file that options name: a path here, a name among the job's files in a service."""
 Source = Annotated[Path, Positional("IN")]
 """The input that a verb works on; a job has its own."""
-Output = Annotated[Path, Spelling(("-o", "--output"))]
+OUTPUT_FLAGS = Spelling(("-o", "--output"))
+Output = Annotated[Path, OUTPUT_FLAGS]
 """Where a verb writes; a job has its own place."""
 DatasetFolder = Annotated[Path | None, Spelling(("--scene", "--dataset"), metavar="FOLDER")]
 """The folder of a run's photographs; a job that needs them has its own."""

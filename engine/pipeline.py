@@ -33,9 +33,9 @@ from octasplat.engine.events import (
     Warned,
     broadcast,
 )
-from octasplat.engine.files import ExportOptions, check_writable, read_facts
+from octasplat.engine.files import ExportOptions, check_writable, export_losses, read_facts
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from octasplat.engine.files.several import export_files
+from octasplat.engine.files.several import export_files, known_targets
 from octasplat.engine.gaussians.materials import reflective_share
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_facts import SceneFacts
@@ -385,12 +385,12 @@ def _export(output: Path, config: ReconstructionConfig, threads: int, tell: List
         on_pass=lambda _done, _total: tell(StageProgress("export", 0, len(missing))),
         on_unknown=lambda text: tell(Warned(text)),
     )
-    return export_files(
-        gaussians,
-        output,
-        missing,
-        options,
-        plain=lambda: plain.gaussians,
+    targets = [output / name for name in missing]
+    for lost in export_losses(gaussians, known_targets(targets)):
+        tell(Warned(lost))
+    _, failed = export_files(
+        targets,
+        lambda exporter: (gaussians if exporter.holds_harmonics else plain.gaussians, options),
         on_done=lambda done: tell(StageProgress("export", done, len(missing))),
-        on_loss=lambda text: tell(Warned(text)),
     )
+    return failed

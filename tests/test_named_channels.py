@@ -15,7 +15,8 @@ from click.testing import CliRunner
 from scipy.spatial import cKDTree
 
 from octasplat.engine.edit.affine import rotation, transform, translation
-from octasplat.engine.edit.cleaning import CleanOptions, clean
+from octasplat.engine.edit.choices import Cleaning
+from octasplat.engine.edit.cleaning import clean
 from octasplat.engine.edit.deform import deform
 from octasplat.engine.edit.recovery import recover_edit
 from octasplat.engine.edit.selection import inside_box, merge, with_sh_degree
@@ -168,7 +169,7 @@ OPERATIONS: dict[str, Operation] = {
     "checkpoint": lambda g, f: load_checkpoint(save_checkpoint(state_of(g), f, "x"), "x").gaussians,
     "best": best,
     "crop": lambda g, _: g.select(inside_box(g, np.zeros(3), np.ones(3))),
-    "clean": lambda g, _: g.select(clean(g, CleanOptions(min_opacity=0.5))[0]),
+    "clean": lambda g, _: g.select(clean(g, Cleaning(min_opacity=0.5))[0]),
     "merge": lambda g, _: merge([g.select(slice(40, None)), g]),
     "fewer harmonics": lambda g, _: with_sh_degree(g, 0),
     "move": lambda g, _: transform(g, translation(np.array([1.0, 2, 3]))),

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -18,9 +18,10 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from octasplat.engine.colour import srgb_to_linear
+from octasplat.engine.edit.axes import Axes
 from octasplat.engine.edit.where import MAX_LENGTH, check_where
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.fields import Spelling
+from octasplat.engine.fields import Group, Spelling, Unit
 from octasplat.engine.gaussians.materials import MATERIAL_WIDTHS
 
 _HEX = re.compile(r"#([0-9a-fA-F]{6})")
@@ -176,3 +177,76 @@ class MaterialChange(BaseModel):
                 "Say what to change: nothing is changed unless albedo, metallic or roughness is set or scaled"
             )
         return self
+
+
+class MeshRecovery(BaseModel):
+    """How an edited mesh becomes Gaussians."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    method: Literal["least-squares", "three-point"] = Field(
+        "least-squares",
+        description="How a frame follows from the corners of its octagon: least-squares over all of them, or "
+        "three-point, the rule of the paper from corners 0, 2 and 6, which drops shear.",
+    )
+    damaged: Literal["repair", "drop"] = Field(
+        "repair",
+        description="What becomes of octagons that lost corners, flipped or crumpled: repair fits them to "
+        "the corners left, turns them back or moves them as their neighbours were; drop leaves them out.",
+    )
+    axes: Literal["auto"] | Axes = Field(
+        "auto", description="Turn of the mesh about x, in degrees, that brings it back to the scene's axes."
+    )
+    q: float | None = Field(
+        None, gt=0.0, le=100.0, description="What the mesh was exported with, should it not say."
+    )
+    min_opacity: float | None = Field(
+        None,
+        ge=0.0,
+        lt=1.0,
+        description="Least opacity that the mesh was exported with, should it not say; without it every "
+        "Gaussian that can have an octagon is taken to have one.",
+    )
+    max_residual: Annotated[float, Unit("standard deviations")] = Field(
+        1.0,
+        gt=0.0,
+        description="Octagons further from an affine image than this many standard deviations are crumpled.",
+    )
+    whole_octagons: bool = Field(
+        False,
+        description="Octagons of which only some corners moved move as a whole, or not at all if most "
+        "stayed.",
+    )
+
+
+class Cleaning(BaseModel):
+    """What to remove of a scene."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    min_opacity: float = Field(
+        0.01, ge=0.0, lt=1.0, description="Remove fainter ones; below 0.01 they cannot be seen."
+    )
+    min_scale: Annotated[float, Unit("world")] = Field(
+        0.0,
+        ge=0.0,
+        description="Remove those whose larger standard deviation is smaller, in the scene's units.",
+    )
+    max_scale: Annotated[float | None, Unit("world")] = Field(
+        None,
+        gt=0.0,
+        description="Remove those whose larger standard deviation is larger, in the scene's units.",
+    )
+    floaters: bool = Field(True, description="Remove small groups by themselves.")
+    min_group: Annotated[int, Unit("Gaussians")] = Field(
+        20, ge=2, description="Groups of fewer Gaussians are floaters."
+    )
+    link: float = Field(
+        1.0,
+        gt=0.0,
+        description="Neighbours belong together if their centres are no further apart than this many times "
+        "the sum of their standard deviations.",
+    )
+    neighbours: Annotated[int, Group("advanced")] = Field(
+        12, ge=1, le=64, description="How many nearest neighbours of a Gaussian may belong to its group."
+    )

@@ -1,14 +1,13 @@
 """Gaussians that a user would rather not see: faint, oversized, too near to a camera, and floaters."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from octasplat.engine.edit.choices import Cleaning
+from octasplat.engine.edit.reports import CleanReport
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.scene.near import NearZones
 
@@ -17,56 +16,8 @@ WIDEST_LINK = 8.0
 Gaussian does not hold everything together."""
 
 
-class CleanOptions(BaseModel):
-    """What to remove.
-
-    Attributes:
-        min_opacity: fainter ones.
-        min_scale: those whose larger standard deviation is smaller, world units.
-        max_scale: those whose larger standard deviation is larger, world units.
-        floaters: isolated small groups.
-        link: two neighbours belong together if their centres are no further apart than this many times the
-            sum of their standard deviations.
-        neighbours: how many nearest neighbours may be linked to.
-        min_group: groups of fewer Gaussians than this are floaters.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    min_opacity: float = Field(default=0.01, ge=0.0, lt=1.0)
-    min_scale: float = Field(default=0.0, ge=0.0)
-    max_scale: float = Field(default=float("inf"), gt=0.0)
-    floaters: bool = True
-    link: float = Field(default=1.0, gt=0.0)
-    neighbours: int = Field(default=12, ge=1, le=64)
-    min_group: int = Field(default=20, ge=2)
-
-
-@dataclass(frozen=True)
-class CleanReport:
-    """How many Gaussians were removed, each counted for the first reason that holds.
-
-    Attributes:
-        faint: below the least opacity.
-        small: below the least scale.
-        large: above the largest scale.
-        near: nearer to a camera than what its photograph shows.
-        floating: in groups too small.
-        groups: number of such groups.
-        kept: those that stay.
-    """
-
-    faint: int
-    small: int
-    large: int
-    near: int
-    floating: int
-    groups: int
-    kept: int
-
-
 def clean(
-    gaussians: FlatGaussians, options: CleanOptions, near_zones: NearZones | None = None
+    gaussians: FlatGaussians, options: Cleaning, near_zones: NearZones | None = None
 ) -> tuple[Bool[np.ndarray, " n"], CleanReport]:
     """Which Gaussians stay, and why the others do not.
 
@@ -75,7 +26,7 @@ def clean(
     largest = gaussians.scales.max(axis=1, initial=0.0)
     faint = gaussians.opacities < options.min_opacity
     small = ~faint & (largest < options.min_scale)
-    large = ~faint & (largest > options.max_scale)
+    large = ~faint & (largest > (np.inf if options.max_scale is None else options.max_scale))
     keep = ~(faint | small | large)
     near = np.zeros(len(gaussians), np.bool_)
     if near_zones is not None:

@@ -4,7 +4,6 @@ This is where a physics engine comes in: it needs to move points, nothing else.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -12,6 +11,7 @@ from jaxtyping import Bool, Float, Float64
 from octasplat.engine.edit.apply import apply_legs_to, blocks
 from octasplat.engine.edit.local_maps import has_area, legs_world
 from octasplat.engine.edit.octagon_fit import fit_octagons
+from octasplat.engine.edit.reports import DeformReport
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import SIDES, corner_directions
 
@@ -20,30 +20,6 @@ CUBATURE_RADIUS = float(np.sqrt(2.0))
 fitted to them is the best one under the Gaussian's own weight, up to third order."""
 
 CornerMap = Callable[[Float64[np.ndarray, "n 8 3"]], Float[np.ndarray, "n 8 3"]]
-
-
-@dataclass(frozen=True)
-class DeformReport:
-    """What a deformation did.
-
-    Attributes:
-        moved: Gaussians with new parameters.
-        unmoved: Gaussians that keep every bit.
-        collapsed: moved ones that lost their area; they were placed, with their old frame and size.
-        mirrored: moved ones in a part of space that was mirrored.
-        residual_median: how far the deformation is from affine over one Gaussian: root mean square distance
-            of its corners from the fit, in standard deviations; median of the moved ones.
-        residual_p95: 95th percentile.
-        residual_max: largest.
-    """
-
-    moved: int
-    unmoved: int
-    collapsed: int
-    mirrored: int
-    residual_median: float
-    residual_p95: float
-    residual_max: float
 
 
 def deformation_corners(gaussians: FlatGaussians) -> Float64[np.ndarray, "n 8 3"]:

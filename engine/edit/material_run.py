@@ -1,9 +1,5 @@
-"""A finished run with other materials: the folder of a run again, but for what was measured of the first."""
+"""The scene of a finished run with other materials."""
 
-import json
-import os
-import shutil
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,30 +8,13 @@ from jaxtyping import Bool
 from octasplat.engine.config import read_config
 from octasplat.engine.edit.choices import MaterialChange, Selection
 from octasplat.engine.edit.material_change import with_harmonics_following, with_materials
-from octasplat.engine.errors import ConfigError, OutputError
-from octasplat.engine.files import read_facts
-from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.materials import require_materials
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_map import read_environment
-from octasplat.engine.run_folder import (
-    CONFIG,
-    ENVIRONMENT,
-    EVENTS,
-    HELD_OUT,
-    POSES,
-    SCENE,
-    TRAINING,
-    VIEWS,
-    is_run,
-)
+from octasplat.engine.run_folder import CONFIG, ENVIRONMENT, SCENE, is_run
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.learnt_light import LearntLight
-from octasplat.engine.writing import telling_of_room, write_json
-
-EDITS = "edits.json"
-"""What was changed since the training, first to last."""
-_KEPT = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT)
 
 
 def change_materials(
@@ -86,63 +65,3 @@ def edit_note(
         **selection.model_dump(mode="json", exclude_defaults=True, include=where),
         "gaussians": int(chosen.sum()),
     }
-
-
-def check_new_run(target: Path) -> None:
-    """Make sure that a folder is free.
-
-    Raises:
-        OutputError: it is not.
-    """
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise OutputError(f"{target} is there already; name a new folder.")
-
-
-def write_changed_run(
-    source: Path, gaussians: FlatGaussians, target: Path, note: Mapping[str, object]
-) -> None:
-    """Write a folder like that of a run with another scene in it, all at once.
-
-    What was measured, rendered and exported of the run does not come along, nor do checkpoints.
-
-    Args:
-        source: folder of the run.
-        gaussians: the other scene.
-        target: a folder that does not exist or is empty.
-        note: what was changed, added to ``edits.json``.
-
-    Raises:
-        OutputError: the folder is taken or cannot be written.
-        NoSpaceLeft: its disk is full.
-    """
-    check_new_run(target)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        with telling_of_room(target):
-            partial.mkdir(parents=True)
-            for name in _KEPT:
-                if (source / name).exists():
-                    shutil.copyfile(source / name, partial / name)
-            if (source / POSES).is_dir():
-                shutil.copytree(source / POSES, partial / POSES)
-            write_gaussian_ply(
-                gaussians,
-                partial / SCENE,
-                facts=read_facts(source),
-            )
-            write_json(partial / EDITS, [*_edits(source), dict(note)])
-            partial.replace(target)
-    except OSError as error:
-        raise OutputError(f"{target} cannot be written ({error.strerror or error}).") from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _edits(source: Path) -> list[object]:
-    if not (source / EDITS).exists():
-        return []
-    try:
-        found = json.loads((source / EDITS).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{source / EDITS} cannot be read ({error}); delete it.") from None
-    return found if isinstance(found, list) else [found]

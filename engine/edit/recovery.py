@@ -2,17 +2,17 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
-from pydantic import BaseModel, ConfigDict, Field
 
 from octasplat.engine.edit.apply import apply_legs_to, blocks
-from octasplat.engine.edit.axes import TURNS, Axes, detect_axes, infer_q, usual_axes
+from octasplat.engine.edit.axes import TURNS, detect_axes, infer_q, usual_axes
+from octasplat.engine.edit.choices import MeshRecovery
 from octasplat.engine.edit.local_maps import has_area, legs_world, solid_derivatives
 from octasplat.engine.edit.matching import Octagons, match_octagons
 from octasplat.engine.edit.octagon_fit import LEAST_CORNERS, fit_octagons
+from octasplat.engine.edit.reports import EditReport
 from octasplat.engine.edit.surroundings import carry, flipped_against, neighbour_turns
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import Mesh
@@ -34,93 +34,6 @@ AXES_SAMPLES = 100_000
 """Octagons that are looked at to find turned axes."""
 
 
-class EditOptions(BaseModel):
-    """How an edited mesh becomes Gaussians.
-
-    Attributes:
-        method: ``least-squares`` over all corners, or the paper's rule from corners 0, 2 and 6, which drops
-            shear.
-        damaged: what becomes of octagons that lost corners, flipped or crumpled. ``repair``: fitted to the
-            corners left, turned back, or moved as their neighbours were; ``drop``: left out.
-        axes: the turn about x that brings the mesh into the scene's frame, or ``auto``.
-        q: chi-square quantile that the mesh was exported with; None asks the mesh.
-        min_opacity: least opacity that the mesh was exported with; None asks the mesh, and one that does not
-            say has an octagon of every Gaussian that can have one.
-        whole_octagons: octagons of which some corners moved and others did not move as those that moved if
-            these are the half of them at least, and else not at all.
-        max_residual: octagons further than this from an affine image, in standard deviations, are crumpled.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    method: Literal["least-squares", "three-point"] = "least-squares"
-    damaged: Literal["repair", "drop"] = "repair"
-    axes: Literal["auto"] | Axes = "auto"
-    q: float | None = Field(default=None, gt=0.0, le=100.0)
-    min_opacity: float | None = Field(default=None, ge=0.0, lt=1.0)
-    whole_octagons: bool = False
-    max_residual: float = Field(default=1.0, gt=0.0)
-
-
-@dataclass
-class EditReport:
-    """What was found in an edited mesh and what became of it; all numbers count Gaussians unless they say.
-
-    Attributes:
-        scene_size: in the unedited scene.
-        result_size: in the result.
-        matched_by: ``ids`` or ``order``.
-        axes: the turn about x that was applied to the mesh.
-        axes_usual: what this kind of file has if it was not converted on its way.
-        q: chi-square quantile of the octagons.
-        unmoved: kept bit for bit, as no corner moved.
-        moved: recovered from their corners.
-        deleted: without any vertex left, so left out.
-        copies: added, as their octagons were duplicated.
-        carried: without an octagon of their own (too faint), moved as their neighbours were.
-        orphaned: without an octagon, left out as their nearest neighbour was deleted.
-        incomplete: with some corners missing.
-        crumpled: folded, without area, or too far from an affine image.
-        flipped: facing the other way than their surroundings.
-        mirrored: in parts of the scene that were mirrored as a whole.
-        dropped: of the damaged ones, left out.
-        partial: with some corners that stayed and others that moved far.
-        snapped: of these, moved or kept as a whole.
-        foreign_vertices: vertices that belong to no octagon.
-        ambiguous_corners: corners claimed by several vertices, taken as missing.
-        strained: with a residual above 0.3 standard deviations.
-        residual_median: median residual of the moved ones, in standard deviations.
-        residual_p95: 95th percentile.
-        residual_max: largest.
-    """
-
-    scene_size: int
-    result_size: int = 0
-    matched_by: str = ""
-    axes: Axes = "x0"
-    axes_usual: Axes = "x0"
-    q: float = CHI2_2_99
-    unmoved: int = 0
-    moved: int = 0
-    deleted: int = 0
-    copies: int = 0
-    carried: int = 0
-    orphaned: int = 0
-    incomplete: int = 0
-    crumpled: int = 0
-    flipped: int = 0
-    mirrored: int = 0
-    dropped: int = 0
-    partial: int = 0
-    snapped: int = 0
-    foreign_vertices: int = 0
-    ambiguous_corners: int = 0
-    strained: int = 0
-    residual_median: float = 0.0
-    residual_p95: float = 0.0
-    residual_max: float = 0.0
-
-
 @dataclass
 class _Recovered:
     """New parameters, one row an octagon, and what is known about each."""
@@ -134,7 +47,7 @@ class _Recovered:
 
 
 def recover_edit(
-    gaussians: FlatGaussians, mesh: Mesh, path: Path, options: EditOptions | None = None
+    gaussians: FlatGaussians, mesh: Mesh, path: Path, options: MeshRecovery | None = None
 ) -> tuple[FlatGaussians, EditReport]:
     """The scene as an edit of its octagon mesh left it.
 
@@ -151,7 +64,7 @@ def recover_edit(
         SceneFileError: the mesh does not belong to the scene, its vertices cannot be identified, or nothing
             is left of the scene.
     """
-    options = options or EditOptions()
+    options = options or MeshRecovery()
     opacities = gaussians.opacities
     q = options.q or infer_q(mesh, opacities, CHI2_2_99)
     radii = octagon_radii(opacities, q)
@@ -202,7 +115,7 @@ def _recover(
     octagons: Octagons,
     radii: Float[np.ndarray, " m"],
     file_rounding: float,
-    options: EditOptions,
+    options: MeshRecovery,
     report: EditReport,
 ) -> _Recovered:
     count = len(octagons)
@@ -326,7 +239,7 @@ def _assemble(
     octagons: Octagons,
     recovered: _Recovered,
     exported: Bool[np.ndarray, " n"],
-    options: EditOptions,
+    options: MeshRecovery,
     report: EditReport,
 ) -> FlatGaussians:
     """The result in the order of the scene, copies last."""

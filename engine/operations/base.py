@@ -23,11 +23,22 @@ class Request(Options):
     """Base of requests: the options of a verb, the input that it reads and the output that it writes."""
 
 
-class SceneRequest(Request):
-    """Base of requests that read a scene and write one."""
+class SourceRequest(Request):
+    """Base of requests that read a scene."""
 
     source: Source = Field(description="The scene to read: a file of any format, or the folder of a run.")
-    output: Output = Field(description="The scene to write; the suffix says in which format.")
+
+
+CHANGED_SCENE = (
+    "The scene to write; the suffix says in which format. Of a run, a name without suffix writes a folder "
+    "that is a run again, with what of it stays valid."
+)
+
+
+class SceneRequest(SourceRequest):
+    """Base of requests that read a scene and write one."""
+
+    output: Output = Field(description=CHANGED_SCENE)
 
 
 class Result(BaseModel):
@@ -66,6 +77,7 @@ RequestT = TypeVar("RequestT", bound=Request)
 RequestT_contra = TypeVar("RequestT_contra", bound=Request, contravariant=True)
 ResultT_co = TypeVar("ResultT_co", bound=Result, covariant=True)
 OptionsT = TypeVar("OptionsT", bound=Options)
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 def never() -> bool:
@@ -118,13 +130,20 @@ class Operation(Generic[RequestT, ResultT_co]):
     run: Run[RequestT, ResultT_co]
 
 
+def options_of(model: type[OptionsT], request: Options) -> OptionsT:
+    """Return the options that a request has, whose class inherits from theirs."""
+    options = model.model_construct(**{name: getattr(request, name) for name in model.model_fields})
+    assert isinstance(options, model)
+    return options
+
+
 class ContradictoryRequest(ConfigError):
     """What is asked for is not complete, or contradicts itself."""
 
 
 def build(
-    model: type[OptionsT], values: Mapping[str, Any], place: Callable[[str], str] = lambda path: path
-) -> OptionsT:
+    model: type[ModelT], values: Mapping[str, Any], place: Callable[[str], str] = lambda path: path
+) -> ModelT:
     """Return the options or request with these values; None stands for the default.
 
     Args:
@@ -144,19 +163,22 @@ def build(
 
 
 def first_complaint(error: ValidationError, place: Callable[[str], str] = lambda path: path) -> str:
-    """Return the first complaint of a validation as one sentence that names the field.
-
-    Fields that the sentence itself names stand in it as ```name```.
-    """
+    """Return the first complaint of a validation as one sentence that names the field."""
     first = error.errors()[0]
     path = ".".join(str(part) for part in first["loc"])
-    message = re.sub(r"`([\w.]+)`", lambda match: place(match[1]), complaint(first["msg"]))
+    message = complaint(first["msg"], place)
     return f"{place(path)}: {message}." if path else f"{message}."
 
 
-def complaint(message: str) -> str:
-    """Return pydantic's message as it was raised by a validator, without a full stop."""
-    return message.removeprefix("Value error, ").removesuffix(".")
+def complaint(message: str, place: Callable[[str], str] = lambda path: path) -> str:
+    """Return pydantic's message as it was raised by a validator, without a full stop.
+
+    Args:
+        message: the message; fields that a validator names stand in it between backquotes.
+        place: what users call such a field.
+    """
+    told = message.removeprefix("Value error, ").removesuffix(".")
+    return re.sub(r"`([\w.]+)`", lambda match: place(match[1]), told)
 
 
 def warn(progress: Listener, message: str) -> None:
@@ -165,6 +187,7 @@ def warn(progress: Listener, message: str) -> None:
 
 
 __all__ = [
+    "CHANGED_SCENE",
     "ContradictoryRequest",
     "Event",
     "Listener",
@@ -177,10 +200,12 @@ __all__ = [
     "Run",
     "SceneRequest",
     "ScenesWritten",
+    "SourceRequest",
     "build",
     "complaint",
     "first_complaint",
     "ignore",
     "never",
+    "options_of",
     "warn",
 ]

@@ -8,7 +8,14 @@ from pydantic import model_validator
 from octasplat.engine.edit.choices import Selection
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, ignore
-from octasplat.engine.operations.base import Operation, Options, SceneRequest, ScenesWritten, never
+from octasplat.engine.operations.base import (
+    Operation,
+    Options,
+    SceneRequest,
+    ScenesWritten,
+    never,
+    options_of,
+)
 
 
 class CropOptions(Selection, Options):
@@ -17,7 +24,7 @@ class CropOptions(Selection, Options):
     @model_validator(mode="after")
     def _chooses(self) -> "CropOptions":
         if self.where is None and self.box is None and self.sphere is None:
-            raise ValueError("say what to keep: a box, a sphere or an expression (where)")
+            raise ValueError("Say what to keep: a box, a sphere or an expression (where)")
         return self
 
 
@@ -54,11 +61,10 @@ def run(
         SceneFileError: the scene cannot be read or written.
     """
     from octasplat.engine.edit.selection import chosen_by
-    from octasplat.engine.files import read_facts
-    from octasplat.engine.operations.scenes import check_target, open_scene, write_scene
+    from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
 
     source: Path = request.source
-    check_target(request.output, [source])
+    check_changed(source, request.output)
     gaussians = open_scene(source, progress)
     keep = chosen_by(gaussians, request)
     if not keep.any():
@@ -69,9 +75,10 @@ def run(
             "its solid part is)."
         )
     kept, count = int(keep.sum()), len(keep)
-    written = write_scene(gaussians.select(keep), read_facts(source), request.output, progress)
-    notes = (f"{source}: {kept:,} of {count:,} Gaussians kept.", written)
-    return CropResult(files=(request.output,), notes=notes, kept=kept, count=count)
+    note = edit_note("crop", options_of(CropOptions, request), gaussians=kept)
+    written = write_changed(source, gaussians.select(keep), request.output, progress, note=note)
+    notes = (f"{source}: {kept:,} of {count:,} Gaussians kept.", written.sentence)
+    return CropResult(files=written.files, folder=written.folder, notes=notes, kept=kept, count=count)
 
 
 OPERATION = Operation("crop", "Keep part of a scene.", CropRequest, CropOptions, run)

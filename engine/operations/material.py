@@ -68,25 +68,15 @@ def run(
         SceneFileError: the scene or the mesh cannot be read, or the scene not be written.
     """
     from octasplat.engine.edit.masked import under_masks
-    from octasplat.engine.edit.material_run import (
-        change_materials,
-        check_new_run,
-        edit_note,
-        follows,
-        write_changed_run,
-    )
+    from octasplat.engine.edit.material_run import change_materials, edit_note, follows
     from octasplat.engine.edit.selection import chosen_by, in_mesh
-    from octasplat.engine.files import read_facts, read_mesh
+    from octasplat.engine.files import read_mesh
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scenes import check_target, open_scene, write_scene
+    from octasplat.engine.operations.scenes import check_changed, open_scene, write_changed
     from octasplat.engine.run_folder import SCENE, is_run
 
     source, output = request.source, request.output
-    is_folder = is_run(source) and not output.suffix
-    if is_folder:
-        check_new_run(output)
-    else:
-        check_target(output, [source])
+    check_changed(source, output)
     gaussians = open_scene(source, progress)
     require_materials(gaussians, source / SCENE if is_run(source) else source)
     chosen = chosen_by(gaussians, request.model_copy(update={"inverse": False}))
@@ -103,16 +93,14 @@ def run(
         notes.append(
             "Viewers and octasplat render show their harmonics, which are as before; relight shows it."
         )
-    if not is_folder:
-        notes.append(write_scene(changed, read_facts(source), output, progress))
-        return MaterialResult(files=(output,), notes=tuple(notes), changed=count, count=len(chosen))
     mesh = {"mesh": request.mesh.name} if request.mesh is not None else {}
     masks = {"masks": [path.name for path in request.masks]} if request.masks else {}
-    write_changed_run(source, changed, output, edit_note(request, request, chosen) | mesh | masks)
+    note = edit_note(request, request, chosen) | mesh | masks
+    written = write_changed(source, changed, output, progress, note=note)
     return MaterialResult(
-        files=tuple(sorted(path for path in output.rglob("*") if path.is_file())),
-        folder=output,
-        notes=(*notes, f"Wrote {output}."),
+        files=written.files,
+        folder=written.folder,
+        notes=(*notes, written.sentence),
         changed=count,
         count=len(chosen),
     )

@@ -14,7 +14,14 @@ _MODULES = {
     "render": "render",
     "relight": "relight",
     "stage-init": "stage_init",
+    "export": "export",
+    "import": "import_",
+    "edit": "edit",
+    "deform": "deform",
+    "transform": "transform",
     "crop": "crop",
+    "merge": "merge",
+    "clean": "clean",
 }
 """Module of each verb, in the order in which users meet them."""
 

@@ -1,15 +1,23 @@
 """Scenes that operations read and write, with a word on what reading or writing loses."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel
+
+from octasplat.engine.edit.changed_run import check_new_run, write_changed_run
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, Noted, Warned
+from octasplat.engine.fields import map_named_files
 from octasplat.engine.files import (
     ExportOptions,
     export_losses,
     export_scene,
     exporter_for,
+    read_facts,
     read_scene,
 )
 from octasplat.engine.gaussians.flattening import ImportReport
@@ -88,3 +96,84 @@ def write_scene(
     export_scene(gaussians, target, ExportOptions(facts=facts))
     what = exporter_for(target).description.partition(";")[0]
     return f"Wrote {target}: {what}, {len(gaussians):,} Gaussians."
+
+
+def becomes_run(source: Path, output: Path) -> bool:
+    """Return whether a changed scene is written as the folder of a run: it is of one, no file is named."""
+    return is_run(source) and not output.suffix
+
+
+def check_changed(source: Path, output: Path, inputs: Sequence[Path] = ()) -> None:
+    """Check before long work that a changed scene can be written to ``output``, a file or a run's folder.
+
+    Args:
+        source: the scene that is changed.
+        output: where the other one goes.
+        inputs: what else is read.
+
+    Raises:
+        ConfigError: ``output`` is one of the inputs.
+        OutputError: the folder is taken.
+        SceneFileError: no format takes the name.
+    """
+    if becomes_run(source, output):
+        check_new_run(output)
+    else:
+        check_target(output, [source, *inputs])
+
+
+@dataclass(frozen=True)
+class Written:
+    """A changed scene that was written.
+
+    Attributes:
+        files: its files.
+        sentence: says so.
+        folder: of the run that it became; None for a file.
+    """
+
+    files: tuple[Path, ...]
+    sentence: str
+    folder: Path | None = None
+
+
+def write_changed(
+    source: Path,
+    gaussians: FlatGaussians,
+    output: Path,
+    progress: Listener,
+    *,
+    note: Mapping[str, object],
+    facts: SceneFacts | None = None,
+    matrix: Float[np.ndarray, "4 4"] | None = None,
+) -> Written:
+    """Write the changed scene of ``source``: a file, or a run's folder with what of the run stays valid.
+
+    Args:
+        source: the scene that was changed, a file or a run's folder.
+        gaussians: what became of it.
+        output: where to; see :func:`becomes_run`.
+        progress: told what is lost.
+        note: what was done, for the run's ``edits.json``.
+        facts: what is known of the scene as a whole; None takes that of the source.
+        matrix: the affine map from the source's world to that of the scene, if they are not the same.
+    """
+    if not becomes_run(source, output):
+        return Written((output,), write_scene(gaussians, facts or read_facts(source), output, progress))
+    for text in write_changed_run(source, gaussians, output, note, facts=facts, matrix=matrix):
+        progress(Warned(text))
+    files = tuple(sorted(path for path in output.rglob("*") if path.is_file()))
+    return Written(files, f"Wrote {output}: a run with {len(gaussians):,} Gaussians.", output)
+
+
+def edit_note(name: str, options: BaseModel, **counts: int) -> dict[str, object]:
+    """Return what was done in a few words of JSON, for ``edits.json``; of files the names only.
+
+    Args:
+        name: the verb.
+        options: what was asked for.
+        counts: what came of it.
+    """
+    asked = map_named_files(options, lambda path: Path(path.name))
+    kept = type(options).model_construct(**asked).model_dump(mode="json", exclude_defaults=True)
+    return {"operation": name, **kept, **counts}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float, Int64
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from octasplat.engine.errors import ConfigError
@@ -121,6 +121,21 @@ class ViewsRecord(_Frozen):
             test_indices=np.flatnonzero(held_out).astype(np.int64),
             extent=self.extent_world,
         )
+
+    def moved(
+        self, scale: float, turn: Float[np.ndarray, "3 3"], shift_world: Float[np.ndarray, "3"]
+    ) -> "ViewsRecord":
+        """The same views of a world that was turned, scaled and then shifted: they show the same pictures."""
+        views = []
+        for row in self.views:
+            rotation = np.array(row.rotation_cam_from_world) @ turn.T
+            translation = scale * np.array(row.translation_cam_from_world) - rotation @ shift_world
+            pose = {
+                "rotation_cam_from_world": tuple(map(tuple, rotation.tolist())),
+                "translation_cam_from_world": tuple(translation.tolist()),
+            }
+            views.append(row.model_copy(update=pose))
+        return self.model_copy(update={"extent_world": scale * self.extent_world, "views": tuple(views)})
 
     def difference(self, other: "ViewsRecord") -> str | None:
         """What ``other`` has otherwise, in a few words; None if nothing."""

@@ -181,13 +181,11 @@ def test_a_mask_means_what_shows_under_it(shiny_run, octasplat, tmp_path):
     ("arguments", "told"),
     [
         (("plain.ply", "--set", "roughness=1"), "plain.ply has no materials"),
-        (("shiny.ply",), "Say what to change"),
         (("shiny.ply", "--set", "rough=1"), "--set rough: there is no such material"),
         (("shiny.ply", "--set", "roughness=2"), "--set roughness: "),
         (("shiny.ply", "--set", "roughness"), "NAME=VALUE"),
         (("shiny.ply", "--set", "albedo=red"), "--set albedo: write it as r,g,b"),
         (("shiny.ply", "--scale", "metallic=-1"), "--scale metallic: "),
-        (("shiny.ply", "--set", "metallic=1", "--scale", "metallic=2"), "metallic is set and scaled"),
         (("shiny.ply", "--set", "metallic=1", "--where", "glow > 1"), "the scene has no glow"),
         (("shiny.ply", "--set", "metallic=1", "--where", "x >"), "--where: 'x >' is no expression"),
         (("shiny.ply", "--set", "metallic=1", "--where", "x > 1e6"), "none of its"),
@@ -200,6 +198,19 @@ def test_mistakes_are_one_sentence(shiny_run, octasplat, tmp_path, monkeypatch, 
     write_gaussian_ply(scene_of(shiny_run).without_channels(["roughness"]), tmp_path / "plain.ply")
     done = octasplat("material", *arguments, "-o", "out.ply")
     assert done.exit_code == 1 and done.stderr.count("\n") == 1 and told in done.stderr, done.stderr
+    assert not (tmp_path / "out.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ((), "Say what to change"),
+        (("--set", "metallic=1", "--scale", "metallic=2"), "metallic is set and scaled"),
+    ],
+)
+def test_requests_that_are_none_are_mistakes_of_usage(shiny_run, octasplat, tmp_path, arguments, told):
+    done = octasplat("material", shiny_run, *arguments, "-o", tmp_path / "out.ply")
+    assert done.exit_code == 2 and told in done.stderr.splitlines()[-1], done.stderr
     assert not (tmp_path / "out.ply").exists()
 
 

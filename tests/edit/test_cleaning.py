@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from octasplat.engine.edit.cleaning import CleanOptions, clean, linked_groups
+from octasplat.engine.edit.choices import Cleaning
+from octasplat.engine.edit.cleaning import clean, linked_groups
 from octasplat.engine.gaussians.model import FlatGaussians, concatenate
 
 Make = Callable[..., FlatGaussians]
@@ -26,7 +27,7 @@ def test_thresholds_are_counted_once_each(sheet: FlatGaussians) -> None:
     sheet.log_scales[5:20] = np.log(0.5)
     sheet.log_scales[20:24] = [np.log(1e-4), np.log(1e-5)]
     sheet.log_scales[24] = [np.log(0.03), np.log(1e-5)]  # a needle is not small
-    options = CleanOptions(min_opacity=0.01, max_scale=0.4, min_scale=1e-3, floaters=False)
+    options = Cleaning(min_opacity=0.01, max_scale=0.4, min_scale=1e-3, floaters=False)
     keep, report = clean(sheet, options)
     np.testing.assert_array_equal(np.flatnonzero(~keep), np.arange(24))
     assert (report.faint, report.large, report.small, report.floating) == (10, 10, 4, 0)
@@ -39,19 +40,19 @@ def test_floaters_are_found_and_the_surface_stays(sheet: FlatGaussians, make_sce
     clump = make_scene(12, sh_degree=0, seed=2, size=0.05)
     clump.means_world = np.float32([0.3, 0, 1]) + 0.05 * clump.means_world
     sheet.opacity_logits[:] = alone.opacity_logits[:] = clump.opacity_logits[:] = 1.0
-    keep, report = clean(concatenate([sheet, alone, clump]), CleanOptions())
+    keep, report = clean(concatenate([sheet, alone, clump]), Cleaning())
     assert not keep[2000:].any()
     assert (~keep[:2000]).sum() <= 4
     assert report.floating == (~keep).sum()
-    assert clean(concatenate([sheet, clump]), CleanOptions(min_group=10))[0][2000:].all()
-    assert clean(concatenate([sheet, alone]), CleanOptions(floaters=False))[0].all()
+    assert clean(concatenate([sheet, clump]), Cleaning(min_group=10))[0][2000:].all()
+    assert clean(concatenate([sheet, alone]), Cleaning(floaters=False))[0].all()
 
 
 def test_a_coarse_background_is_no_floater(sheet: FlatGaussians, make_scene: Make) -> None:
     wall = make_scene(300, sh_degree=0, seed=3, size=3.0)
     wall.means_world = wall.means_world * np.float32([30, 30, 0]) + np.float32([0, 0, 50])
     sheet.opacity_logits[:] = wall.opacity_logits[:] = 1.0
-    keep, _ = clean(concatenate([sheet, wall]), CleanOptions())
+    keep, _ = clean(concatenate([sheet, wall]), Cleaning())
     assert keep[2000:].mean() > 0.97
 
 
@@ -61,7 +62,7 @@ def test_one_huge_gaussian_does_not_hold_floaters(sheet: FlatGaussians, make_sce
     alone = make_scene(5, sh_degree=0, seed=1, size=0.02)
     alone.opacity_logits[:] = 1.0
     alone.means_world = np.float32([0, 0, 3]) + alone.means_world
-    keep, _ = clean(concatenate([sheet, alone]), CleanOptions())
+    keep, _ = clean(concatenate([sheet, alone]), Cleaning())
     assert not keep[2000:].any()
 
 
@@ -69,7 +70,7 @@ def test_a_scene_smaller_than_a_group_is_not_cleaned_away(make_scene: Make) -> N
     for count in (1, 2, 5):
         g = make_scene(count, spread=0.01)
         g.opacity_logits[:] = 1.0
-        assert clean(g, CleanOptions())[0].all()
+        assert clean(g, Cleaning())[0].all()
 
 
 def test_groups(make_scene: Make) -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from edit_scenes import assert_same, covariance_errors, moved_covariances, twist
 
-from octasplat.engine.edit.recovery import EditOptions, recover_edit
+from octasplat.engine.edit.choices import MeshRecovery
+from octasplat.engine.edit.recovery import recover_edit
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import export_scene, read_mesh
 from octasplat.engine.gaussians.model import FlatGaussians
@@ -59,7 +60,7 @@ def test_twist(blender, make_scene: Make, tmp_path: Path, name: str) -> None:
     expected = back.T @ expected @ back
     errors, centres = {}, {}
     for method in ("least-squares", "three-point"):
-        options = EditOptions.model_validate({"method": method, "axes": "x0"})
+        options = MeshRecovery.model_validate({"method": method, "axes": "x0"})
         result, report = recover_edit(g, read_mesh(target), target, options)
         errors[method] = covariance_errors(result, expected)
         means = twist_by(phase, axis, exact(g.means_world))

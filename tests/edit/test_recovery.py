@@ -15,7 +15,8 @@ from edit_scenes import (
     twist,
 )
 
-from octasplat.engine.edit.recovery import EditOptions, EditReport, recover_edit
+from octasplat.engine.edit.choices import MeshRecovery
+from octasplat.engine.edit.recovery import EditReport, recover_edit
 from octasplat.engine.errors import SceneFileError
 from octasplat.engine.files import ExportOptions, Mesh, export_scene, read_mesh
 from octasplat.engine.gaussians.harmonics import sh_basis
@@ -59,7 +60,7 @@ def without(mesh: Mesh, gone: np.ndarray) -> Mesh:
 def recover(
     gaussians: FlatGaussians, mesh: Mesh, path: Path = PLY, **options: object
 ) -> tuple[FlatGaussians, EditReport]:
-    return recover_edit(gaussians, mesh, path, EditOptions.model_validate(options))
+    return recover_edit(gaussians, mesh, path, MeshRecovery.model_validate(options))
 
 
 @pytest.mark.parametrize("name", ["mesh.ply", "scene.obj", "scene.glb"])

@@ -1,7 +1,6 @@
 """Options that several commands share, and what they mean."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar
 
 import click
@@ -33,31 +32,13 @@ def quiet_option(command: F) -> F:
     return click.option("--quiet", "-q", is_flag=True, help="Show warnings and errors only.")(command)
 
 
-def scenes_output_option(command: F) -> F:
-    """``--output`` of what writes one scene, or a sequence of them."""
-    return click.option(
-        "-o",
-        "--output",
-        type=click.Path(path_type=Path),
-        required=True,
-        help="The scene to write; for a sequence a pattern such as out/%04d.ply, or a folder.",
-    )(command)
-
-
-def report_option(command: F) -> F:
-    """``--report``."""
-    return click.option(
-        "--report", type=click.Path(path_type=Path), metavar="FILE.json", help="Write all counts there."
-    )(command)
-
-
 def export_names(text: str | None) -> tuple[str, ...] | None:
     """``mesh.glb,scene.spz`` as names of files; None where nothing was said.
 
     Raises:
         ConfigError: one of them is no name of a result.
     """
-    from octasplat.workers.work.kinds.options import check_export_name
+    from octasplat.engine.files.result_names import check_export_name
 
     if text is None:
         return None

@@ -50,7 +50,11 @@ def request_options(model: type[BaseModel], *, leave_out: Sequence[str] = ()) ->
 
 
 def operation_command(
-    operation: Operation[Any, Any], *, stops: bool = False, threads: bool = False
+    operation: Operation[Any, Any],
+    *,
+    stops: bool = False,
+    threads: bool = False,
+    cls: type[click.Command] = click.Command,
 ) -> click.Command:
     """Return the command of an operation that needs nothing but its request.
 
@@ -58,6 +62,7 @@ def operation_command(
         operation: the verb.
         stops: whether the operation asks ``should_stop``; else a signal ends it where it is.
         threads: whether the command has ``--threads``.
+        cls: class of the command.
     """
 
     def run(quiet: bool, threads: int = 0, **given: Any) -> None:
@@ -69,7 +74,10 @@ def operation_command(
     if threads:
         command = threads_option(command)
     command = request_options(operation.request)(command)
-    return click.command(operation.name, short_help=operation.title, help=operation.request.__doc__)(command)
+    told = (operation.request.__doc__ or "").replace("``", "")
+    make = click.command(operation.name, cls=cls, short_help=operation.title, help=told)
+    made: click.Command = make(command)
+    return made
 
 
 def request_of(model: type[Any], given: dict[str, Any]) -> Any:
@@ -135,7 +143,7 @@ def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
                 name,
                 metavar=f"{place.metavar}...",
                 nargs=-1,
-                required=True,
+                required=info.is_required(),
                 type=_type(get_args(inner)[0], None),
             )
             if many
@@ -228,18 +236,40 @@ def _is_sequence(annotation: Any) -> bool:
     return get_origin(annotation) is tuple and get_args(annotation)[-1] is Ellipsis
 
 
+class _Choice(click.Choice[Any]):
+    """One of several values, which need not be texts."""
+
+    def __init__(self, values: Sequence[Any]) -> None:
+        self._values = {str(value): value for value in values}
+        super().__init__(list(self._values))
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the value that a word stands for."""
+        return self._values[super().convert(str(value), param, ctx)]
+
+
 def _type(annotation: Any, info: FieldInfo | None) -> Any:
     marks: list[Any] = list(info.metadata) if info is not None else []
     while get_origin(annotation) is Annotated:
         annotation, *more = get_args(annotation)
         marks += more
-    if get_origin(annotation) is Literal:
-        return click.Choice([str(value) for value in get_args(annotation)])
+    if values := _literals(annotation):
+        return _Choice(values)
     if annotation is Path:
         return click.Path(path_type=Path)
     if annotation in (int, float):
         return _range(annotation, marks)
     return annotation if annotation in (str, bool) else str
+
+
+def _literals(annotation: Any) -> tuple[Any, ...]:
+    """The values of a literal type, or of a union of such; none where it is something else."""
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)
+    if get_origin(annotation) in (Union, types.UnionType):
+        parts = [_literals(part) for part in get_args(annotation) if part is not type(None)]
+        return tuple(value for part in parts for value in part) if all(parts) else ()
+    return ()
 
 
 def _plain_type(annotation: Any) -> Any:

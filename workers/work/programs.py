@@ -27,7 +27,6 @@ from octasplat.engine.writing import write_json
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
-    ExportJobOptions,
     ReconstructOptions,
 )
 from octasplat.workers.work.places import Places
@@ -88,37 +87,6 @@ def _publish_run(task: Task) -> None:
         hidden = any(part.startswith(".") for part in name.parts)
         if path.is_file() and not hidden and name.parts[0] not in (CHECKPOINTS, CACHE):
             _publish(task, path, name.as_posix())
-
-
-def export(task: Task) -> None:
-    """The scene of a reconstruction in other formats."""
-    options = ExportJobOptions.model_validate(task.options)
-    gaussians, _ = read_gaussian_ply(task.run / SCENE)
-    q = options.q if options.q is not None else read_config(task.run / CONFIG).train.trace.q
-    settings = ExportOptions(q=q, min_opacity=options.min_opacity, sh_pad_degree=options.sh_pad_degree)
-    tell = stopping(task.listener, task.should_stop)
-    if (left_out := not_exported(task.run)) is not None:
-        tell(Warned(left_out))
-    count = len(options.files)
-    plain = PlainScene(
-        gaussians,
-        task.run,
-        threads=task.threads,
-        on_pass=lambda _done, _total: tell(StageProgress("export", 0, count)),
-        on_unknown=lambda text: tell(Warned(text)),
-    )
-    with counted_stage("export", tell, count):
-        failed = export_files(
-            gaussians,
-            task.results,
-            options.files,
-            settings,
-            plain=lambda: plain.gaussians,
-            on_done=lambda done: tell(StageProgress("export", done, count)),
-            on_loss=lambda text: tell(Warned(text)),
-        )
-    if failed is not None:
-        raise ExportFailed(failed)
 
 
 def run_operation(task: Task) -> None:

@@ -5,11 +5,16 @@ from pathlib import Path
 from typing import Any
 
 from octasplat.engine.operations.base import Options
+from octasplat.engine.operations.clean import OPERATION as CLEAN
 from octasplat.engine.operations.crop import OPERATION as CROP
+from octasplat.engine.operations.deform import OPERATION as DEFORM
+from octasplat.engine.operations.edit import OPERATION as EDIT
 from octasplat.engine.operations.evaluate import OPERATION as EVALUATE
 from octasplat.engine.operations.material import OPERATION as MATERIAL
+from octasplat.engine.operations.merge import OPERATION as MERGE
 from octasplat.engine.operations.relight import OPERATION as RELIGHT
 from octasplat.engine.operations.render import OPERATION as RENDER
+from octasplat.engine.operations.transform import OPERATION as TRANSFORM
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
@@ -21,21 +26,23 @@ from octasplat.workers.work.kinds.estimates import (
 )
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.options import (
-    ExportJobOptions,
     ReconstructOptions,
     resolve_reconstruction,
     revise_reconstruction,
 )
 from octasplat.workers.work.kinds.pictures import Relight, Render
 from octasplat.workers.work.kinds.surface import Surface
+from octasplat.workers.work.kinds.scene_kinds import (
+    BACKGROUND,
+    EDITS,
+    LIGHT,
+    RUN_FILES,
+    Export,
+    Import,
+    SceneChange,
+)
 from octasplat.workers.work.kinds.table import JobKind, register
 from octasplat.workers.work.task import Task
-
-_RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json", "events.jsonl")
-_LIGHT = "environment.hdr"
-"""What results with materials have, and no others."""
-_BACKGROUND = "background.exr"
-"""What results with a learnt background have, and no others."""
 
 
 class Reconstruct(JobKind[ReconstructOptions]):
@@ -111,28 +118,6 @@ class Evaluate(OperationKind):
         return options.model_copy(update={"all_views": True})
 
 
-class Export(JobKind[ExportJobOptions]):
-    """A scene in other formats."""
-
-    writes_at = "files"
-
-    def writes(self, options: ExportJobOptions) -> tuple[str, ...]:
-        """Return the names of the files."""
-        return options.files
-
-    def demands(self, options: ExportJobOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
-        """Return the number of files."""
-        return (Demand("files", "exports", len(options.files)),)
-
-
-class Material(OperationKind):
-    """Other materials."""
-
-    def places(self, task: Task, options: Any) -> dict[str, Path]:
-        """Return the run, and the folder of the run that comes of it, which is published file by file."""
-        return {"source": task.run, "output": task.folder / "changed"}
-
-
 def register_all() -> None:
     """Register them."""
     register(
@@ -149,42 +134,31 @@ def register_all() -> None:
             EVALUATE,
             title="Measure views of a reconstruction: those held out again, or other photographs",
             stages=("evaluate",),
-            source_files=(*_RUN_FILES, _LIGHT, _BACKGROUND, "edits.json"),
+            source_files=(*RUN_FILES, LIGHT, BACKGROUND, EDITS),
             tells_stages=True,
         )
     )
-    register(
-        Export(
-            name="export",
-            title="The scene of a reconstruction in other formats",
-            needs="result",
-            options=ExportJobOptions,
-            program="octasplat.workers.work.programs:export",
-            stages=("export",),
-            source_files=("scene.ply", "config.json"),
-        )
-    )
+    register(Export())
     register(
         Render(
             RENDER,
             title="New views of the scene of a reconstruction, as a video or images",
-            source_files=(*_RUN_FILES[:4], _BACKGROUND),
+            source_files=(*RUN_FILES[:4], BACKGROUND),
         )
     )
     register(
         Relight(
             RELIGHT,
             title="The scene of a reconstruction with materials in other light",
-            source_files=(_LIGHT, *_RUN_FILES[:4]),
+            source_files=(LIGHT, *RUN_FILES[:4]),
         )
     )
-    register(
-        Material(
-            MATERIAL,
-            title="The scene of a reconstruction with other materials",
-            stages=("edit",),
-            source_files=(_LIGHT, *_RUN_FILES, "edits.json"),
-        )
-    )
+    register(SceneChange(MATERIAL, title="The scene of a reconstruction with other materials", first=LIGHT))
     register(Surface())
-    register(OperationKind(CROP, stages=("edit",)))
+    register(SceneChange(CROP))
+    register(SceneChange(CLEAN))
+    register(SceneChange(TRANSFORM, keeps_world=False))
+    register(SceneChange(EDIT, sequence="meshes"))
+    register(SceneChange(DEFORM, sequence="deformed"))
+    register(SceneChange(MERGE))
+    register(Import())

@@ -3,14 +3,14 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from octasplat.engine.events import Listener
 from octasplat.engine.fields import map_named_files, named_files, takes_files
 from octasplat.engine.operations.base import Operation, Options, Request
 from octasplat.engine.stages import stopping
 from octasplat.workers.store.names import check_name
-from octasplat.workers.work.kinds.table import JobKind
+from octasplat.workers.work.kinds.table import JobKind, Needs
 from octasplat.workers.work.task import SCENE_FILE, Task
 
 PROGRAM = "octasplat.workers.work.programs:run_operation"
@@ -39,7 +39,7 @@ class OperationKind(JobKind[Any]):
         stages: Sequence[str],
         source_files: Sequence[str] = (SCENE_FILE, "config.json"),
         output: str = SCENE_FILE,
-        needs: Literal["dataset", "result"] = "result",
+        needs: Needs = "result",
         program: str = PROGRAM,
         tells_stages: bool = False,
     ) -> None:

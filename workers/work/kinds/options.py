@@ -1,6 +1,5 @@
 """Options of the job kinds, as users give them and as they are kept. Imports neither torch nor numba."""
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,33 +7,9 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from octasplat.engine.config import ReconstructionConfig
-from octasplat.engine.errors import SceneFileError
-from octasplat.engine.files import exporter_for
+from octasplat.engine.files.result_names import ExportName
 from octasplat.engine.train.config import preset, with_materials
 from octasplat.engine.train.preset_names import PRESETS
-
-_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-_TAKEN = frozenset(
-    {"scene.ply", "config.json", "held_out.json", "views.json", "events.jsonl", "metrics.json", "report.html"}
-    | {"training.json", "plan.json", "environment.hdr", "background.exr", "edits.json", "renders", "layers"}
-    | {"cache", "checkpoints", "poses"}
-)  # fmt: skip
-
-
-def check_export_name(name: str) -> str:
-    """A file name of a result, whose format is known; raises ValueError otherwise."""
-    if not _FILE_NAME.fullmatch(name) or ".." in name:
-        raise ValueError("name a file such as mesh.glb: letters, digits, '.', '_' and '-'")
-    if name.lower() in _TAKEN:
-        raise ValueError(f"{name} is the name of another result")
-    try:
-        exporter_for(Path(name))
-    except SceneFileError as error:
-        raise ValueError(str(error)) from None
-    return name
-
-
-ExportName = Annotated[str, AfterValidator(check_export_name)]
 
 
 class ReconstructOptions(ReconstructionConfig):
@@ -45,24 +20,6 @@ class ReconstructOptions(ReconstructionConfig):
     def config(self) -> ReconstructionConfig:
         """The engine's part."""
         return ReconstructionConfig.model_validate(self.model_dump(mode="json"))
-
-
-class ExportJobOptions(BaseModel):
-    """Options of ``export``.
-
-    Attributes:
-        files: files to write; their names say the formats.
-        min_opacity: Gaussians fainter than this are left out.
-        q: squared radius of the octagons in standard deviations; None takes that of the reconstruction.
-        sh_pad_degree: Gaussian PLY: pad the harmonics with zeros up to this degree.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    files: tuple[ExportName, ...] = Field(min_length=1, max_length=100)
-    min_opacity: float = Field(0.0, ge=0, lt=1)
-    q: float | None = Field(None, gt=0, le=100)
-    sh_pad_degree: int | None = Field(None, ge=0, le=3)
 
 
 def _learns_materials(train: object) -> bool:

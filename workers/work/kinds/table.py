@@ -14,13 +14,17 @@ from octasplat.workers.work.kinds.estimates import Estimate
 OptionsT = TypeVar("OptionsT", bound=BaseModel, default=Any)
 
 
+Needs = Literal["dataset", "result", "files"]
+
+
 class JobKind(Generic[OptionsT]):
     """A kind of job; subclasses override what is otherwise for them.
 
     Args:
         name: what the API calls it.
         title: one line for people.
-        needs: what it works on: a committed dataset, or the results of a finished job.
+        needs: what it works on: a committed dataset of photographs, the results of a finished job, or only
+            the files that its options name.
         options: model of its options, whose JSON Schema is published.
         program: ``module:function`` that does the work, imported by the job's own process only; it takes a
             :class:`octasplat.workers.work.task.Task`.
@@ -33,6 +37,8 @@ class JobKind(Generic[OptionsT]):
     """Whether options may name files, which are uploaded as a dataset that holds files."""
     takes_other_photographs = False
     """Whether a job may name photographs to work on in the place of the source job's."""
+    keeps_world = True
+    """Whether what is made stands where the photographs of the source job show it."""
     writes_at = ""
     """Where the options name the files of :meth:`writes`."""
 
@@ -41,7 +47,7 @@ class JobKind(Generic[OptionsT]):
         *,
         name: str,
         title: str,
-        needs: Literal["dataset", "result"],
+        needs: Needs,
         options: type[OptionsT],
         program: str,
         stages: Sequence[str] = (),

@@ -1,0 +1,116 @@
+"""A finished run with another scene: the folder of a run again, but for what was measured of the first."""
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from octasplat.engine.edit.moved_run import is_similarity, write_moved
+from octasplat.engine.errors import OutputError
+from octasplat.engine.files import read_facts
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.run_folder import (
+    BACKGROUND,
+    CONFIG,
+    ENVIRONMENT,
+    EVENTS,
+    HELD_OUT,
+    POSES,
+    SCENE,
+    TRAINING,
+    VIEWS,
+)
+from octasplat.engine.writing import telling_of_room, write_json
+
+EDITS = "edits.json"
+"""What was changed since the training, first to last."""
+_KEPT = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT, BACKGROUND)
+"""What is as true of the scene after it was changed where it stands."""
+
+
+def check_new_run(target: Path) -> None:
+    """Make sure that a folder is free.
+
+    Raises:
+        OutputError: it is not.
+    """
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise OutputError(f"{target} is there already; name a new folder.")
+
+
+def write_changed_run(
+    source: Path,
+    gaussians: FlatGaussians,
+    target: Path,
+    note: Mapping[str, object],
+    *,
+    facts: SceneFacts | None = None,
+    matrix: Float[np.ndarray, "4 4"] | None = None,
+) -> tuple[str, ...]:
+    """Write a folder like that of a run with another scene in it, all at once.
+
+    What was measured, rendered and exported of the run does not come along, nor do checkpoints. Of a scene
+    that was moved the cameras and the learnt light are moved along, or left out where that cannot be.
+
+    Args:
+        source: folder of the run.
+        gaussians: the other scene.
+        target: a folder that does not exist or is empty.
+        note: what was changed, added to ``edits.json``.
+        facts: what is known of the other scene as a whole; None takes that of the run's.
+        matrix: the affine map from the run's world to that of the scene, if they are not the same.
+
+    Returns:
+        What of the run was left out or is not as exact as it was, a sentence each.
+
+    Raises:
+        OutputError: the folder is taken or cannot be written.
+        NoSpaceLeft: its disk is full.
+    """
+    check_new_run(target)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    told: tuple[str, ...] = ()
+    try:
+        with telling_of_room(target):
+            partial.mkdir(parents=True)
+            if matrix is None:
+                _copy(source, partial)
+            elif is_similarity(matrix):
+                told = write_moved(source, partial, matrix)
+            else:
+                told = (
+                    "Cameras and learnt light cannot follow a scene that was mirrored, sheared or scaled "
+                    f"unevenly, so {target} holds the scene alone.",
+                )
+            write_gaussian_ply(gaussians, partial / SCENE, facts=facts or read_facts(source))
+            write_json(partial / EDITS, [*_edits(source), dict(note)])
+            partial.replace(target)
+    except OSError as error:
+        raise OutputError(f"{target} cannot be written ({error.strerror or error}).") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return told
+
+
+def _copy(source: Path, target: Path) -> None:
+    for name in _KEPT:
+        if (source / name).exists():
+            shutil.copyfile(source / name, target / name)
+    if (source / POSES).is_dir():
+        shutil.copytree(source / POSES, target / POSES)
+
+
+def _edits(source: Path) -> list[object]:
+    if not (source / EDITS).exists():
+        return []
+    try:
+        found = json.loads((source / EDITS).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{source / EDITS} cannot be read ({error}); delete it.") from None
+    return found if isinstance(found, list) else [found]

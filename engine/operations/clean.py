@@ -1,0 +1,122 @@
+"""``clean``: remove what nobody wants to see of a scene."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from octasplat.engine.edit.choices import Cleaning
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import OUTPUT_FLAGS, Spelling
+from octasplat.engine.operations.base import (
+    CHANGED_SCENE,
+    Operation,
+    Options,
+    ScenesWritten,
+    SourceRequest,
+    never,
+    options_of,
+)
+
+
+class CleanOptions(Cleaning, Options):
+    """Which Gaussians to remove: the faint, the too small or large, floaters, and those before a camera."""
+
+    near_share: Annotated[float, Spelling(("--near",), metavar="SHARE")] = Field(
+        0.25,
+        ge=0.0,
+        lt=1.0,
+        description="In a run: remove those nearer to the camera of a training view than this share of the "
+        "distance at which the sparse points around it begin; 0 for none.",
+    )
+
+
+class CleanRequest(CleanOptions, SourceRequest):
+    """Remove Gaussians of the scene that cannot be seen, are too large, too near to a camera, or float.
+
+    ``octasplat info`` tells how large and how opaque they are.
+    """
+
+    output: Annotated[Path | None, OUTPUT_FLAGS] = Field(None, description=CHANGED_SCENE)
+    dry_run: bool = Field(False, description="Only count.")
+
+    @model_validator(mode="after")
+    def _writes_or_counts(self) -> "CleanRequest":
+        if (self.output is None) != self.dry_run:
+            raise ValueError("Name the result with `output`, or say `dry_run`")
+        return self
+
+
+class CleanResult(ScenesWritten):
+    """What was removed, each Gaussian counted for the first reason that holds.
+
+    Attributes:
+        count: number of Gaussians of the source.
+        faint: below the least opacity.
+        small: below the least scale.
+        large: above the largest scale.
+        near: nearer to a camera than what its photograph shows.
+        floating: in groups too small.
+        groups: number of such groups.
+        kept: those that stay.
+    """
+
+    count: int
+    faint: int
+    small: int
+    large: int
+    near: int
+    floating: int
+    groups: int
+    kept: int
+
+
+def run(
+    request: CleanRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> CleanResult:
+    """Remove what nobody wants to see; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        ConfigError: nothing would be left.
+        SceneFileError: the scene cannot be read or written.
+    """
+    from dataclasses import asdict
+
+    from octasplat.engine.edit.cleaning import clean
+    from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
+    from octasplat.engine.run_folder import is_run, run_near_zones
+
+    source: Path = request.source
+    if request.output is not None:
+        check_changed(source, request.output)
+    gaussians = open_scene(source, progress)
+    share = request.near_share
+    zones = run_near_zones(source, share) if share > 0 and is_run(source) else None
+    keep, report = clean(gaussians, request, zones)
+    told = (
+        f"{source}: {len(gaussians):,} Gaussians; {report.faint:,} too faint, {report.small:,} too small, "
+        f"{report.large:,} too large, {report.near:,} too near to a camera, "
+        f"{report.floating:,} in {report.groups:,} groups of floaters; {report.kept:,} kept."
+    )
+    if not keep.any():
+        raise ConfigError(
+            f"{source}: nothing of it would be left; ask for less (octasplat info tells its sizes and "
+            "opacities)."
+        )
+    counts = {"count": len(gaussians), **asdict(report)}
+    if request.output is None:
+        return CleanResult(notes=(told,), **counts)
+    note = edit_note("clean", options_of(CleanOptions, request), gaussians=report.kept)
+    written = write_changed(source, gaussians.select(keep), request.output, progress, note=note)
+    return CleanResult(files=written.files, folder=written.folder, notes=(told, written.sentence), **counts)
+
+
+OPERATION = Operation(
+    "clean", "Remove faint Gaussians, oversized ones and floaters.", CleanRequest, CleanOptions, run
+)

@@ -1,0 +1,191 @@
+"""``deform``: a scene that follows a coarse mesh."""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import Field, PlainSerializer
+
+from octasplat.engine.edit.axes import TURNS, Axes
+from octasplat.engine.edit.reports import DeformReport
+from octasplat.engine.errors import SceneFileError
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import InputFile, Spelling, Unit
+from octasplat.engine.files import Mesh, read_mesh
+from octasplat.engine.operations.base import Operation, Options, ScenesWritten, never, options_of
+from octasplat.engine.operations.sequence_request import SequenceRequest
+
+if TYPE_CHECKING:
+    from octasplat.engine.edit.proxy import Binding, Proxy
+
+_Length = Annotated[
+    float, PlainSerializer(lambda value: value if math.isfinite(value) else "inf", when_used="json")
+]
+"""JSON has no infinity, so that it is a text there."""
+
+
+class DeformOptions(Options):
+    """Which mesh moves the scene, and what of it."""
+
+    proxy: InputFile = Field(
+        description="The mesh at rest (.ply, .obj or .glb), lying on or around what is to move."
+    )
+    deformed: Annotated[tuple[InputFile, ...], Spelling(metavar="MESH")] = Field(
+        min_length=1,
+        max_length=10_000,
+        description="The same mesh deformed; several, or here a quoted pattern such as 'frames/*.obj', are a "
+        "sequence.",
+    )
+    method: Literal["nearest", "mvc"] = Field(
+        "nearest",
+        description="nearest: follow the triangles close by; mvc: mean-value coordinates of a closed cage.",
+    )
+    reach: Annotated[_Length | None, Spelling(metavar="LENGTH"), Unit("world")] = Field(
+        None,
+        ge=0.0,
+        description="Follow fully up to this distance from the mesh, and not at all beyond twice of it; inf "
+        "for everything.  [default: nearest: a tenth of the mesh's diagonal; mvc: inside of the cage]",
+    )
+    axes: Axes = Field(
+        "x0",
+        description="Turn of both meshes about x, in degrees, that brings them to the scene's axes; x90 for "
+        "what Blender saves as OBJ or GLB beside a scene imported as PLY.",
+    )
+    mirrored: Literal["auto", "yes", "no"] = Field(
+        "auto",
+        description="Whether the deformed mesh was mirrored; auto looks at it, which a flat mesh cannot "
+        "show.",
+    )
+
+
+class DeformRequest(DeformOptions, SequenceRequest):
+    """Let the scene follow a coarse mesh, as an artist or a physics engine deformed it."""
+
+
+class DeformResult(ScenesWritten):
+    """A scene for each deformed mesh.
+
+    Attributes:
+        moving: number of Gaussians that are near enough to the mesh to move.
+        count: number of Gaussians of the source.
+        reports: what each deformation did.
+    """
+
+    moving: int
+    count: int
+    reports: tuple[DeformReport, ...]
+
+
+def run(
+    request: DeformRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> DeformResult:
+    """Bind the scene to a mesh at rest and move it; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        OctasplatError: something cannot be read or written, or the meshes are not the same one.
+    """
+    from octasplat.engine.edit.deform import deform_to, deformation_corners
+    from octasplat.engine.operations.scenes import edit_note, open_scene
+    from octasplat.engine.operations.sequences import Frames, expanded
+
+    source: Path = request.source
+    paths = expanded(request.deformed)
+    frames = Frames(source, request.output, paths, [source, request.proxy, *paths])
+    gaussians = open_scene(source, progress)
+    rest = read_mesh(request.proxy)
+    corners = deformation_corners(gaussians)
+    binding = _bound(request, _proxy(request, rest), corners)
+    moving, count = int(binding.moving.sum()), len(gaussians)
+    note = edit_note("deform", options_of(DeformOptions, request))
+    reports, notes = [], [f"{request.proxy}: moves {moving:,} of {count:,} Gaussians."]
+    for number, path in enumerate(paths):
+        vertices = _turned(_same_mesh(path, request.proxy, rest), request.axes)
+        result, report = deform_to(gaussians, corners, binding.deform(vertices), binding.mirrored(vertices))
+        notes += [*_told(path, report), frames.write(number, result, progress, note)]
+        reports.append(report)
+    frames.write_report(request.report, [{"deformed": str(path)} for path in paths], map(asdict, reports))
+    return DeformResult(
+        files=frames.files,
+        folder=frames.folder,
+        notes=tuple(notes),
+        moving=moving,
+        count=count,
+        reports=tuple(reports),
+    )
+
+
+def _proxy(request: DeformRequest, rest: Mesh) -> "Proxy":
+    from octasplat.engine.edit.proxy import Proxy
+
+    mirrored = {"auto": None, "yes": True, "no": False}[request.mirrored]
+    try:
+        return Proxy(_turned(rest, request.axes), rest.triangles, mirrored)
+    except SceneFileError as error:
+        raise SceneFileError(f"{request.proxy}: {error}") from None
+
+
+def _bound(request: DeformRequest, proxy: "Proxy", corners: Float64[np.ndarray, "n 8 3"]) -> "Binding":
+    from octasplat.engine.edit.proxy import bind
+
+    try:
+        binding = bind(proxy, corners, request.method, request.reach)
+    except SceneFileError as error:
+        raise SceneFileError(f"{request.proxy}: {error}") from None
+    if not binding.moving.any():
+        raise SceneFileError(
+            f"{request.proxy}: no Gaussian is near enough to be moved; if the proxy was saved along other "
+            "axes, as Blender does for OBJ and GLB, say --axes x90, else widen --reach."
+        )
+    return binding
+
+
+def _same_mesh(path: Path, proxy: Path, rest: Mesh) -> Mesh:
+    mesh = read_mesh(path)
+    if len(mesh) != len(rest) or not _same_faces(mesh, rest):
+        raise SceneFileError(
+            f"{path}: is not the mesh {proxy} with vertices moved; both need the same vertices and faces in "
+            "the same order."
+        )
+    return mesh
+
+
+def _turned(mesh: Mesh, axes: Axes) -> Float64[np.ndarray, "v 3"]:
+    turned: Float64[np.ndarray, "v 3"] = mesh.vertices @ TURNS[axes].T
+    return turned
+
+
+def _same_faces(one: Mesh, other: Mesh) -> bool:
+    """Whether the same vertices make triangles; programs may have turned over those of a mirrored mesh."""
+    if one.triangles.shape != other.triangles.shape:
+        return False
+    if np.array_equal(one.triangles, other.triangles):
+        return True
+    first, second = (np.sort(mesh.triangles, axis=1) for mesh in (one, other))
+    return np.array_equal(first[np.lexsort(first.T)], second[np.lexsort(second.T)])
+
+
+def _told(path: Path, report: DeformReport) -> list[str]:
+    """A report in words."""
+    lines = [
+        f"{path}: {report.moved:,} Gaussians moved; distance from an affine map, in standard deviations: "
+        f"median {report.residual_median:.2g}, 95th percentile {report.residual_p95:.2g}, "
+        f"largest {report.residual_max:.2g}."
+    ]
+    if report.mirrored:
+        lines.append(f"  {report.mirrored:,} mirrored with the proxy")
+    if report.collapsed:
+        lines.append(f"  {report.collapsed:,} lost their area and were only placed")
+    return lines
+
+
+OPERATION = Operation(
+    "deform", "A scene that follows a deformed cage or coarse mesh.", DeformRequest, DeformOptions, run
+)

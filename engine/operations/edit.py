@@ -1,0 +1,135 @@
+"""``edit``: a scene from its edited mesh."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from octasplat.engine.edit.choices import MeshRecovery
+from octasplat.engine.edit.reports import EditReport
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import InputFile, Spelling
+from octasplat.engine.operations.base import Operation, Options, ScenesWritten, never, options_of, warn
+from octasplat.engine.operations.sequence_request import SequenceRequest
+
+
+class EditOptions(MeshRecovery, Options):
+    """Which meshes become scenes, and how."""
+
+    meshes: Annotated[tuple[InputFile, ...], Spelling(("--mesh",), metavar="MESH")] = Field(
+        min_length=1,
+        max_length=10_000,
+        description="The edited mesh (.ply, .obj or .glb); several, or here a quoted pattern such as "
+        "'frames/*.ply', are a sequence.",
+    )
+
+
+class EditRequest(EditOptions, SequenceRequest):
+    """Bring an edited mesh of the scene back to Gaussians.
+
+    The mesh is what octasplat export wrote for the scene, moved, bent, cut or copied in a mesh editor.
+    Gaussians whose octagon stayed keep every bit. See docs/editing.md.
+    """
+
+
+class EditResult(ScenesWritten):
+    """A scene for each mesh.
+
+    Attributes:
+        reports: what was found in each mesh and what became of it.
+    """
+
+    reports: tuple[EditReport, ...]
+
+
+def run(
+    request: EditRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> EditResult:
+    """Recover the scene from each edited mesh; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        OctasplatError: something cannot be read, matched or written.
+    """
+    from octasplat.engine.edit.recovery import recover_edit
+    from octasplat.engine.files import read_mesh
+    from octasplat.engine.operations.scenes import edit_note, open_scene
+    from octasplat.engine.operations.sequences import Frames, expanded
+
+    source: Path = request.source
+    meshes = expanded(request.meshes)
+    recovery: MeshRecovery = request
+    frames = Frames(source, request.output, meshes, [source, *meshes])
+    gaussians = open_scene(source, progress)
+    note = edit_note("edit", options_of(EditOptions, request))
+    reports, notes = [], []
+    for number, path in enumerate(meshes):
+        result, report = recover_edit(gaussians, read_mesh(path), path, recovery)
+        if recovery.axes == "auto":  # all frames of a sequence came the same way
+            recovery = recovery.model_copy(update={"axes": report.axes})
+            _warn_of_axes(path, report, progress)
+        _warn_of_torn(report, progress)
+        notes += [*_told(path, report), frames.write(number, result, progress, note)]
+        reports.append(report)
+    frames.write_report(request.report, [{"mesh": str(path)} for path in meshes], map(asdict, reports))
+    return EditResult(files=frames.files, folder=frames.folder, notes=tuple(notes), reports=tuple(reports))
+
+
+def _warn_of_axes(path: Path, report: EditReport, progress: Listener) -> None:
+    """Tell if a mesh seems to have been turned on its way."""
+    if report.axes != report.axes_usual:
+        warn(
+            progress,
+            f"{path} came back along other axes than it was written with (as when a mesh changes format in "
+            "Blender) and was turned back; if turning it was your edit, say --axes "
+            f"{report.axes_usual}.",
+        )
+
+
+def _warn_of_torn(report: EditReport, progress: Listener) -> None:
+    if report.partial > report.snapped:
+        warn(
+            progress,
+            f"{report.partial - report.snapped:,} octagons moved with some corners only, which makes long "
+            "streaks: select whole octagons in the editor (Select Linked) or say --whole-octagons.",
+        )
+
+
+def _told(path: Path, report: EditReport) -> list[str]:
+    """A report in words; what did not happen is left out."""
+    lines = [
+        f"{path}: {report.moved:,} Gaussians moved, {report.unmoved:,} did not "
+        f"(vertices found by {report.matched_by})."
+    ]
+    counts = (
+        (report.deleted, "deleted with their octagons"),
+        (report.copies, "added, as their octagons were duplicated"),
+        (report.carried, "too faint for an octagon, moved as their neighbours"),
+        (report.orphaned, "too faint for an octagon, deleted with their neighbours"),
+        (report.mirrored, "mirrored with their surroundings"),
+        (report.incomplete, "with missing corners"),
+        (report.crumpled, "crumpled (folded, without area or far from flat)"),
+        (report.flipped, "flipped against their surroundings"),
+        (report.dropped, "left out as damaged"),
+        (report.snapped, "moved in part, taken as a whole"),
+    )
+    lines += [f"  {count:,} {what}" for count, what in counts if count]
+    if report.foreign_vertices:
+        lines.append(f"  {report.foreign_vertices:,} vertices belong to no octagon and were passed over")
+    if report.ambiguous_corners:
+        lines.append(f"  {report.ambiguous_corners:,} corners were there more than once and were passed over")
+    if report.moved:
+        lines.append(
+            f"  distance from an affine map, in standard deviations: median {report.residual_median:.2g}, "
+            f"95th percentile {report.residual_p95:.2g}, largest {report.residual_max:.2g}"
+            + (f"; {report.strained:,} above 0.3" if report.strained else "")
+        )
+    return lines
+
+
+OPERATION = Operation("edit", "A mesh edited elsewhere back to Gaussians.", EditRequest, EditOptions, run)

@@ -1,0 +1,299 @@
+"""``export``: Gaussians to meshes and other formats."""
+
+import math
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
+
+from octasplat.engine.errors import ExportFailed, SceneFileError
+from octasplat.engine.events import Listener, StageProgress, Warned, ignore
+from octasplat.engine.fields import Group, Positional, Spelling
+from octasplat.engine.files.options import ExportChoices, ExportOptions, OctagonQ
+from octasplat.engine.files.registry import Exporter, exporter_for
+from octasplat.engine.files.result_names import ExportName
+from octasplat.engine.operations.axes import Axis
+from octasplat.engine.operations.base import Operation, Options, Result, SourceRequest, never
+
+if TYPE_CHECKING:
+    from octasplat.engine.gaussians.model import FlatGaussians
+
+CORES_OF_CHUNKS, CORES_IN_ORDER = 0.3, 0.5
+"""Where ``for_viewers`` draws solid, in chunks and in one order (docs/opening/threejs.md)."""
+
+
+def read_direction(value: object) -> object:
+    """Return the numbers of a text ``x,y,z``; any other value as it is."""
+    if not isinstance(value, str) or value in ("cameras", "constant"):
+        return value
+    try:
+        x, y, z = (float(part) for part in value.split(","))
+    except ValueError:
+        raise ValueError("write cameras, constant, or three numbers X,Y,Z") from None
+    return x, y, z
+
+
+_Colour = Literal["cameras", "constant"] | tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+def _with_direction(colour: _Colour | None) -> _Colour | None:
+    if isinstance(colour, tuple) and not math.hypot(*colour) > 0:
+        raise ValueError("is no direction")
+    return colour
+
+
+class _Exporting(ExportChoices, Options):
+    """What the options of a job and those of the command have in common."""
+
+    q: OctagonQ | None = Field(
+        None,
+        description="Meshes: squared radius of the octagons in standard deviations.  [default: that of the "
+        "run, of a file 9.21]",
+    )
+    colour: Annotated[
+        _Colour | None,
+        BeforeValidator(read_direction, json_schema_input_type=_Colour | str | None),
+        AfterValidator(_with_direction),
+        Spelling(metavar="cameras|constant|X,Y,Z"),
+    ] = Field(
+        None,
+        description="Formats with one colour for each Gaussian: the one that loses least seen from the "
+        "photographs' places of a run, or from all around a file; the harmonics' constant part; or the one "
+        "seen along a direction.  [default: cameras for a run, constant for a file]",
+    )
+    for_viewers: bool = Field(
+        False,
+        description="GLB: for programs that sort chunks at best: solid middles beneath, and in a run whose "
+        "photographs were taken from one side, the order that is right from most of them. Carries no numbers "
+        "for edits.",
+    )
+    materials: bool = Field(
+        False,
+        description="GLB: base colour, metallic and roughness instead of colours that have their light in "
+        "them.",
+    )
+    up: Annotated[Axis | None, Group("advanced")] = Field(
+        None, description="With materials: the axis that points up.  [default: the run's, of a file -y]"
+    )
+
+    @model_validator(mode="after")
+    def _go_together(self) -> "_Exporting":
+        if self.up is not None and not self.materials:
+            raise ValueError("`up` goes with `materials`")
+        targets = self.targets()
+        names = [_format_name(target, self.format_name()) for target in targets]
+        if None not in names and "glb" not in names:
+            told = f"{targets[-1]} is written as {names[-1]}"
+            for name in ("opaque", "materials", "for_viewers"):
+                if getattr(self, name):
+                    raise ValueError(f"`{name}` is for GLB of octagons; {told}")
+        if self.for_viewers and (self.opaque or self.materials):
+            raise ValueError("`for_viewers` is for GLB of octagons without `opaque` and `materials`")
+        return self
+
+    def targets(self) -> tuple[Path, ...]:
+        """Return the files to write."""
+        raise NotImplementedError
+
+    def format_name(self) -> str | None:
+        """Return the name of the format of all files, if their names do not say it."""
+        return None
+
+
+def _format_name(target: Path, asked: str | None) -> str | None:
+    """The name of the format; None where there is none, which is complained of later."""
+    try:
+        return exporter_for(target, asked).name
+    except SceneFileError:
+        return None
+
+
+class ExportJobOptions(_Exporting):
+    """Which files to write, and how."""
+
+    files: tuple[ExportName, ...] = Field(
+        min_length=1, max_length=100, description="Files to write; their names say the formats."
+    )
+
+    def targets(self) -> tuple[Path, ...]:
+        """Return the files to write."""
+        return tuple(map(Path, self.files))
+
+
+class ExportRequest(_Exporting, SourceRequest):
+    """Write the Gaussians of IN, a run's folder or a file of any splat format, to OUT in another format.
+
+    OUT's name says the format, unless --format does; the formats are listed below. Where two take a name, as
+    *.ply and *.mesh.ply do, the longer pattern wins.
+    """
+
+    files: Annotated[tuple[Path, ...], Positional("OUT")] = Field(
+        min_length=1, description="Files to write; their names say the formats."
+    )
+    format: Annotated[str | None, Spelling(metavar="NAME")] = Field(
+        None, description="The format, if OUT's name does not say it."
+    )
+
+    def targets(self) -> tuple[Path, ...]:
+        """Return the files to write."""
+        return self.files
+
+    def format_name(self) -> str | None:
+        """Return the name of the format of all files, if their names do not say it."""
+        return self.format
+
+
+class ExportResult(Result):
+    """The files."""
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the files with their sizes."""
+        return tuple(f"Wrote {path} ({path.stat().st_size / 1e6:.1f} MB)." for path in self.files)
+
+
+def run(
+    request: ExportRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> ExportResult:
+    """Write a scene in other formats; see :class:`octasplat.engine.operations.base.Run`.
+
+    Tells the steps of a stage ``export``, one for each file.
+
+    Raises:
+        ExportFailed: a file could not be written; the others were.
+        OctasplatError: the scene cannot be read, or no format takes a name.
+    """
+    from octasplat.engine.files import export_losses
+    from octasplat.engine.files.several import export_files
+    from octasplat.engine.gaussians.materials import require_materials
+    from octasplat.engine.operations.scenes import open_scene
+
+    for path in request.files:
+        exporter_for(path, request.format)  # complain before the long work
+    count = len(request.files)
+    gaussians = open_scene(request.source, progress)
+    if request.materials:
+        require_materials(gaussians, request.source)
+    else:
+        for text in export_losses(gaussians, list(request.files), request.format):
+            progress(Warned(text))
+    forms = _Forms(request, gaussians, lambda: progress(StageProgress("export", 0, count)), progress, threads)
+    files, failed = export_files(
+        request.files,
+        forms.of,
+        on_done=lambda done: progress(StageProgress("export", done, count)),
+        format=request.format,
+    )
+    if failed is not None:
+        raise ExportFailed(failed)
+    return ExportResult(files=files)
+
+
+class _Forms:
+    """What is written in each format: the scene, and how."""
+
+    def __init__(
+        self,
+        request: ExportRequest,
+        gaussians: "FlatGaussians",
+        on_pass: Callable[[], None],
+        progress: Listener,
+        threads: int,
+    ) -> None:
+        self._request, self._gaussians = request, gaussians
+        self._on_pass, self._progress, self._threads = on_pass, progress, threads
+
+    def of(self, exporter: Exporter) -> "tuple[FlatGaussians, ExportOptions]":
+        """Return the scene and the options for a format."""
+        request, options = self._request, self._options
+        is_glb = exporter.name == "glb"
+        if not (exporter.holds_harmonics or (request.materials and is_glb)):
+            gaussians = self._one_colour
+        else:
+            gaussians = self._gaussians
+        if not is_glb:
+            return gaussians, options.model_copy(update={"light_up": None})
+        if request.for_viewers:
+            return self._drawn_in_order(gaussians, options)
+        return gaussians, options
+
+    @cached_property
+    def _options(self) -> ExportOptions:
+        from octasplat.engine.files import read_facts
+        from octasplat.engine.operations.axes import light_up
+
+        request = self._request
+        choices = {name: getattr(request, name) for name in ExportChoices.model_fields}
+        light = light_up(request.source, request.up).tolist() if request.materials else None
+        options = {
+            **choices,
+            "facts": read_facts(request.source),
+            "light_up": light,
+            "ids": request.ids and not request.for_viewers,
+            "cores": CORES_OF_CHUNKS if request.for_viewers else None,
+        }
+        if (q := request.q or self._run_q) is not None:
+            options["q"] = q
+        return ExportOptions.model_validate(options)
+
+    @property
+    def _run_q(self) -> float | None:
+        """What the scene of a run was trained with."""
+        from octasplat.engine.config import read_config
+        from octasplat.engine.run_folder import CONFIG, is_run
+
+        source = self._request.source
+        known = is_run(source) and (source / CONFIG).exists()
+        return read_config(source / CONFIG).train.trace.q if known else None
+
+    @cached_property
+    def _one_colour(self) -> "FlatGaussians":
+        """The scene with the constant harmonic only."""
+        import numpy as np
+
+        from octasplat.engine.plain_colours import PlainScene
+        from octasplat.engine.render.one_colour import colours_toward, with_colours
+        from octasplat.engine.run_folder import is_run
+
+        gaussians, source = self._gaussians, self._request.source
+        colour = self._request.colour or ("cameras" if is_run(source) else "constant")
+        if colour == "constant" or gaussians.sh_degree == 0:
+            return gaussians
+        if colour == "cameras":
+            return PlainScene(
+                gaussians,
+                source if is_run(source) else None,
+                threads=self._threads,
+                on_pass=lambda _done, _total: self._on_pass(),
+                on_unknown=lambda text: self._progress(Warned(text)),
+            ).gaussians
+        return with_colours(gaussians, colours_toward(gaussians, np.array(colour)))
+
+    def _drawn_in_order(
+        self, gaussians: "FlatGaussians", options: ExportOptions
+    ) -> "tuple[FlatGaussians, ExportOptions]":
+        """In one chunk and in the order of most photographs' cameras, where these agree; else as it was."""
+        import numpy as np
+
+        from octasplat.engine.render.draw_order import AGREEMENT, common_order
+        from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
+
+        source = self._request.source
+        if not (is_run(source) and (source / CONFIG).exists()):
+            return gaussians, options
+        seen = run_viewpoints(source)
+        centres = np.stack([seen.views[index].origin_world for index in seen.train_indices])
+        order, agreement = common_order(gaussians.means_world, centres)
+        if agreement < AGREEMENT:
+            return gaussians, options
+        return gaussians.select(order), options.model_copy(update={"chunks": 1, "cores": CORES_IN_ORDER})
+
+
+OPERATION = Operation(
+    "export", "Gaussians to meshes and other formats.", ExportRequest, ExportJobOptions, run
+)

@@ -1,0 +1,98 @@
+"""``merge``: several scenes as one."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import InputFile, Positional
+from octasplat.engine.operations.base import (
+    Operation,
+    Options,
+    SceneRequest,
+    ScenesWritten,
+    never,
+    options_of,
+    warn,
+)
+
+
+class MergeOptions(Options):
+    """Which scenes to put to the first one."""
+
+    scenes: Annotated[tuple[InputFile, ...], Positional("IN")] = Field(
+        (), max_length=100, description="The other scenes: files of any format, each in the same frame."
+    )
+    sh_degree: int | None = Field(
+        None,
+        ge=0,
+        le=3,
+        description="Degree of the colours' harmonics.  [default: the highest among the scenes]",
+    )
+
+    @model_validator(mode="after")
+    def _are_several(self) -> "MergeOptions":
+        if not self.scenes:
+            raise ValueError("Name at least two scenes; `scenes` has those to put to the first one")
+        return self
+
+
+class MergeRequest(MergeOptions, SceneRequest):
+    """Put all Gaussians of two or more scenes into one file, each where it is in its own frame.
+
+    Named channels that only some of the scenes have are 0 for the Gaussians of the others.
+    """
+
+
+class MergeResult(ScenesWritten):
+    """The scene of all.
+
+    Attributes:
+        counts: number of Gaussians of each scene, the first one first.
+    """
+
+    counts: tuple[int, ...]
+
+
+def run(
+    request: MergeRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> MergeResult:
+    """Put scenes together; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        SceneFileError: a scene cannot be read, or the result not be written.
+    """
+    from octasplat.engine.edit.selection import merge
+    from octasplat.engine.files import read_facts
+    from octasplat.engine.gaussians.scene_facts import shared_facts
+    from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
+
+    first: Path = request.source
+    sources = (first, *request.scenes)
+    check_changed(first, request.output, request.scenes)
+    scenes = [open_scene(source, progress) for source in sources]
+    every = dict.fromkeys(name for scene in scenes for name in scene.channels)
+    for source, scene in zip(sources, scenes, strict=True):
+        if missing := ", ".join(name for name in every if name not in scene.channels):
+            warn(progress, f"{source}: has no channel {missing}; it is 0 there.")
+    merged = merge(scenes, request.sh_degree)
+    written = write_changed(
+        first,
+        merged,
+        request.output,
+        progress,
+        note=edit_note("merge", options_of(MergeOptions, request), gaussians=len(merged)),
+        facts=shared_facts(list(zip(scenes, map(read_facts, sources), strict=True))),
+    )
+    return MergeResult(
+        files=written.files, folder=written.folder, notes=(written.sentence,), counts=tuple(map(len, scenes))
+    )
+
+
+OPERATION = Operation("merge", "Put scenes together.", MergeRequest, MergeOptions, run)

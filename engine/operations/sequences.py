@@ -1,0 +1,128 @@
+"""Sequences: many meshes that are read one after another, and a scene that is written for each."""
+
+import glob
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from octasplat.engine.edit.changed_run import check_new_run
+from octasplat.engine.errors import ConfigError
+from octasplat.engine.events import Listener
+from octasplat.engine.files import read_facts
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.operations.scenes import becomes_run, check_target, write_changed, write_scene
+from octasplat.engine.writing import write_json
+
+
+def expanded(given: Sequence[Path]) -> tuple[Path, ...]:
+    """Return the files that are named one by one or by patterns such as ``frames/*.ply``.
+
+    The matches of a pattern are in the order of the numbers in their names.
+
+    Raises:
+        ConfigError: a pattern matches nothing.
+    """
+    paths: list[Path] = []
+    for path in given:
+        if path.exists() or not glob.has_magic(str(path)):
+            paths.append(path)
+            continue
+        matches = sorted(glob.glob(str(path), recursive=True), key=_natural)  # noqa: PTH207 (may be absolute)
+        if not matches:
+            raise ConfigError(f"{path}: no file matches this pattern.")
+        paths.extend(map(Path, matches))
+    return tuple(paths)
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """A sort key in which 10 comes after 9."""
+    return [
+        (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part
+    ]
+
+
+def targets_for(output: Path, sources: Sequence[Path], inputs: Sequence[Path]) -> tuple[Path, ...]:
+    """Return the file to write for each source: ``output`` for one, numbered files for several.
+
+    Several need a pattern such as ``out/%04d.ply``, a folder (names as those of the sources), or a plain name
+    to which ``_0000`` and so on is added.
+
+    Raises:
+        ConfigError: a target is one of ``inputs``, or two targets are the same.
+        SceneFileError: no format takes the name.
+    """
+    if "%" in output.name:
+        try:
+            targets = [output.with_name(output.name % number) for number in range(len(sources))]
+        except (TypeError, ValueError):
+            raise ConfigError(f"{output}: is no pattern; write one number as in frame_%04d.ply.") from None
+    elif len(sources) == 1:
+        targets = [output]
+    elif output.suffix:
+        targets = [
+            output.with_name(f"{output.stem}_{number:04d}{output.suffix}") for number in range(len(sources))
+        ]
+    else:
+        targets = [output / f"{source.stem}.ply" for source in sources]
+    for target in targets:
+        check_target(target, inputs)
+    if len(set(targets)) < len(targets):
+        raise ConfigError(f"{output}: gives two results the same name; write a pattern such as %04d.ply.")
+    return tuple(targets)
+
+
+class Frames:
+    """The scenes that are written for the meshes of a sequence, or the one scene of one mesh.
+
+    Args:
+        source: the scene that is changed.
+        output: where to; see :func:`targets_for`, and for one mesh
+            :func:`octasplat.engine.operations.scenes.becomes_run`.
+        meshes: those that each make a scene.
+        inputs: all that is read.
+
+    Attributes:
+        files: those that were written.
+        folder: of the run that was written; None for files.
+
+    Raises:
+        ConfigError: a scene would overwrite an input, or two have the same name.
+        OutputError: the folder is taken.
+        SceneFileError: no format takes the name.
+    """
+
+    def __init__(self, source: Path, output: Path, meshes: Sequence[Path], inputs: Sequence[Path]) -> None:
+        self._source = source
+        self._is_run = len(meshes) == 1 and becomes_run(source, output)
+        if self._is_run:
+            check_new_run(output)
+            self._targets: tuple[Path, ...] = (output,)
+        else:
+            self._targets = targets_for(output, meshes, inputs)
+        self.files: tuple[Path, ...] = ()
+        self.folder: Path | None = None
+
+    def write(
+        self, number: int, gaussians: FlatGaussians, progress: Listener, note: Mapping[str, object]
+    ) -> str:
+        """Write the scene of the mesh with this number; return a sentence that says so."""
+        target = self._targets[number]
+        if self._is_run:
+            counted = {**note, "gaussians": len(gaussians)}
+            written = write_changed(self._source, gaussians, target, progress, note=counted)
+            self.files, self.folder = written.files, written.folder
+            return written.sentence
+        self.files = (*self.files, target)
+        return write_scene(gaussians, read_facts(self._source), target, progress, warn=number == 0)
+
+    def write_report(
+        self,
+        path: Path | None,
+        meshes: Sequence[Mapping[str, object]],
+        reports: Iterable[Mapping[str, object]],
+    ) -> None:
+        """Write the counts of all meshes, if anybody asks for them."""
+        if path is None:
+            return
+        rows = zip(meshes, self._targets, reports, strict=True)
+        write_json(path, [{**mesh, "output": str(target), **report} for mesh, target, report in rows])

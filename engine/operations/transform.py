@@ -1,0 +1,139 @@
+"""``transform``: a scene moved, turned, scaled."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import Field, FiniteFloat, model_validator
+
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import InputFile, Spelling, Unit
+from octasplat.engine.operations.axes import Axis
+from octasplat.engine.operations.base import (
+    Operation,
+    Options,
+    SceneRequest,
+    ScenesWritten,
+    never,
+    options_of,
+)
+
+_Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+class TransformOptions(Options):
+    """What to do, in this order: matrix, up, scale, rotate as often as given, translate."""
+
+    matrix: Annotated[InputFile | None, Spelling(metavar="FILE")] = Field(
+        None,
+        description="A text file with an affine 4 x 4 or 3 x 4 matrix, row by row, that maps old points to "
+        "new ones.",
+    )
+    up: Annotated[tuple[Axis, Axis] | None, Spelling(metavar="OLD NEW")] = Field(
+        None,
+        description="Turn the axis that points up to another: -y z from COLMAP's usual frame to Blender's.",
+    )
+    scale: FiniteFloat | None = Field(None, description="Scale by a factor.")
+    rotate: Annotated[
+        tuple[tuple[Literal["x", "y", "z"], FiniteFloat], ...],
+        Spelling(metavar="AXIS DEGREES"),
+        Unit("degrees"),
+    ] = Field(
+        (),
+        max_length=100,
+        description="Turn about an axis, counter-clockwise seen from its tip; may be repeated.",
+    )
+    translate: Annotated[_Point | None, Unit("world")] = Field(None, description="Move.")
+    about: Annotated[_Point, Unit("world")] = Field(
+        (0.0, 0.0, 0.0), description="The point that up, scale and rotate leave where it is."
+    )
+
+    @model_validator(mode="after")
+    def _does_something(self) -> "TransformOptions":
+        asked = (self.matrix, self.up, self.scale, self.rotate or None, self.translate)
+        if all(value is None for value in asked):
+            raise ValueError("Say what to do: `matrix`, `up`, `scale`, `rotate` or `translate`")
+        return self
+
+    def world_map(self) -> Float64[np.ndarray, "4 4"]:
+        """Return the matrix from the old world to the new one.
+
+        Raises:
+            ConfigError: the file of the matrix cannot be read.
+        """
+        from octasplat.engine.edit import affine
+
+        turns = np.eye(4)
+        if self.up is not None:
+            turns = affine.between_axes(*self.up)
+        if self.scale is not None:
+            turns = affine.scaling(np.full(3, self.scale)) @ turns
+        for axis, degrees in self.rotate:
+            turns = affine.rotation(affine.AXES[axis], degrees) @ turns
+        whole = affine.about(turns, np.array(self.about))
+        if self.matrix is not None:
+            whole = whole @ affine.read_matrix(self.matrix)
+        if self.translate is not None:
+            whole = affine.translation(np.array(self.translate)) @ whole
+        return whole
+
+
+class TransformRequest(TransformOptions, SceneRequest):
+    """Move, turn, scale or shear the scene, its view-dependent colours included.
+
+    Done in this order: matrix, up, scale, rotate as often as given, translate. The cameras and the learnt
+    light of a run go along where they can.
+    """
+
+
+class TransformResult(ScenesWritten):
+    """The moved scene.
+
+    Attributes:
+        matrix: the affine map from the old world to the new one, row by row.
+        count: number of Gaussians.
+    """
+
+    matrix: tuple[tuple[float, ...], ...]
+    count: int
+
+
+def run(
+    request: TransformRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> TransformResult:
+    """Move, turn, scale or shear a scene; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        ConfigError: the matrix cannot be read or flattens space.
+        SceneFileError: the scene cannot be read or written.
+    """
+    from octasplat.engine.edit.affine import mean_stretch, transform
+    from octasplat.engine.files import read_facts
+    from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
+
+    source: Path = request.source
+    check_changed(source, request.output, [] if request.matrix is None else [request.matrix])
+    matrix = request.world_map()
+    moved = transform(open_scene(source, progress), matrix)
+    rows = tuple(map(tuple, matrix.tolist()))
+    written = write_changed(
+        source,
+        moved,
+        request.output,
+        progress,
+        note={**edit_note("transform", options_of(TransformOptions, request)), "world_map": rows},
+        facts=read_facts(source).scaled(mean_stretch(matrix)),
+        matrix=matrix,
+    )
+    return TransformResult(
+        files=written.files, folder=written.folder, notes=(written.sentence,), matrix=rows, count=len(moved)
+    )
+
+
+OPERATION = Operation("transform", "Move, turn or scale a scene.", TransformRequest, TransformOptions, run)
