@@ -79,7 +79,8 @@ def _python_call(entry: Operation[Any, Any]) -> str:
 
 
 def _columns(verb: Verb) -> tuple[str, ...]:
-    job = f"`{verb.job_kind}`, on a {verb.works_on}" if verb.job_kind else ""
+    works_on = "files" if verb.works_on == "files" else f"a {verb.works_on}"
+    job = f"`{verb.job_kind}`, on {works_on}" if verb.job_kind else ""
     code = (f"`{text}`" if text else "" for text in (verb.command, verb.http, verb.python))
     command, http, python = code
     return verb.name, verb.title, command, job, http, python
