@@ -6,8 +6,7 @@ import shutil
 from contextlib import nullcontext
 from pathlib import Path
 
-from octasplat.engine.config import read_config
-from octasplat.engine.errors import CheckpointError, ConfigError, ExportFailed
+from octasplat.engine.errors import CheckpointError, ConfigError
 from octasplat.engine.events import (
     Event,
     Noted,
@@ -16,19 +15,13 @@ from octasplat.engine.events import (
     Warned,
     broadcast,
 )
-from octasplat.engine.files import ExportOptions
-from octasplat.engine.files.gaussian_ply import read_gaussian_ply
-from octasplat.engine.files.several import export_files
 from octasplat.engine.pipeline import reconstruct as reconstruct_scene
-from octasplat.engine.plain_colours import PlainScene
-from octasplat.engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE, not_exported
+from octasplat.engine.run_folder import CACHE, CHECKPOINTS, CONFIG, EVENTS, SCENE
 from octasplat.engine.stages import counted_stage, stopping
 from octasplat.engine.writing import write_json
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.kinds.operation_kind import OperationKind
-from octasplat.workers.work.kinds.options import (
-    ReconstructOptions,
-)
+from octasplat.workers.work.kinds.options import ReconstructOptions
 from octasplat.workers.work.places import Places
 from octasplat.workers.work.preview import Previews
 from octasplat.workers.work.task import Task

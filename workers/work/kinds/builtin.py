@@ -1,7 +1,6 @@
 """The kinds that octasplat brings."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from octasplat.engine.operations.base import Options
@@ -31,7 +30,6 @@ from octasplat.workers.work.kinds.options import (
     revise_reconstruction,
 )
 from octasplat.workers.work.kinds.pictures import Relight, Render
-from octasplat.workers.work.kinds.surface import Surface
 from octasplat.workers.work.kinds.scene_kinds import (
     BACKGROUND,
     EDITS,
@@ -41,8 +39,8 @@ from octasplat.workers.work.kinds.scene_kinds import (
     Import,
     SceneChange,
 )
+from octasplat.workers.work.kinds.surface import Surface
 from octasplat.workers.work.kinds.table import JobKind, register
-from octasplat.workers.work.task import Task
 
 
 class Reconstruct(JobKind[ReconstructOptions]):

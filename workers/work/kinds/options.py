@@ -1,10 +1,9 @@
 """Options of the job kinds, as users give them and as they are kept. Imports neither torch nor numba."""
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from octasplat.engine.config import ReconstructionConfig
 from octasplat.engine.files.result_names import ExportName
