@@ -33,13 +33,13 @@ import httpx
 from benchmarks.chaos_kind import ChainOptions, undisturbed
 from benchmarks.chaos_machine import BLOWS, Blow, Machine, small_disk
 
+from octasplat.engine.operations.reconstruct import options_of
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.workers.client.api import Api, ServiceError, Unreachable
 from octasplat.workers.client.upload import scene_files, upload_scene
 from octasplat.workers.store.opening import open_storage
 from octasplat.workers.store.trees import read_manifest
-from octasplat.workers.work.kinds.options import resolve_reconstruction
 
 IN_FLIGHT = 20
 OVER = ("succeeded", "failed", "canceled")
@@ -268,7 +268,7 @@ def make_scene(folder: Path) -> Path:
 
 def undisturbed_reconstruction(scene: Path, folder: Path) -> dict[str, bytes]:
     """Contents by name of what must not depend on what happens on the way."""
-    run = reconstruct(scene, folder, resolve_reconstruction(RECONSTRUCTION).config(), threads=1)
+    run = reconstruct(scene, folder, options_of(RECONSTRUCTION).config(), threads=1)
     files = (path for path in run.rglob("*") if path.is_file())
     named = {path.relative_to(run).as_posix(): path for path in files}
     return {name: path.read_bytes() for name, path in named.items() if _is_compared(name)}

@@ -22,7 +22,6 @@ from PIL import Image
 from octasplat.engine.config import resolve_config
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.estimates import estimate_reconstruction
-from octasplat.workers.work.kinds.options import ReconstructOptions
 
 
 def main() -> None:
@@ -38,8 +37,7 @@ def main() -> None:
     found = Counter(Image.open(path).size for path in sorted((options.scene / "images").iterdir()))
     sizes = [Sizes(width, height, count) for (width, height), count in found.items()]
     cores = len(os.sched_getaffinity(0))
-    asked = ReconstructOptions.model_validate(config.model_dump(mode="json"))
-    expected = estimate_reconstruction(asked, sizes, cores)
+    expected = estimate_reconstruction(config, sizes, cores)
     command = [sys.executable, "-m", "octasplat", "reconstruct", str(options.scene), "--quiet"]
     command += ["--preset", options.preset]
     command += ["--max-side", str(options.max_side)] if options.max_side else []

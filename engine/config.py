@@ -1,73 +1,34 @@
-"""The settings of a reconstruction, shared by the command line, ``config.json`` and the API.
+"""The settings of a reconstruction, and how they follow from what is asked for.
 
 Imports neither torch nor numba.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.fields import ADVANCED, BASIC, Unit
-from octasplat.engine.nearest_names import did_you_mean
+from octasplat.engine.refusals import Refusal, SettingsRefused, refusals_of, submodels, unknown_setting
+from octasplat.engine.run_settings import RunSettings
+from octasplat.engine.settings import Settings
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
-from octasplat.engine.train.preset_names import PresetName
+from octasplat.engine.train.preset_names import PRESETS, PRESETS_WITH_MATERIALS
 
 
-class ReconstructionConfig(BaseModel):
+class ReconstructionConfig(RunSettings):
     """Everything that decides what a reconstruction gives; the number of threads does not."""
 
-    preset: Annotated[PresetName, BASIC] = Field(
-        "standard",
-        description="Where the settings of the training come from: fast is a first look, standard is "
-        "better, high is better yet and takes about three times as many iterations, paper has the published "
-        "settings.",
-    )
-    max_side: Annotated[int | None, Unit("px"), BASIC] = Field(
-        None,
-        ge=16,
-        description="Longest side to which photographs are shrunk; None keeps their size. Set it for a quick "
-        "try, or where memory is short.",
-    )
-    test_every: Annotated[int, Unit("views"), BASIC] = Field(
-        8,
-        ge=0,
-        description="Every how-manieth view by name is held out to be measured; 0 holds out none, so that "
-        "all are trained on.",
-    )
-    held_out: Annotated[tuple[str, ...] | None, ADVANCED] = Field(
-        None, description="Names of the views to hold out instead."
-    )
-    poses: Annotated[Literal["given", "auto", "missing"], BASIC] = Field(
-        "given",
-        description="Where the poses of the cameras come from: given takes the COLMAP model of the dataset; "
-        "auto finds the poses first, by COLMAP's features, matching and mapping; missing does so only where "
-        "the dataset holds no model.",
-    )
-    masks: Annotated[Literal["ignore", "alpha"], ADVANCED] = Field(
-        "ignore",
-        description="What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as "
-        "the alpha, for objects that are cut out.",
-    )
-    evaluate_background: Annotated[Literal["black", "white"], ADVANCED] = Field(
-        "black",
-        description="What lies behind renders and photographs with alpha when they are compared.",
-    )
-    minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
-        None,
-        ge=0.1,
-        le=100_000,
-        description="Time in which the training is to end, which decides its iterations and Gaussians by the "
-        "pace of the machine that begins it; None leaves them to the other settings.",
-    )
-    exports: Annotated[tuple[str, ...], BASIC] = Field(
-        ("mesh.ply", "mesh.obj", "mesh.glb"),
-        description="Files to write besides scene.ply; their names say the format.",
-    )
     train: TrainConfig = Field(TrainConfig(), description="The settings of the training.")
+
+    def with_poses_decided(self, has_model: bool) -> "ReconstructionConfig":
+        """Return the same with ``poses`` as they come out for a dataset with or without a COLMAP model."""
+        if self.poses != "missing":
+            return self
+        return self.model_copy(update={"poses": "given" if has_model else "auto"})
 
 
 def resolve_config(
@@ -75,102 +36,235 @@ def resolve_config(
     *,
     materials: bool = False,
     settings: Mapping[str, object] | None = None,
+    train: Mapping[str, Any] | None = None,
     assignments: Sequence[str] = (),
 ) -> ReconstructionConfig:
-    """A configuration from a preset, top-level settings, and ``section.name=value`` assignments.
+    """Return the configuration that a preset, settings and assignments mean; later ones win.
+
+    Whatever switches materials on, the flag, ``train`` or an assignment, means the same: the preset with
+    materials, see :func:`octasplat.engine.train.config.with_materials`, and what else is given on top.
 
     Args:
         preset_name: one of :data:`octasplat.engine.train.preset_names.PRESETS`.
-        materials: learn materials and the environment too, see
-            :func:`octasplat.engine.train.config.with_materials`.
-        settings: fields of :class:`ReconstructionConfig`; None values are left at their defaults.
+        materials: learn materials and the environment.
+        settings: fields of :class:`RunSettings`; None values are left at their defaults.
+        train: some settings of the training, nested as in :class:`ReconstructionConfig`.
         assignments: of any setting, values as JSON: ``rates.mean=2e-4``, which is
             ``train.rates.mean=2e-4``, or ``test_every=4``.
 
     Raises:
-        ConfigError: an unknown name, a value out of range, or no such preset.
+        SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
     """
-    chosen = preset(preset_name)
-    train: dict[str, Any] = (with_materials(chosen) if materials else chosen).model_dump()
-    values = {key: value for key, value in (settings or {}).items() if value is not None}
-    for assignment in assignments:
-        name, equals, text = (part.strip() for part in assignment.partition("="))
-        if not equals:
-            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. rates.mean=2e-4.")
-        if name in ReconstructionConfig.model_fields and name not in ("preset", "train"):
-            values[name] = _value(text)
+    given = {key: value for key, value in (settings or {}).items() if value is not None}
+    values, changes = _collected({**given, "preset": preset_name}, materials or None, train, assignments)
+    base = _base(values["preset"], _learns_materials(changes))
+    return _validated({**values, "train": merged(base, changes)})
+
+
+def revise_config(
+    before: Mapping[str, Any],
+    *,
+    materials: bool | None = None,
+    settings: Mapping[str, object] | None = None,
+    train: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] = (),
+) -> ReconstructionConfig:
+    """Return a configuration with changes; another preset brings its own settings of the training.
+
+    Where the changes switch materials on or off, the rest of what that means comes with it, but for the
+    settings that differ from those of the preset.
+
+    Args:
+        before: the configuration, as JSON.
+        materials: as for :func:`resolve_config`; None leaves them as they are.
+        settings: fields of :class:`RunSettings`; those that are not there stay as they are.
+        train: as for :func:`resolve_config`.
+        assignments: as for :func:`resolve_config`.
+
+    Raises:
+        SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
+    """
+    values, changes = _collected(settings or {}, materials, train, assignments)
+    values = {**before, **values}
+    kept: Mapping[str, Any] = before.get("train", {})
+    learnt = _learns_materials(kept)
+    if values.get("preset") != before.get("preset"):
+        kept = {}
+    elif _learns_materials(merged(kept, changes)) == learnt:
+        return _validated({**values, "train": merged(kept, changes)})
+    else:
+        kept = _differences(_base(before.get("preset"), learnt), kept)
+        kept.get("materials", {}).pop("learn", None)
+    asked = merged(kept, changes)
+    base = _base(values.get("preset"), _learns_materials(asked))
+    return _validated({**values, "train": merged(base, asked)})
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with the values of ``over``, section by section; another kind of section begins anew.
+
+    >>> merged({"rates": {"quat": 1, "mean": 2}}, {"rates": {"quat": 3}})
+    {'rates': {'quat': 3, 'mean': 2}}
+    """
+    result = dict(base)
+    for key, value in over.items():
+        old = result.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            is_same = "kind" not in old or value.get("kind", old["kind"]) == old["kind"]
+            result[key] = merged(old, value) if is_same else value
         else:
-            _assign(train, training_setting(name) or name, text)
-    try:
-        return ReconstructionConfig.model_validate({"preset": preset_name, "train": train, **values})
-    except ValidationError as error:
-        raise ConfigError(_first_complaint(error)) from None
-
-
-def training_setting(name: str) -> str | None:
-    """The setting of the training that a dotted name means; None if it means none.
-
-    >>> training_setting("rates.mean"), training_setting("train.rates.mean"), training_setting("test_every")
-    ('rates.mean', 'rates.mean', None)
-    """
-    inner = name.removeprefix("train.")
-    return inner if inner.partition(".")[0] in TrainConfig.model_fields else None
+            result[key] = value
+    return result
 
 
 def read_config(path: Path) -> ReconstructionConfig:
-    """The configuration part of a run's ``config.json``.
+    """Return the configuration part of a run's ``config.json``.
 
     Raises:
         ConfigError: the file is missing, damaged, or of another version.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return ReconstructionConfig.model_validate(content["reconstruction"])
-    except ValidationError as error:
-        raise ConfigError(
-            f"{path} is not a configuration of this version: {_first_complaint(error)}"
-        ) from None
+        return _validated(content["reconstruction"])
+    except SettingsRefused as error:
+        raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{path} cannot be read ({error}); name the folder of a finished or stopped run."
         ) from None
 
 
-def _assign(target: dict[str, Any], name: str, text: str) -> None:
-    *path, last = name.split(".")
-    section: Any = target
-    for key in path:
-        section = section.get(key) if isinstance(section, dict) else None
-    if not isinstance(section, dict) or (last not in section and last != "kind"):
-        known = [*_names(target, ""), *(set(ReconstructionConfig.model_fields) - {"preset", "train"})]
-        raise ConfigError(
-            f"--set {name}: there is no such setting.{did_you_mean(name.removeprefix('train.'), known)} "
-            "octasplat config list --all lists them."
-        )
-    value = _value(text)
-    if path == ["densify"] and last == "kind" and section.get("kind") != value:
-        # Another strategy has other settings: begin from its defaults.
-        section.clear()
-    section[last] = value
+def _collected(
+    settings: Mapping[str, object],
+    materials: bool | None,
+    train: Mapping[str, Any] | None,
+    assignments: Sequence[str],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The fields of :class:`RunSettings` and the nested settings of the training that are asked for."""
+    values = dict(settings)
+    changes: dict[str, Any] = {} if materials is None else {"materials": {"learn": materials}}
+    if train:
+        _check_names(train)
+        changes = merged(changes, train)
+    for assignment in assignments:
+        path, value = _read_assignment(assignment)
+        if len(path) == 1 and path[0] in RunSettings.model_fields:
+            values[path[0]] = value
+            continue
+        for name in reversed(path):
+            value = {name: value}
+        _check_names(value)
+        changes = merged(changes, value)
+    return values, changes
 
 
-def _names(values: Mapping[str, Any], prefix: str) -> list[str]:
-    """The names of all settings in nested values, with dots."""
-    names: list[str] = []
-    for name, value in values.items():
-        names += _names(value, f"{prefix}{name}.") if isinstance(value, Mapping) else [f"{prefix}{name}"]
-    return names
-
-
-def _value(text: str) -> Any:
-    """JSON, or else the text itself."""
+def _validated(values: Mapping[str, Any]) -> ReconstructionConfig:
     try:
-        return json.loads(text)
+        return ReconstructionConfig.model_validate(dict(values))
+    except ValidationError as error:
+        raise SettingsRefused(refusals_of(error, ReconstructionConfig)) from None
+
+
+def _read_assignment(assignment: str) -> tuple[list[str], Any]:
+    """The path and the value that an assignment names; the value is JSON, or else the text itself."""
+    name, equals, text = (part.strip() for part in assignment.partition("="))
+    if not equals or not name:
+        sentence = f"{assignment}: write an assignment as name=value, e.g. rates.mean=2e-4."
+        raise SettingsRefused([Refusal(("assignments",), "assignment", sentence)])
+    try:
+        value = json.loads(text)
     except ValueError:
-        return text
+        value = text
+    path = name.split(".")
+    return path[1:] if path[0] == "train" and len(path) > 1 else path, value
 
 
-def _first_complaint(error: ValidationError) -> str:
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return f"{where}: {first['msg']} (it is {first.get('input')!r})."
+def _base(preset_name: object, materials: bool) -> dict[str, Any]:
+    """The settings of a preset's training; none where there is no such preset, which validation refuses."""
+    if preset_name not in PRESETS:
+        return {}
+    if materials and preset_name not in PRESETS_WITH_MATERIALS:
+        *others, last = PRESETS_WITH_MATERIALS
+        sentence = (
+            f"The preset {preset_name} is for scenes without materials; with materials choose "
+            f"{', '.join(others)} or {last}."
+        )
+        raise SettingsRefused([Refusal(("preset",), "materials", sentence)])
+    chosen = preset(str(preset_name))
+    return (with_materials(chosen) if materials else chosen).model_dump()
+
+
+def _learns_materials(train: Mapping[str, Any]) -> bool:
+    """Whether these settings of a training switch materials on, in whichever way they say so."""
+    materials = train.get("materials")
+    try:
+        return isinstance(materials, Mapping) and _BOOL.validate_python(materials.get("learn", False))
+    except ValidationError:
+        return False
+
+
+_BOOL = TypeAdapter(bool)
+
+
+def _differences(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that are not those of ``base``, section by section."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        old = base.get(key)
+        if isinstance(value, Mapping) and isinstance(old, Mapping) and value.get("kind") == old.get("kind"):
+            if inner := _differences(old, value):
+                found[key] = inner
+        elif value != (list(old) if isinstance(old, tuple) else old):
+            found[key] = value
+    return found
+
+
+def _check_names(train: Mapping[str, Any]) -> None:
+    """Refuse settings of the training that there are not, with the nearest name.
+
+    Raises:
+        SettingsRefused: some are unknown.
+    """
+    unknown = list(_unknown((TrainConfig,), train, ("train",)))
+    if unknown:
+        raise SettingsRefused([unknown_setting(path, _setting_names()) for path in unknown])
+
+
+def _unknown(
+    models: Sequence[type[BaseModel]], values: Mapping[str, Any], path: tuple[str, ...]
+) -> Iterator[tuple[str, ...]]:
+    """The paths of the values that none of ``models`` has."""
+    for key, value in values.items():
+        place = (*path, str(key))
+        infos = [model.model_fields[key] for model in models if key in model.model_fields]
+        if not infos:
+            former = (model.former_settings for model in models if issubclass(model, Settings))
+            if not any(key in names for names in former):
+                yield from _leaves(value, place)
+        elif isinstance(value, Mapping):
+            inner = tuple(model for info in infos for model in submodels(info.annotation))
+            yield from _unknown(inner, value, place)
+
+
+def _leaves(value: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    if isinstance(value, Mapping) and value:
+        for key, inner in value.items():
+            yield from _leaves(inner, (*path, str(key)))
+    else:
+        yield path
+
+
+@cache
+def _setting_names() -> tuple[str, ...]:
+    """The names of all settings, with dots."""
+    return (*RunSettings.model_fields, *dict.fromkeys(_names_in((TrainConfig,), "")))
+
+
+def _names_in(models: Sequence[type[BaseModel]], prefix: str) -> Iterator[str]:
+    for model in models:
+        for name, info in model.model_fields.items():
+            inner = submodels(info.annotation)
+            if inner:
+                yield from _names_in(inner, f"{prefix}{name}.")
+            else:
+                yield prefix + name

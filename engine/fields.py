@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -47,6 +48,35 @@ class Group(_InSchema):
 
 
 BASIC, ADVANCED, EXPERIMENTAL = Group("basic"), Group("advanced"), Group("experimental")
+
+
+@dataclass(frozen=True)
+class PartOf:
+    """Mark of a nested mapping that has some of the fields of a model; its schema is the model's.
+
+    Attributes:
+        model: ``module:class``, imported when the schema is asked for.
+    """
+
+    model: str
+
+    def __get_pydantic_json_schema__(
+        self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        module, _, name = self.model.partition(":")
+        model: type[BaseModel] = getattr(import_module(module), name)
+        return handler(model.__pydantic_core_schema__)
+
+
+@dataclass(frozen=True)
+class Shortcut(_InSchema):
+    """Mark of a field that stands for a setting of the training, by its name; forms show that one."""
+
+    setting: str
+
+    def schema_entries(self) -> Mapping[str, object]:
+        """Return what stands in the schema."""
+        return {"shortcut": self.setting}
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,3 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
         by_last_part.setdefault(full.rpartition(".")[2], full)
     last = get_close_matches(name.rpartition(".")[2], list(by_last_part), n=1, cutoff=0.75)
     return by_last_part[last[0]] if last else None
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return " Did you mean NAME?" with the nearest known name; empty where none is near."""
-    nearest = nearest_name(name, known)
-    return f" Did you mean {nearest}?" if nearest else ""

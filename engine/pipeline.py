@@ -62,6 +62,7 @@ from octasplat.engine.run_folder import (
 )
 from octasplat.engine.run_poses import find_missing_poses, free_lenses, place_misfits
 from octasplat.engine.scene import Dataset, write_held_out
+from octasplat.engine.scene.colmap import has_model as has_model_files
 from octasplat.engine.scene.near import NearZones, nearest_distances
 from octasplat.engine.scene.seen import SeenSpace
 from octasplat.engine.scene.views_file import ViewsRecord, read_views, write_views
@@ -225,8 +226,9 @@ def _claim_output(scene: Path, output: Path, config: ReconstructionConfig, resum
             raise OutputError(
                 f"{output} already holds a run; add --resume to go on with it, or name another folder."
             )
-        before = read_config(output / CONFIG)
-        if before.model_copy(update={"exports": config.exports}) != config:
+        has_model = has_model_files(scene)
+        before = read_config(output / CONFIG).model_copy(update={"exports": config.exports})
+        if before.with_poses_decided(has_model) != config.with_poses_decided(has_model):
             raise ConfigError(
                 f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
                 "or name another folder."

@@ -24,7 +24,7 @@ class FormerSetting:
 class Settings(BaseModel):
     """Base of the models of settings; runs of earlier versions are read, see :class:`FormerSetting`."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     former_settings: ClassVar[Mapping[str, FormerSetting]] = {}
 

@@ -16,8 +16,8 @@ from pydantic.fields import FieldInfo
 from octasplat.engine.config import ReconstructionConfig, resolve_config
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.fields import Group, Level, Unit
-from octasplat.engine.nearest_names import did_you_mean
-from octasplat.engine.train.preset_names import PRESETS
+from octasplat.engine.refusals import SettingsRefused, unknown_setting
+from octasplat.engine.train.preset_names import PRESETS, PRESETS_WITH_MATERIALS
 
 MATERIALS = "+materials"
 """What is added to the name of a preset where materials are learnt with it."""
@@ -80,6 +80,7 @@ def settings() -> tuple[Setting, ...]:
         name + (MATERIALS if materials else ""): setting_values(resolve_config(name, materials=materials))
         for name in PRESETS
         for materials in (False, True)
+        if not materials or name in PRESETS_WITH_MATERIALS
     }
     found: dict[str, Setting] = {}
     for name, info in _walk(ReconstructionConfig, ""):
@@ -104,7 +105,7 @@ def setting_named(name: str) -> Setting:
     inside = [known for known in names if known.startswith(f"{wanted}.")]
     if inside:
         raise ConfigError(f"{name} is a group of settings: {', '.join(inside)}.")
-    raise ConfigError(f"There is no setting '{name}'.{did_you_mean(wanted, names)}")
+    raise SettingsRefused([unknown_setting(wanted.split("."), names)])
 
 
 def setting_values(config: ReconstructionConfig) -> dict[str, object]:

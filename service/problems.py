@@ -1,7 +1,7 @@
 """Errors as problem documents (RFC 9457), and nothing but those."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 from octasplat.engine.errors import OctasplatError
 from octasplat.engine.light.stage_file import stage_complaint, stage_keys
 from octasplat.engine.operations.base import complaint
+from octasplat.engine.refusals import SettingsRefused
 from octasplat.service.intake.faults import IntakeRefused
 from octasplat.workers.records.errors import Conflict, Missing
 from octasplat.workers.records.quotas import QuotaExceeded
@@ -109,8 +110,14 @@ def not_found(what: str) -> Problem:
     return Problem(404, "not-found", f"There is no such {what}.")
 
 
-def refused_options(error: ValidationError, prefix: str = "/options") -> Problem:
+def refused_options(error: ValidationError | SettingsRefused, prefix: str = "/options") -> Problem:
     """Options that do not fit their schema."""
+    if isinstance(error, SettingsRefused):
+        faults = [
+            {"code": each.code, "detail": each.sentence, "pointer": _pointer(prefix, each.path)}
+            for each in error.refusals
+        ]
+        return Problem(422, "options", str(error), errors=faults)
     return Problem(
         422,
         "options",
@@ -226,7 +233,15 @@ def _fault(prefix: str, fault: Mapping[str, Any]) -> dict[str, Any]:
     if prefix:
         path = [where, *path]
         where = "body"
-    escaped = (str(part).replace("~", "~0").replace("/", "~1") for part in path)
-    pointer = "#" + prefix + "".join(f"/{part}" for part in escaped)
-    named = {"pointer": pointer} if where == "body" else {"parameter": "/".join(str(p) for p in path)}
+    named = (
+        {"pointer": _pointer(prefix, path)}
+        if where == "body"
+        else {"parameter": "/".join(str(p) for p in path)}
+    )
     return {"code": str(fault["type"]), "detail": complaint(str(fault["msg"])), **named}
+
+
+def _pointer(prefix: str, path: Iterable[str | int]) -> str:
+    """A JSON pointer into the request."""
+    escaped = (str(part).replace("~", "~0").replace("/", "~1") for part in path)
+    return f"#{prefix}" + "".join(f"/{part}" for part in escaped)

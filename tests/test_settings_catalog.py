@@ -94,9 +94,9 @@ def test_catalog_has_every_setting_once() -> None:
     ("name", "nearest"), [("window_ray", "window_rays"), ("quats", "rates.quat"), ("rate.mean", "rates.mean")]
 )
 def test_unknown_setting_is_refused_and_the_nearest_one_offered(name: str, nearest: str) -> None:
-    with pytest.raises(ConfigError, match=f"Did you mean {nearest}"):
+    with pytest.raises(ConfigError, match=f"the nearest is {nearest}"):
         setting_named(name)
-    with pytest.raises(ConfigError, match=f"Did you mean {nearest}"):
+    with pytest.raises(ConfigError, match=f"the nearest is {nearest}"):
         resolve_config(assignments=[f"{name}=1"])
     assert nearest_name("zzz", [entry.name for entry in settings()]) is None
 
@@ -132,7 +132,7 @@ def test_config_explain_tells_what_is_known() -> None:
     text = config_command("explain", "rates.decay").stdout
     assert "Unit: share" in text and "Default: 0.3" in text and "With paper: 0.1" in text
     refused = config_command("explain", "rates.decai")
-    assert refused.exit_code == 1 and "Did you mean rates.decay?" in refused.stderr
+    assert refused.exit_code == 1 and "the nearest is rates.decay." in refused.stderr
 
 
 def test_config_diff_tells_what_runs_had_changed(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_
 
 from octasplat.engine.errors import ExportFailed, SceneFileError
 from octasplat.engine.events import Listener, StageProgress, Warned, ignore
+from octasplat.engine.export_names import ExportName
 from octasplat.engine.fields import Group, Positional, Spelling
 from octasplat.engine.files.options import ExportChoices, ExportOptions, OctagonQ
 from octasplat.engine.files.registry import Exporter, exporter_for
-from octasplat.engine.files.result_names import ExportName
 from octasplat.engine.operations.axes import Axis
 from octasplat.engine.operations.base import Operation, Options, Result, SourceRequest, never
 

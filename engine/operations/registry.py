@@ -8,6 +8,7 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.operations.base import Operation
 
 _MODULES = {
+    "reconstruct": "reconstruct",
     "evaluate": "evaluate",
     "surface": "surface",
     "material": "material",

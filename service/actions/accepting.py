@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.refusals import SettingsRefused
 from octasplat.service.actions.access import owned_job, refuse_while_draining
 from octasplat.service.actions.asked import accepted_kind, input_problem, resolved
 from octasplat.service.actions.jobs import job_view
@@ -225,7 +226,7 @@ async def _revised(
         raise Problem(409, "version", detail) from None
     try:
         options = kind.revised(job.options, asked.options) if asked.options else before
-    except ValidationError as error:
+    except (ValidationError, SettingsRefused) as error:
         raise refused_options(error) from None
     check_writable(kind, options, job.queue, workers)
     await check_named_files(connection, who, kind, options, job.files_id)

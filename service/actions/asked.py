@@ -6,6 +6,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.refusals import SettingsRefused
 from octasplat.service.problems import Problem, refused_options
 from octasplat.workers.work.kinds import JobKind, kind_named
 
@@ -30,7 +31,7 @@ def resolved(kind: JobKind, asked: Mapping[str, Any]) -> BaseModel:
     """
     try:
         return kind.options.model_validate(kind.resolve(asked).model_dump(mode="json"))
-    except ValidationError as error:
+    except (ValidationError, SettingsRefused) as error:
         raise refused_options(error) from None
 
 

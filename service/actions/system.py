@@ -108,7 +108,7 @@ async def render_metrics(service: Service) -> bytes:
 
 
 def _kind_view(kind: JobKind, service: Service) -> KindView:
-    schema = kind.options.model_json_schema()
+    schema = kind.asked.model_json_schema()
     ceilings = ceilings_by_path(kind, service.settings)
     return KindView(name=kind.name, title=kind.title, needs=kind.needs, options=schema, ceilings=ceilings)
 

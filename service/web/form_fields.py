@@ -44,6 +44,8 @@ _LABELS = {
 }
 _LOADED = ("stage", "photographs", "camera_path")
 """Options that forms of their own, or the viewer, ask for."""
+_ASSIGNMENTS = "assignments"
+"""Settings by name, which a form has as fields."""
 _SHORT = re.compile(r"\b(sh|ssim|l1|l2|fov)\b", re.IGNORECASE)
 _UNIT_IN_NAME = re.compile(r" (px|degrees|db|gb)$")
 _CHOICES = {
@@ -125,7 +127,7 @@ def _walk(
     for name, raw in schema["properties"].items():
         given = _resolved(root, raw)
         path = f"{prefix}{name}"
-        if path in _LOADED:
+        if path in _LOADED or path == _ASSIGNMENTS or "shortcut" in given:
             continue
         if "oneOf" in given:  # one of several sections, told apart by their kind
             yield from _variants(root, given, path, presets)

@@ -63,7 +63,7 @@ def options_form(
         unwritable: formats whose files are marked and cannot be chosen.
         ceilings: of numbers, by their paths.
     """
-    schema = kind.options.model_json_schema()
+    schema = kind.asked.model_json_schema()
     presets = _preset_values(schema)
     fields = [_capped(_marked(item, unwritable), ceilings) for item in fields_of(schema, presets)]
     basic = {item.path: item for item in fields if item.group == "basic"}

@@ -26,13 +26,13 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_bare_folder_is_told_of_the_ways_that_work(photographs, octasplat, tmp_path, tiny):
     output = tmp_path / "out"
-    refused = octasplat("reconstruct", photographs, "-o", output, *tiny)
+    refused = octasplat("reconstruct", photographs, "-o", output, "--poses", "given", *tiny)
     assert refused.exit_code == 1 and not output.exists()
     assert "--poses auto" in refused.stderr and "octasplat submit" in refused.stderr
     scene = tmp_path / "scene"
     scene.mkdir()
     (scene / "images").symlink_to(photographs)
-    refused = octasplat("reconstruct", scene, "-o", output, *tiny)
+    refused = octasplat("reconstruct", scene, "-o", output, "--poses", "given", *tiny)
     assert refused.exit_code == 1 and not output.exists()
     assert "--poses auto" in refused.stderr and "octasplat submit" in refused.stderr
 
@@ -41,7 +41,7 @@ def test_poses_are_found_in_the_run_and_the_same_on_any_threads(photographs, oct
     runs = [tmp_path / "one", tmp_path / "two"]
     for threads, output in enumerate(runs, start=1):
         done = octasplat(
-            "reconstruct", photographs, "-o", output, "--poses", "auto", "--max-side", "64", *tiny,
+            "reconstruct", photographs, "-o", output, "--max-side", "64", *tiny,
             "--threads", threads,
         )  # fmt: skip
         assert done.exit_code == 0, done.stderr

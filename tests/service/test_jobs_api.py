@@ -103,7 +103,8 @@ def test_dataset_must_be_committed_and_have_poses(talk: Callable[..., None]) -> 
         made = (await http.post("/v1/datasets", json={"name": "x"})).json()
         assert is_problem(await http.post("/v1/jobs", json={"dataset_id": made["id"]}), 409, "dataset-open")
         without = await committed_dataset(service, has_poses=False)
-        assert is_problem(await http.post("/v1/jobs", json={"dataset_id": without}), 422, "poses")
+        given = {"dataset_id": without, "options": {"poses": "given"}}
+        assert is_problem(await http.post("/v1/jobs", json=given), 422, "poses")
         found = {"dataset_id": without, "options": {"poses": "auto"}}
         answer = await http.post("/v1/jobs", json=found)
         assert answer.status_code == 202
@@ -116,7 +117,7 @@ def test_poses_are_found_only_where_they_are_missing(talk: Callable[..., None]) 
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         for has_poses, kept, first in ((True, "given", "load"), (False, "auto", "features")):
             dataset = await committed_dataset(service, has_poses=has_poses)
-            asked = {"dataset_id": dataset, "options": {"poses": "missing"}}
+            asked = {"dataset_id": dataset, "options": {}}
             job = (await http.post("/v1/jobs", json=asked)).json()
             assert (job["options"]["poses"], job["stages"][0]) == (kept, first)
 

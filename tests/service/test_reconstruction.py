@@ -15,6 +15,7 @@ import psutil
 import pytest
 from click.testing import CliRunner
 
+from octasplat.engine.operations.reconstruct import options_of
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.workers.cli.main import cli
@@ -23,7 +24,6 @@ from octasplat.workers.client.download import download_results
 from octasplat.workers.client.submission import Submission, submit
 from octasplat.workers.client.upload import upload_scene
 from octasplat.workers.client.watch import watch_job
-from octasplat.workers.work.kinds.options import resolve_reconstruction
 
 pytestmark = pytest.mark.heavy
 
@@ -100,7 +100,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = resolve_reconstruction(OPTIONS).config()
+    config = options_of(OPTIONS).config()
     return reconstruct(scene, tmp_path_factory.mktemp("undisturbed") / "run", config, threads=1)
 
 

@@ -20,13 +20,13 @@ from service_bench import claimed, committed_dataset, running, stored
 from test_reconstruction import ROOT
 
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.operations.reconstruct import options_of
 from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.render.images import write_png
 from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.service.state import Service
 from octasplat.workers.cli.main import cli
 from octasplat.workers.queue.attempts import Result
-from octasplat.workers.work.kinds.options import resolve_reconstruction
 
 TRIANGLE = b"v 0 0 0\nv .3 0 0\nv 0 -.3 0\nf 1 2 3\n"
 HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n" + bytes([128, 128, 128, 128] * 4)
@@ -193,7 +193,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
     write_generated_scene(root / "scene", config)
     train = {"iterations": 20, "rays": 512, "max_gaussians": 500, "initial_points": 400, "fit_iterations": 0}
-    asked = resolve_reconstruction({"preset": "fast", "train": train, "exports": ["mesh.ply"]})
+    asked = options_of({"preset": "fast", "train": train, "exports": ["mesh.ply"]})
     reconstruct(root / "scene", root / "run", asked.config(), threads=1)
     (root / "things").mkdir()
     (root / "things" / "t").mkdir()

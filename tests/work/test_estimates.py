@@ -5,13 +5,11 @@ import pytest
 from octasplat.engine.config import resolve_config
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.estimates import Estimate, estimate_reconstruction
-from octasplat.workers.work.kinds.options import ReconstructOptions
 
 
 def estimated(preset: str, sizes: Sizes, *, materials: bool = False) -> Estimate:
     config = resolve_config(preset, materials=materials)
-    options = ReconstructOptions.model_validate(config.model_dump(mode="json"))
-    return estimate_reconstruction(options, [sizes], 1)
+    return estimate_reconstruction(config, [sizes], 1)
 
 
 @pytest.mark.parametrize(

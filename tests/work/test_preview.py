@@ -12,6 +12,7 @@ from PIL import Image
 
 from octasplat.engine.config import ReconstructionConfig
 from octasplat.engine.events import Event
+from octasplat.engine.operations.reconstruct import options_of
 from octasplat.engine.pipeline import Watcher, reconstruct
 from octasplat.engine.rays import ImageRays, RayBatch
 from octasplat.engine.scene import Dataset
@@ -20,7 +21,6 @@ from octasplat.engine.shading.plain import PLAIN
 from octasplat.engine.shading.protocol import ShadingModel
 from octasplat.engine.trace.protocol import Tracer
 from octasplat.workers.work import preview
-from octasplat.workers.work.kinds.options import resolve_reconstruction
 from octasplat.workers.work.preview import Previews, PreviewWritten
 
 
@@ -56,7 +56,7 @@ def config() -> ReconstructionConfig:
         "rebuild_every": 20, "checkpoint_every": 1000, "fit_iterations": 10, "probe_rays": 256,
         "densify": {"interval": 10, "start": 10},
     }  # fmt: skip
-    return resolve_reconstruction({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()
+    return options_of({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()
 
 
 def watched(clock: Clock, previews: Previews, seconds: float) -> Watcher:

@@ -4,11 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from octasplat.engine.config import ReconstructionConfig, read_config, resolve_config
+from octasplat.engine.config import ReconstructionConfig, read_config
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.operations.reconstruct import ReconstructRequest
 from octasplat.engine.run_folder import CONFIG
 from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.engine.stages import counted_stage
+from octasplat.engine.train.preset_names import PresetName
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.reconstruction import run_reconstruction
 from octasplat.workers.cli.signals import orderly_termination
@@ -41,28 +43,33 @@ def make_scene(root: Path, size: Mapping[str, int | None], *, quiet: bool) -> No
         write_generated_scene(root, config, progress)
 
 
-def reconstruct_scene(scene: Path, output: Path, preset: str, *, threads: int, quiet: bool) -> Path:
+def reconstruct_scene(scene: Path, output: Path, preset: PresetName, *, threads: int, quiet: bool) -> Path:
     """Reconstruct the demo scene, or go on with it, and return the path of the report.
 
     Raises:
         Stopped: by a signal, after a checkpoint.
         OctasplatError: as :func:`octasplat.engine.pipeline.reconstruct` does.
     """
-    config = resolve_config(preset, assignments=DEMO_ASSIGNMENTS.get(preset, ()))
     resume = (output / CONFIG).exists()
-    if resume and read_config(output / CONFIG) != config:
+    request = ReconstructRequest(
+        source=scene,
+        output=output,
+        resume=resume,
+        preset=preset,
+        assignments=DEMO_ASSIGNMENTS.get(preset, ()),
+    )
+    config = request.config().with_poses_decided(has_model=True)
+    if resume and read_config(output / CONFIG).with_poses_decided(has_model=True) != config:
         raise ConfigError(
             f"{output} holds a demo with other settings; delete it or name another folder with -o."
         )
     report = output / "report.html"
     if not (resume and is_complete(output, config)):
-        run_reconstruction(
-            scene, output, config, resume=resume, threads=threads, quiet=quiet, resumes_by_itself=True
-        )
+        run_reconstruction(request, threads=threads, quiet=quiet, resumes_by_itself=True)
     return report
 
 
 def is_complete(output: Path, config: ReconstructionConfig) -> bool:
-    """Whether every file of the run is there."""
+    """Return whether every file of the run is there."""
     names = ("scene.ply", "metrics.json", "report.html", *config.exports)
     return all((output / name).exists() for name in names)

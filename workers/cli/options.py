@@ -38,7 +38,7 @@ def export_names(text: str | None) -> tuple[str, ...] | None:
     Raises:
         ConfigError: one of them is no name of a result.
     """
-    from octasplat.engine.files.result_names import check_export_name
+    from octasplat.engine.export_names import check_export_name
 
     if text is None:
         return None

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import annotated_types
 import click
-from pydantic import BaseModel, BeforeValidator, TypeAdapter, ValidationError
+from pydantic import BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -19,7 +19,6 @@ from octasplat.engine.operations.base import (
     Operation,
     Result,
     build,
-    first_complaint,
     never,
 )
 from octasplat.workers.cli.options import quiet_option, threads_option
@@ -87,7 +86,11 @@ def request_of(model: type[Any], given: dict[str, Any]) -> Any:
         UsageError: what is asked for is not complete, or contradicts itself.
         ConfigError: a value is out of range; the sentence names the option.
     """
-    values = {name: value for name, value in given.items() if value is not None and value != ()}
+    values = {
+        name: value
+        for name, value in given.items()
+        if value is not None and not (value == () and _is_repeated(model.model_fields[name]))
+    }
     try:
         return build(model, values, functools.partial(option_name, model))
     except ContradictoryRequest as error:
@@ -159,10 +162,10 @@ def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
         "default": None,
     }
     flags = _flags(name, info)
-    if any(isinstance(mark, BeforeValidator) for mark in info.metadata):
+    if _reads_text(info):
         if spelling.repeated:
             return click.option(*flags, name, multiple=True, **settings)
-        return click.option(*flags, name, type=_ReadText(info), **settings)
+        return click.option(*flags, name, type=str, **settings)
     if inner is bool:
         return click.option(*flags, name, is_flag=True, help=settings["help"], default=None)
     if _is_sequence(inner):
@@ -179,20 +182,15 @@ def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
     return click.option(*flags, name, type=_type(inner, info), **settings)
 
 
-class _ReadText(click.ParamType[Any]):
-    """Text that the field reads by itself, such as ``5k,50k``."""
+def _reads_text(info: FieldInfo) -> bool:
+    return any(isinstance(mark, BeforeValidator) for mark in info.metadata)
 
-    name = "text"
 
-    def __init__(self, info: FieldInfo) -> None:
-        self._annotation: Any = Annotated[info.annotation, *info.metadata]
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return what the text says."""
-        try:
-            return TypeAdapter(self._annotation).validate_python(value)
-        except ValidationError as error:
-            self.fail(first_complaint(error), param, ctx)
+def _is_repeated(info: FieldInfo) -> bool:
+    """Whether the option may be given several times, so that none at all is an empty tuple."""
+    return _spelling(info).repeated or (
+        not _reads_text(info) and _is_sequence(_without_none(info.annotation)[0])
+    )
 
 
 def _flags(name: str, info: FieldInfo) -> tuple[str, ...]:

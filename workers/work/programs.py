@@ -6,6 +6,7 @@ import shutil
 from contextlib import nullcontext
 from pathlib import Path
 
+from octasplat.engine.config import ReconstructionConfig
 from octasplat.engine.errors import CheckpointError, ConfigError
 from octasplat.engine.events import (
     Event,
@@ -21,7 +22,6 @@ from octasplat.engine.stages import counted_stage, stopping
 from octasplat.engine.writing import write_json
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.kinds.operation_kind import OperationKind
-from octasplat.workers.work.kinds.options import ReconstructOptions
 from octasplat.workers.work.places import Places
 from octasplat.workers.work.preview import Previews
 from octasplat.workers.work.task import Task
@@ -49,7 +49,7 @@ def reconstruct(task: Task) -> None:
 
 def _reconstruct(task: Task) -> None:
     assert task.scene is not None
-    config = ReconstructOptions.model_validate(task.options).config()
+    config = ReconstructionConfig.model_validate(task.options)
 
     def publish_finished(event: Event) -> None:
         # Whatever becomes of the rest, even if this process is killed.

@@ -78,7 +78,8 @@ export async function answer(response) {
     error.status = response.status;
     error.faults = (problem.errors ?? []).map((fault) => {
         const where = (fault.pointer ?? "").replace(/^#\/options\//, "").replaceAll("/", ".");
-        return problem.type?.endsWith(":options") ? `${where}: ${fault.detail}` : fault.detail;
+        const isNamed = fault.detail.includes(where.split(".").at(-1));
+        return problem.type?.endsWith(":options") && !isNamed ? `${where}: ${fault.detail}` : fault.detail;
     });
     throw error;
 }

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.train.preset_names import PRESETS
+from octasplat.engine.operations.reconstruct import ReconstructOptions
 from octasplat.workers.cli.options import export_names, exports_option, quiet_option
+from octasplat.workers.cli.request_options import request_of, request_options
 
 if TYPE_CHECKING:
     from octasplat.workers.client.api import Api
@@ -56,28 +57,22 @@ def connected(server: str | None) -> Iterator["Api"]:
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
-@click.option("--preset", type=click.Choice(PRESETS), help="Where settings come from.")
-@click.option(
-    "--poses",
-    type=click.Choice(["given", "auto", "missing"]),
-    default="missing",
-    show_default=True,
-    help="Take the poses of the COLMAP model, find them, or find them if there is no model.",
-)
-@click.option("--max-side", type=int, metavar="PX", help="Shrink photographs to this longer side.")
-@click.option(
-    "--iterations", type=int, metavar="N", help="Iterations of the training; 0 asks the photographs' pixels."
-)
-@click.option("--minutes", type=click.FloatRange(0.1), metavar="N", help="End the training within N minutes.")
-@exports_option
-@set_option
+@request_options(ReconstructOptions)
 @click.option("--label", help="What to call the job.")
 @click.option("--queue", default="cpu", show_default=True, help="Which workers.")
 @click.option("--priority", type=click.IntRange(-100, 100), default=0, help="Higher goes first.")
 @server_option
 @quiet_option
 def submit(
-    scene: Path, wait: bool, output: Path | None, server: str | None, quiet: bool, **given: Any
+    scene: Path,
+    wait: bool,
+    output: Path | None,
+    label: str | None,
+    queue: str,
+    priority: int,
+    server: str | None,
+    quiet: bool,
+    **given: Any,
 ) -> None:
     """Send SCENE: a folder with images/ (and sparse/0), one of photographs, a ZIP file or a dataset's id.
 
@@ -86,7 +81,10 @@ def submit(
     from octasplat.workers.cli.submitting import submit, submit_and_wait
     from octasplat.workers.client.submission import Submission
 
-    what = Submission(scene, _options(given), given["label"], given["queue"], given["priority"])
+    options: ReconstructOptions = request_of(ReconstructOptions, given)
+    options.config()  # what cannot be used is refused before anything is sent
+    asked = options.model_dump(mode="json", exclude_unset=True)
+    what = Submission(scene, asked, label, queue, priority)
     with connected(server) as api:
         if wait:
             submit_and_wait(api, what, output or Path(f"{scene.stem or 'scene'}-result"), quiet=quiet)
@@ -247,7 +245,7 @@ def retry(job_id: str, from_start: bool, server: str | None, **given: Any) -> No
     body: dict[str, Any] = {"from": "start" if from_start else "checkpoint"}
     with connected(server) as api:
         job = _job(api, job_id)
-        if options := _options(given, training=job["kind"] == "reconstruct"):
+        if options := _changes(given, training=job["kind"] == "reconstruct"):
             body["options"] = options
         job = api.post(f"/v1/jobs/{job['id']}/retry", body)
     click.echo(f"{job['id']}: {job['state']}")
@@ -272,34 +270,21 @@ def download(
         fetch(api, job["id"], output or Path(f"octasplat-{job['id'][-12:]}"), names, quiet=quiet)
 
 
-def _options(given: dict[str, Any], *, training: bool = True) -> dict[str, Any]:
-    """The options of the job, which is a training or not."""
-    options: dict[str, Any] = {
-        name: given[name]
-        for name in ("preset", "poses", "max_side", "minutes")
-        if given.get(name) is not None
-    }
+def _changes(given: dict[str, Any], *, training: bool) -> dict[str, Any]:
+    """What is to be otherwise in the options of a job, which is a training or not."""
     exports = export_names(given["exports"])
-    if exports is not None:
-        options["exports"] = list(exports)
-    if given.get("iterations") is not None:
-        options["train"] = {"iterations": given["iterations"]}
-    return _assigned(options, given["assignments"], training=training)
+    options: dict[str, Any] = {} if exports is None else {"exports": list(exports)}
+    if not training:
+        return _assigned(options, given["assignments"])
+    return options | ({"assignments": list(given["assignments"])} if given["assignments"] else {})
 
 
-def _assigned(
-    options: dict[str, Any], assignments: tuple[str, ...], *, training: bool = False
-) -> dict[str, Any]:
-    """The options with ``--set`` on top; those of a ``training`` may be named as ``reconstruct`` does."""
+def _assigned(options: dict[str, Any], assignments: tuple[str, ...]) -> dict[str, Any]:
+    """The options with ``--set`` on top."""
     for assignment in assignments:
         name, equals, text = assignment.partition("=")
         if not equals:
-            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. rates.quat=0.02.")
-        if training:
-            from octasplat.engine.config import training_setting  # here, as it takes half a second
-
-            inner = training_setting(name.strip())
-            name = f"train.{inner}" if inner else name
+            raise ConfigError(f"--set {assignment}: write it as name=value, e.g. q=9.")
         try:
             value = json.loads(text)
         except ValueError:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from octasplat.engine.config import ReconstructionConfig
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.clean import OPERATION as CLEAN
 from octasplat.engine.operations.crop import OPERATION as CROP
@@ -11,6 +12,8 @@ from octasplat.engine.operations.edit import OPERATION as EDIT
 from octasplat.engine.operations.evaluate import OPERATION as EVALUATE
 from octasplat.engine.operations.material import OPERATION as MATERIAL
 from octasplat.engine.operations.merge import OPERATION as MERGE
+from octasplat.engine.operations.reconstruct import OPERATION as RECONSTRUCT
+from octasplat.engine.operations.reconstruct import options_of
 from octasplat.engine.operations.relight import OPERATION as RELIGHT
 from octasplat.engine.operations.render import OPERATION as RENDER
 from octasplat.engine.operations.transform import OPERATION as TRANSFORM
@@ -24,11 +27,6 @@ from octasplat.workers.work.kinds.estimates import (
     training_pixels,
 )
 from octasplat.workers.work.kinds.operation_kind import OperationKind
-from octasplat.workers.work.kinds.options import (
-    ReconstructOptions,
-    resolve_reconstruction,
-    revise_reconstruction,
-)
 from octasplat.workers.work.kinds.pictures import Relight, Render
 from octasplat.workers.work.kinds.scene_kinds import (
     BACKGROUND,
@@ -40,46 +38,44 @@ from octasplat.workers.work.kinds.scene_kinds import (
     SceneChange,
 )
 from octasplat.workers.work.kinds.surface import Surface
-from octasplat.workers.work.kinds.table import JobKind, register
+from octasplat.workers.work.kinds.table import register
 
 
-class Reconstruct(JobKind[ReconstructOptions]):
+class Reconstruct(OperationKind):
     """Photographs to a scene."""
 
     writes_at = "exports"
 
-    def resolve(self, asked: Mapping[str, Any]) -> ReconstructOptions:
+    def resolve(self, asked: Mapping[str, Any]) -> ReconstructionConfig:
         """Return complete options: those of the preset, and what was asked for on top."""
-        return resolve_reconstruction(asked)
+        return options_of(asked).config()
 
-    def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructOptions:
+    def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> ReconstructionConfig:
         """Return the options of a job with changes; another preset brings its own settings."""
-        return revise_reconstruction(before, changes)
+        return options_of(changes).revised(before)
 
-    def stages(self, options: ReconstructOptions) -> tuple[str, ...]:
+    def stages(self, options: ReconstructionConfig) -> tuple[str, ...]:
         """Return the stages, those that find poses among them if there are none."""
         stages = ("load", "train", "evaluate", "export")
         return stages if options.poses == "given" else ("features", "matches", "poses", *stages)
 
-    def needs_poses(self, options: ReconstructOptions) -> bool:
+    def needs_poses(self, options: ReconstructionConfig) -> bool:
         """Return whether the dataset must hold a COLMAP model."""
         return options.poses == "given"
 
-    def settle(self, options: ReconstructOptions, has_poses: bool) -> ReconstructOptions:
+    def settle(self, options: ReconstructionConfig, has_poses: bool) -> ReconstructionConfig:
         """Return the options with poses decided, so that no job shows stages that it will not have."""
-        if options.poses != "missing":
-            return options
-        return options.model_copy(update={"poses": "given" if has_poses else "auto"})
+        return options.with_poses_decided(has_poses)
 
-    def goes_on(self, before: ReconstructOptions, after: ReconstructOptions) -> bool:
+    def goes_on(self, before: ReconstructionConfig, after: ReconstructionConfig) -> bool:
         """Return whether only the files differ, which are written after everything else."""
         return before.model_copy(update={"exports": after.exports}) == after
 
-    def writes(self, options: ReconstructOptions) -> tuple[str, ...]:
+    def writes(self, options: ReconstructionConfig) -> tuple[str, ...]:
         """Return the names of the files to export."""
         return options.exports
 
-    def demands(self, options: ReconstructOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+    def demands(self, options: ReconstructionConfig, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
         """Return what the training asks for."""
         train = options.train
         pixels = training_pixels(options, sizes)
@@ -97,7 +93,7 @@ class Reconstruct(JobKind[ReconstructOptions]):
             Demand("max_side", "workspace_bytes", reconstruction_bytes(options, sizes)),
         )
 
-    def estimate(self, options: ReconstructOptions, sizes: Sequence[Sizes], cores: int) -> Estimate:
+    def estimate(self, options: ReconstructionConfig, sizes: Sequence[Sizes], cores: int) -> Estimate:
         """Return the time and memory that it takes."""
         return estimate_reconstruction(options, sizes, cores)
 
@@ -120,11 +116,13 @@ def register_all() -> None:
     """Register them."""
     register(
         Reconstruct(
-            name="reconstruct",
+            RECONSTRUCT,
             title="Photographs to a scene, its meshes and measurements",
+            stages=(),
             needs="dataset",
-            options=ReconstructOptions,
+            complete=ReconstructionConfig,
             program="octasplat.workers.work.programs:reconstruct",
+            tells_stages=True,
         )
     )
     register(

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, computed_field
 
+from octasplat.engine.config import ReconstructionConfig
 from octasplat.engine.durations import duration
 from octasplat.engine.operations.pictures import PictureOptions
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
 from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
-from octasplat.workers.work.kinds.options import ReconstructOptions
 
 _START_CPU_SECONDS = 16.0
 _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7
@@ -92,7 +92,7 @@ class Estimate(BaseModel):
 
 
 def estimate_reconstruction(
-    options: ReconstructOptions, photographs: Sequence[Sizes], cores: int
+    options: ReconstructionConfig, photographs: Sequence[Sizes], cores: int
 ) -> Estimate:
     """The estimate of a reconstruction of these photographs, on a machine of so many cores."""
     train = options.train
@@ -125,7 +125,7 @@ def estimate_reconstruction(
     return _estimate(cpu_seconds, memory, cores, finds_poses=options.poses == "auto", disk_bytes=disk)
 
 
-def reconstruction_bytes(options: ReconstructOptions, photographs: Sequence[Sizes]) -> int:
+def reconstruction_bytes(options: ReconstructionConfig, photographs: Sequence[Sizes]) -> int:
     """The least that the folder of a reconstruction takes: decoded photographs, and one checkpoint."""
     shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
     pixels = sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
@@ -138,7 +138,7 @@ def image_bytes(options: PictureOptions, photographs: Sequence[Sizes], turns: in
     return round(_IMAGE_PIXEL_BYTES[options.format] * rendered_pixels(options, photographs) * turns)
 
 
-def training_pixels(options: ReconstructOptions, photographs: Sequence[Sizes]) -> int:
+def training_pixels(options: ReconstructionConfig, photographs: Sequence[Sizes]) -> int:
     """Pixels of the views that a reconstruction trains on, all of the photographs having poses."""
     shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
     count = sum(sizes.count for sizes in shrunk)
@@ -201,7 +201,7 @@ def _shrunk(sizes: Sizes, max_side: int | None) -> Sizes:
     return Sizes(max(1, round(sizes.width_px * scale)), max(1, round(sizes.height_px * scale)), sizes.count)
 
 
-def _held_out(options: ReconstructOptions, count: int) -> int:
+def _held_out(options: ReconstructionConfig, count: int) -> int:
     if options.held_out is not None:
         return min(len(options.held_out), count)
     return -(-count // options.test_every) if options.test_every else 0

@@ -5,6 +5,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from octasplat.engine.events import Listener
 from octasplat.engine.fields import map_named_files, named_files, takes_files
 from octasplat.engine.operations.base import Operation, Options, Request
@@ -28,6 +30,7 @@ class OperationKind(JobKind[Any]):
         output: name of the file or folder, among the results, that the request calls its output.
         needs: what it works on.
         tells_stages: whether the operation tells its stages itself.
+        complete: model of the complete options, if they are not those that users give.
     """
 
     def __init__(
@@ -42,12 +45,14 @@ class OperationKind(JobKind[Any]):
         needs: Needs = "result",
         program: str = PROGRAM,
         tells_stages: bool = False,
+        complete: type[BaseModel] | None = None,
     ) -> None:
         super().__init__(
             name=operation.name,
             title=title or operation.title.removesuffix("."),
             needs=needs,
-            options=options or operation.options,
+            options=complete or options or operation.options,
+            asked=options or operation.options,
             program=program,
             stages=stages,
             source_files=source_files,

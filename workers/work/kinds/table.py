@@ -25,7 +25,8 @@ class JobKind(Generic[OptionsT]):
         title: one line for people.
         needs: what it works on: a committed dataset of photographs, the results of a finished job, or only
             the files that its options name.
-        options: model of its options, whose JSON Schema is published.
+        options: model of its complete options, as they are kept.
+        asked: model of the options that users give, whose JSON Schema is published; None for ``options``.
         program: ``module:function`` that does the work, imported by the job's own process only; it takes a
             :class:`octasplat.workers.work.task.Task`.
         stages: names of its stages, in order.
@@ -52,17 +53,24 @@ class JobKind(Generic[OptionsT]):
         program: str,
         stages: Sequence[str] = (),
         source_files: Sequence[str] = (),
+        asked: type[BaseModel] | None = None,
     ) -> None:
         self.name, self.title, self.needs, self.options, self.program = name, title, needs, options, program
+        self.asked: type[BaseModel] = asked or options
         self.source_files = tuple(source_files)
         self._stages = tuple(stages)
 
     def resolve(self, asked: Mapping[str, Any]) -> OptionsT:
-        """Return complete options from what a user asks for; raises pydantic's ValidationError."""
+        """Return complete options from what a user asks for.
+
+        Raises:
+            ValidationError: an option cannot be used.
+            SettingsRefused: likewise, with a sentence for each.
+        """
         return self.options.model_validate(dict(asked))
 
     def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> OptionsT:
-        """Return the options of a job that is tried again with changes; raises ValidationError."""
+        """Return the options of a job that is tried again with changes; raises as :meth:`resolve` does."""
         return self.resolve({**before, **changes})
 
     def stages(self, options: OptionsT) -> tuple[str, ...]:

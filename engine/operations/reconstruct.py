@@ -1,0 +1,245 @@
+"""``reconstruct``: photographs to a scene, its meshes and measurements."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import ADVANCED, BASIC, PartOf, Positional, Shortcut, Spelling
+from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never
+from octasplat.engine.refusals import SettingsRefused, refusals_of
+from octasplat.engine.run_settings import RunSettings
+
+if TYPE_CHECKING:
+    from octasplat.engine.config import ReconstructionConfig
+    from octasplat.engine.pipeline import Watcher
+
+_CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html", "scene.ply"
+
+
+class ReconstructOptions(RunSettings, Options):
+    """How photographs become a scene: a preset, and what is to be otherwise."""
+
+    materials: Annotated[bool, BASIC] = Field(
+        False,
+        description="Learn materials and the environment of shiny things; environment.hdr lies beside the "
+        "scene then.",
+    )
+    for_surface: Annotated[bool, BASIC] = Field(
+        False,
+        description="Hold normals and depths together, so that a surface made of the scene is smoother.",
+    )
+    iterations: Annotated[int | None, Shortcut("iterations"), Spelling(metavar="N")] = Field(
+        None, description="Iterations of the training; 0 asks the photographs' pixels."
+    )
+    rays: Annotated[int | None, Shortcut("rays"), Spelling(metavar="N")] = Field(
+        None, description="Rays of one iteration."
+    )
+    max_gaussians: Annotated[int | None, Shortcut("max_gaussians"), Spelling(metavar="N")] = Field(
+        None, description="Most Gaussians; 0, the default, asks the photographs' pixels."
+    )
+    sh_degree: Annotated[int | None, Shortcut("sh_degree"), Spelling(metavar="N")] = Field(
+        None, description="Degree of the spherical harmonics of the colours, 0 to 3."
+    )
+    seed: Annotated[int | None, Shortcut("seed"), Spelling(metavar="N")] = Field(
+        None, description="Seed of everything random.  [default: 0]"
+    )
+    train: Annotated[
+        dict[str, Any], PartOf("octasplat.engine.train.config:TrainConfig"), Spelling(hidden=True)
+    ] = Field(
+        default_factory=dict,
+        description="Settings of the training that are to be otherwise than the preset's.",
+    )
+    assignments: Annotated[tuple[str, ...], Spelling(("--set",), metavar="NAME=VALUE"), ADVANCED] = Field(
+        (),
+        description="Any other setting, e.g. rates.quat=0.02 or test_every=4, values as JSON; octasplat "
+        "config list shows them.",
+    )
+
+    def config(self) -> "ReconstructionConfig":
+        """Return the complete configuration that the options mean.
+
+        Raises:
+            SettingsRefused: a setting is unknown, out of range or contradicts another.
+        """
+        from octasplat.engine.config import resolve_config
+
+        settings = {name: getattr(self, name) for name in RunSettings.model_fields if name != "preset"}
+        return resolve_config(
+            self.preset,
+            materials=self.materials,
+            settings=settings,
+            train=self._training(),
+            assignments=self.assignments,
+        )
+
+    def revised(self, before: Mapping[str, Any]) -> "ReconstructionConfig":
+        """Return a complete configuration, given as JSON, with those options on top that were given.
+
+        Raises:
+            SettingsRefused: a setting is unknown, out of range or contradicts another.
+        """
+        from octasplat.engine.config import revise_config
+
+        given = self.model_fields_set
+        return revise_config(
+            before,
+            materials=self.materials if "materials" in given else None,
+            settings={name: getattr(self, name) for name in RunSettings.model_fields if name in given},
+            train=self._training(),
+            assignments=self.assignments,
+        )
+
+    def _training(self) -> dict[str, Any]:
+        """The settings of the training that are asked for by name, nested."""
+        from octasplat.engine.config import merged
+        from octasplat.engine.train.config import FOR_SURFACE
+
+        names = {name: info.metadata for name, info in ReconstructOptions.model_fields.items()}
+        shortcuts: dict[str, Any] = {
+            mark.setting: getattr(self, name)
+            for name, marks in names.items()
+            for mark in marks
+            if isinstance(mark, Shortcut) and getattr(self, name) is not None
+        }
+        if self.for_surface:
+            shortcuts["loss"] = {"depth_normal": FOR_SURFACE}
+        return merged(self.train, shortcuts)
+
+
+class ReconstructRequest(ReconstructOptions, Request):
+    """Reconstruct SCENE, a folder with images/ and a COLMAP model in sparse/0, or with photographs alone.
+
+    Where there is no model, COLMAP finds the poses of the photographs. The output folder gets scene.ply,
+    meshes, metrics.json, report.html, renders of the held-out views and checkpoints. Ctrl-C stops after
+    writing a checkpoint; the same command with --resume goes on.
+    """
+
+    source: Annotated[Path, Positional("SCENE")] = Field(description="The folder of the photographs.")
+    output: Output = Field(description="Folder for the results.")
+    resume: bool = Field(
+        False,
+        description="Go on with the run in the output folder, if there is one; without other options its own "
+        "settings are taken.",
+    )
+
+
+class ReconstructResult(Result):
+    """A finished run.
+
+    Attributes:
+        metrics: what was measured, as ``metrics.json`` holds it.
+        scene: the Gaussians.
+        report: the page that shows what was measured.
+        summary: sentences about the run.
+    """
+
+    metrics: Mapping[str, Any] = {}
+    scene: Path
+    report: Path
+    summary: tuple[str, ...] = ()
+
+    @property
+    def config(self) -> "ReconstructionConfig":
+        """All settings of the run."""
+        from octasplat.engine.config import read_config
+
+        assert self.folder is not None
+        return read_config(self.folder / _CONFIG)
+
+    @property
+    def psnr(self) -> float | None:
+        """Mean PSNR of the held-out views in dB; None where there were none."""
+        value = self.metrics.get("mean", {}).get("psnr")
+        return None if value is None else float(value)
+
+    def lines(self) -> tuple[str, ...]:
+        """Return what was reached and where it is shown."""
+        return self.summary
+
+
+def options_of(asked: Mapping[str, Any]) -> ReconstructOptions:
+    """Return options from JSON.
+
+    Raises:
+        SettingsRefused: an option is unknown or out of range.
+    """
+    try:
+        return ReconstructOptions.model_validate(dict(asked))
+    except ValidationError as error:
+        raise SettingsRefused(refusals_of(error, ReconstructOptions)) from None
+
+
+def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
+    """Return the configuration of a run: that of the request or, to go on without options, the run's own.
+
+    Raises:
+        ConfigError: a setting cannot be used, or the run's settings cannot be read.
+    """
+    from octasplat.engine.config import read_config
+
+    given = request.model_fields_set - {"source", "output", "resume", "exports"}
+    if not request.resume or given or not (request.output / _CONFIG).exists():
+        return request.config()
+    config = read_config(request.output / _CONFIG)
+    if "exports" in request.model_fields_set:
+        config = config.model_copy(update={"exports": request.exports})
+    return config
+
+
+def run(
+    request: ReconstructRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+    on_step: "Watcher | None" = None,
+) -> ReconstructResult:
+    """Reconstruct a scene; see :class:`octasplat.engine.operations.base.Run`.
+
+    Args:
+        request: what to do.
+        progress: called with each event.
+        should_stop: asked now and then; True stops the run after a checkpoint.
+        threads: number of threads; 0 means all cores.
+        on_step: called with the training after each iteration; it must change nothing.
+
+    Raises:
+        OctasplatError: as :func:`octasplat.engine.pipeline.reconstruct` does.
+    """
+    from octasplat.engine.evaluate.summary import run_summary
+    from octasplat.engine.pipeline import reconstruct
+    from octasplat.engine.stages import stopping
+
+    config = run_config(request)
+    output = request.output
+    reconstruct(
+        request.source,
+        output,
+        config,
+        resume=request.resume,
+        threads=threads,
+        listener=stopping(progress, should_stop),
+        should_stop=should_stop,
+        watch=on_step,
+    )
+    return ReconstructResult(
+        files=tuple(output / name for name in (_SCENE, *config.exports, _METRICS, _REPORT)),
+        folder=output,
+        metrics=json.loads((output / _METRICS).read_text(encoding="utf-8")),
+        scene=output / _SCENE,
+        report=output / _REPORT,
+        summary=tuple(run_summary(output, config.exports)),
+    )
+
+
+OPERATION = Operation(
+    "reconstruct",
+    "Photographs to a scene, its meshes, and measurements.",
+    ReconstructRequest,
+    ReconstructOptions,
+    run,
+)

@@ -1,0 +1,64 @@
+"""What decides a reconstruction beside its training; imports nothing heavy."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from octasplat.engine.export_names import ExportNames
+from octasplat.engine.fields import ADVANCED, BASIC, Spelling, Unit
+from octasplat.engine.train.preset_names import PresetName
+
+
+class RunSettings(BaseModel):
+    """What decides a reconstruction beside the settings of its training."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    preset: Annotated[PresetName, BASIC] = Field(
+        "standard",
+        description="Where the settings of the training come from: fast is a first look, standard is "
+        "better, high is better yet and takes about three times as many iterations, paper has the published "
+        "settings.",
+    )
+    max_side: Annotated[int | None, Unit("px"), BASIC] = Field(
+        None,
+        ge=16,
+        description="Longest side to which photographs are shrunk; by default they keep their size. Set it "
+        "for a quick try, or where memory is short.",
+    )
+    test_every: Annotated[int, Unit("views"), BASIC] = Field(
+        8,
+        ge=0,
+        description="Every how-manieth view by name is held out to be measured; 0 holds out none, so that "
+        "all are trained on.",
+    )
+    held_out: Annotated[tuple[str, ...] | None, Spelling(metavar="NAME"), ADVANCED] = Field(
+        None, description="Names of the views to hold out instead of every how-manieth."
+    )
+    poses: Annotated[Literal["given", "auto", "missing"], BASIC] = Field(
+        "missing",
+        description="Where the poses of the cameras come from: given takes the COLMAP model of the dataset "
+        "(photographs far from where matches put them are moved, see place_misfits); auto finds the poses, "
+        "by COLMAP's features, matching and mapping; missing does so only where the dataset holds no model.",
+    )
+    masks: Annotated[Literal["ignore", "alpha"], ADVANCED] = Field(
+        "ignore",
+        description="What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as "
+        "the alpha, for objects that are cut out.",
+    )
+    evaluate_background: Annotated[Literal["black", "white"], Spelling(("--background",)), ADVANCED] = Field(
+        "black",
+        description="What lies behind renders and photographs with alpha when they are compared.",
+    )
+    minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
+        None,
+        ge=0.1,
+        le=100_000,
+        description="Time in which the training is to end, which decides its iterations and Gaussians by the "
+        "pace of the machine that begins it; by default the other settings do.",
+    )
+    exports: Annotated[ExportNames, Spelling(metavar="NAMES"), BASIC] = Field(
+        ("mesh.ply", "mesh.obj", "mesh.glb"),
+        max_length=100,
+        description="Files to write besides scene.ply; their names say the format.",
+    )
