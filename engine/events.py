@@ -73,7 +73,7 @@ class TrainingProgress(Event):
 
 @dataclass(frozen=True)
 class HeldOutMeasured(Event):
-    """Mean PSNR over the held-out views at ``iteration``, in dB."""
+    """PSNR of rays spread over the held-out views at ``iteration``, their errors pooled, in dB."""
 
     kind: ClassVar[str] = "held_out_measured"
     iteration: int

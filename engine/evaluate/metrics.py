@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import flip_evaluator
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 from scipy.ndimage import correlate1d
 
 from octasplat.engine.colour import to_bytes
@@ -39,11 +39,13 @@ DEFINITIONS: dict[str, str] = {
     "flip": "mean LDR-FLIP at 67 pixels per degree; 0 is best",
     "depth_spread": "share of the covered pixels whose mean and median depth differ by more than a tenth: "
     "haze, clouds and strokes before or behind the surfaces; 0 is best",
-    "images": "renders and references are rounded to 8 bits first; pixels that a mask rules out do not count "
-    "in PSNR and are replaced by the reference's in the other metrics",
+    "images": "renders and references are rounded to 8 bits first; pixels that a mask rules out do not "
+    "count, and in the neighbourhood of others they show what the reference shows",
     "training_views": "PSNR of the views that were trained on, on a fixed grid of 576 pixels of each, "
     "rendered as held-out ones are; misfits are views far worse than those around them",
-    "mean": "the mean of the per-view values, not of pooled errors",
+    "mean": "the mean of the per-view values, not of pooled errors, over the views that have a finite one",
+    "mean_left_out": "how many views each mean leaves out: perfect ones, wholly masked ones, and those too "
+    "small for the metric",
     "mean_psnr_ci95": "95 % bootstrap interval of the mean PSNR over the views",
 }
 """What each key of ``metrics.json`` means."""
@@ -75,55 +77,87 @@ def filled_outside(
     return np.asarray(render * w + reference * (1 - w), dtype=np.float32)
 
 
-def ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float:
+def ssim(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"] | None = None,
+) -> float:
     """SSIM as in 3D Gaussian Splatting: windows reach over the border, where the images count as black."""
-    return ssim_both(render, reference)[0]
+    return ssim_both(render, reference, weight)[0]
 
 
-def ssim_valid(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float:
+def ssim_valid(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"] | None = None,
+) -> float:
     """SSIM as first published: only windows that lie wholly inside the image count.
 
     Not-a-number when the image is smaller than the window of 11 pixels.
     """
-    return ssim_both(render, reference)[1]
+    return ssim_both(render, reference, weight)[1]
 
 
 def ssim_both(
-    render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"] | None = None,
 ) -> tuple[float, float]:
-    """``ssim`` and ``ssim_valid`` from one filtering, since the second is the inner part of the first."""
+    """Return ``ssim`` and ``ssim_valid`` from one filtering, since the second is the inner part of the first.
+
+    With ``weight``, how much each pixel counts, the means are over the windows around pixels that do;
+    not-a-number where none does.
+    """
     luminance, structure = _similarity(render.astype(np.float64), reference.astype(np.float64))
     similarity = luminance * structure
     inner = _inner(similarity)
-    return float(similarity.mean()), float(inner.mean()) if inner.size else float("nan")
+    if weight is None or (weight == 1).all():
+        return float(similarity.mean()), float(inner.mean()) if inner.size else float("nan")
+    valid = float(_means(inner, _inner(weight)).mean()) if inner.size else float("nan")
+    return float(_means(similarity, weight).mean()), valid
 
 
-def ms_ssim(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> float | None:
+def ms_ssim(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"] | None = None,
+) -> float | None:
     """Multi-scale SSIM over five scales, windows wholly inside.
 
-    Negative means are cut to 0, per channel and scale, and the channels averaged last.
+    Negative means are cut to 0, per channel and scale, and the channels averaged last. With ``weight`` the
+    means are over the windows around pixels that count; a pixel of a coarser scale counts by the mean of
+    those that it is made of.
 
     Returns:
-        The index, or ``None`` when the smaller side is 160 pixels or less, too small for the fifth scale.
+        The index, or ``None`` when the smaller side is 160 pixels or less, too small for the fifth scale, or
+        when no window counts at some scale.
     """
     if min(render.shape[:2]) <= (WINDOW - 1) * 2 ** (len(MS_SSIM_WEIGHTS) - 1):
         return None
     x, y = render.astype(np.float64), reference.astype(np.float64)
+    counts = np.ones((*render.shape[:2], 1)) if weight is None else weight[..., None].astype(np.float64)
+    is_whole = bool((counts == 1).all())
     product = np.ones(3)
     for scale, exponent in enumerate(MS_SSIM_WEIGHTS):
         luminance, structure = _similarity(x, y)
         last = scale == len(MS_SSIM_WEIGHTS) - 1
-        mean = _inner(luminance * structure if last else structure).mean(axis=(0, 1))
+        values = _inner(luminance * structure if last else structure)
+        mean = values.mean(axis=(0, 1)) if is_whole else _means(values, _inner(counts)[..., 0])
         product *= np.maximum(mean, 0.0) ** exponent
         if not last:
-            x, y = _halved(x), _halved(y)
-    return float(product.mean())
+            x, y, counts = _halved(x), _halved(y), _halved(counts)
+    return float(product.mean()) if np.isfinite(product).all() else None
 
 
-def flip(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h w 3"]) -> FlipError:
+def flip(
+    render: Float32[np.ndarray, "h w 3"],
+    reference: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"] | None = None,
+) -> FlipError:
     """LDR-FLIP: what a viewer notices when the two images alternate.
 
-    Computed by NVIDIA's own library for a screen of 67 pixels per degree.
+    Computed by NVIDIA's own library for a screen of 67 pixels per degree. With ``weight`` the mean is over
+    the pixels that count, not-a-number where none does.
     """
     error, _, _ = flip_evaluator.evaluate(
         np.ascontiguousarray(reference, dtype=np.float32),
@@ -134,7 +168,9 @@ def flip(render: Float32[np.ndarray, "h w 3"], reference: Float32[np.ndarray, "h
         parameters={"ppd": PIXELS_PER_DEGREE},
     )
     error = np.asarray(error, dtype=np.float32).reshape(render.shape[:2])
-    return FlipError(error, float(error.mean(dtype=np.float64)))
+    if weight is None or (weight == 1).all():
+        return FlipError(error, float(error.mean(dtype=np.float64)))
+    return FlipError(error, float(_means(error[..., None].astype(np.float64), weight)[0]))
 
 
 def _gaussian_window() -> Float64[np.ndarray, "taps"]:
@@ -163,15 +199,25 @@ def _similarity(
     return luminance, structure
 
 
-def _inner(values: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "a b 3"]:
+def _means(
+    values: Float64[np.ndarray, "h w c"], weight: Float[np.ndarray, "h w"]
+) -> Float64[np.ndarray, "c"]:
+    """Return the weighted mean of each channel; not-a-number where the weights are 0."""
+    total = float(weight.sum(dtype=np.float64))
+    if total <= 0:
+        return np.full(values.shape[-1], np.nan)
+    return np.asarray((values * weight[..., None]).sum(axis=(0, 1)) / total)
+
+
+def _inner(values: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "a b *c"]:
     reach = WINDOW // 2
     return values[reach : values.shape[0] - reach, reach : values.shape[1] - reach]
 
 
-def _halved(image: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "a b 3"]:
+def _halved(image: Float64[np.ndarray, "h w c"]) -> Float64[np.ndarray, "a b c"]:
     """Means of 2x2 blocks; odd sides get a black line before them, which counts as image."""
     odd = [(side % 2, 0) for side in image.shape[:2]]
     even = np.pad(image, [*odd, (0, 0)])
     # The reference implementation pads both sides and floors, which drops the padding at the far end.
     h, w = even.shape[0] // 2, even.shape[1] // 2
-    return np.asarray(even.reshape(h, 2, w, 2, 3).mean(axis=(1, 3)))
+    return np.asarray(even.reshape(h, 2, w, 2, -1).mean(axis=(1, 3)))

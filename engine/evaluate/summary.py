@@ -33,7 +33,9 @@ def mean_metrics(metrics: dict[str, Any]) -> str:
         return "No views were held out, so nothing was measured."
     mean = metrics["mean"]
     known = [form.format(mean[key]) for key, form in _METRICS if mean.get(key) is not None]
-    return f"Mean over {count} held-out view{'s' if count > 1 else ''}: {', '.join(known)}"
+    left_out = metrics.get("mean_left_out", {}).get("psnr", 0)
+    without = f" ({left_out} perfect or wholly masked left out)" if left_out else ""
+    return f"Mean over {count} held-out view{'s' if count > 1 else ''}{without}: {', '.join(known)}"
 
 
 def measured_summary(path: Path) -> list[str]:

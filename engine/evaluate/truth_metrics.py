@@ -137,8 +137,9 @@ def environment_errors(
 
 
 def mean_of(values: Sequence[float]) -> float | None:
-    """Mean of numbers; None of none."""
-    return float(np.mean(values)) if values else None
+    """Return the mean of the numbers that are finite; None where none is."""
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else None
 
 
 def depth_along_axis(

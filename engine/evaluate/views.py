@@ -55,7 +55,7 @@ class ViewMetrics:
     """The metrics of one view; see ``metrics.DEFINITIONS``.
 
     ``psnr`` is infinite for a perfect render and not-a-number when the mask leaves no pixel. Metrics that the
-    view is too small for, or has no foreground for, are ``None``.
+    view is too small for, has no foreground for, or of which the mask leaves nothing are ``None``.
     """
 
     name: str
@@ -63,10 +63,10 @@ class ViewMetrics:
     height: int
     psnr: float
     psnr_colour_corrected: float
-    ssim: float
+    ssim: float | None
     ssim_valid: float | None
     ms_ssim: float | None
-    flip: float
+    flip: float | None
     psnr_foreground: float | None = None
     depth_spread: float | None = None
 
@@ -84,12 +84,14 @@ class Metrics:
 
     Attributes:
         views: In the order in which they came.
-        mean: Mean over the views that have the metric, by key; ``None`` when none has.
+        mean: Mean over the views of which the metric is finite, by key; ``None`` when none is.
+        left_out: Of how many views it is not, by key, where there are any.
         mean_psnr_ci95: 95 % bootstrap interval of the mean PSNR over the views.
     """
 
     views: tuple[ViewMetrics, ...]
     mean: dict[str, float | None]
+    left_out: dict[str, int]
     mean_psnr_ci95: tuple[float, float] | None
 
     def as_dict(self, run: Mapping[str, object]) -> dict[str, object]:
@@ -112,6 +114,7 @@ class Metrics:
         interval = self.mean_psnr_ci95
         return {
             "mean": {key: _finite(value) for key, value in self.mean.items()},
+            **({"mean_left_out": self.left_out} if self.left_out else {}),
             "mean_psnr_ci95": None if interval is None else [_finite(bound) for bound in interval],
             "views": views,
             "definitions": dict(DEFINITIONS),
@@ -123,7 +126,7 @@ def measure_view(view: RenderedView) -> MeasuredView:
     """All metrics of one view.
 
     Render and reference are rounded to 8 bits first, as they would be in files. Pixels that the weight rules
-    out do not count in PSNR; in the metrics that look at neighbourhoods they are replaced by the reference's.
+    out do not count; where metrics look at the neighbourhood of others, they show what the reference shows.
 
     Raises:
         DatasetError: Render and reference differ in size, or the render has pixels that are no number.
@@ -138,8 +141,8 @@ def measure_view(view: RenderedView) -> MeasuredView:
     reference = rounded_to_8_bits(view.reference)
     render = rounded_to_8_bits(view.render)
     filled = filled_outside(render, reference, view.weight)
-    padded, valid = ssim_both(filled, reference)
-    flip_map, mean_flip = flip(filled, reference)
+    padded, valid = ssim_both(filled, reference, view.weight)
+    flip_map, mean_flip = flip(filled, reference, view.weight)
     height, width = view.weight.shape
     metrics = ViewMetrics(
         name=view.name,
@@ -147,10 +150,10 @@ def measure_view(view: RenderedView) -> MeasuredView:
         height=height,
         psnr=psnr(render, reference, view.weight),
         psnr_colour_corrected=psnr(colour_corrected(render, reference, view.weight), reference, view.weight),
-        ssim=padded,
-        ssim_valid=None if math.isnan(valid) else valid,
-        ms_ssim=ms_ssim(filled, reference),
-        flip=mean_flip,
+        ssim=_known(padded),
+        ssim_valid=_known(valid),
+        ms_ssim=ms_ssim(filled, reference, view.weight),
+        flip=_known(mean_flip),
         psnr_foreground=_psnr_foreground(render, reference, view.weight, view.alpha),
         depth_spread=view.depth_spread,
     )
@@ -175,7 +178,7 @@ def depth_spread(depth: Float32[np.ndarray, "h w"], depth_median: Float32[np.nda
 
 
 def summarise(views: Iterable[ViewMetrics]) -> Metrics:
-    """Means over views, each metric over those that have it.
+    """Return means over views, each metric over those of which it is finite.
 
     Raises:
         DatasetError: Two views share a name.
@@ -187,8 +190,10 @@ def summarise(views: Iterable[ViewMetrics]) -> Metrics:
         raise DatasetError(f"Two measured views are named {twice}; names must differ.")
     keys = ["psnr", "psnr_colour_corrected", "ssim", "ssim_valid", "ms_ssim", "flip"]
     keys += [key for key in OPTIONAL if any(getattr(row, key) is not None for row in rows)]
-    mean = {key: _mean([getattr(row, key) for row in rows]) for key in keys}
-    return Metrics(rows, mean, bootstrap_interval([row.psnr for row in rows]))
+    finite = {key: [value for row in rows if _is_finite(value := getattr(row, key))] for key in keys}
+    mean = {key: sum(values) / len(values) if values else None for key, values in finite.items()}
+    left_out = {key: len(rows) - len(values) for key, values in finite.items() if len(values) < len(rows)}
+    return Metrics(rows, mean, left_out, bootstrap_interval([row.psnr for row in rows]))
 
 
 def bootstrap_interval(
@@ -217,12 +222,15 @@ def _psnr_foreground(
     if alpha is None:
         return None
     value = psnr(render, reference, np.where(alpha > FOREGROUND_ALPHA, weight, np.float32(0)))
+    return _known(value)
+
+
+def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None and not math.isnan(value)]
-    return sum(known) / len(known) if known else None
+def _is_finite(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
 
 
 def _finite(value: object) -> object:

@@ -33,8 +33,6 @@ from octasplat.engine.trace.protocol import GaussianGradients, TraceGradients, T
 
 AMBIENT_COLUMN = 5
 BOUNCED_COLUMNS = slice(6, 9)
-TURNS = 1 << 20
-"""So finely the share of the training that is done says whose turn it is."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +77,7 @@ class Deferred:
         self._leaving = Leaving(self._gap, settings.leaves * extent_world)
         self._leaving_far = self._leaving._replace(gap_world=2 * self._gap)
         self._started_over = np.zeros(1, bool)
+        self._turn = np.array([-1.0, -1.0])
         self._features: Float32[np.ndarray, "n f"] = np.empty((0, 5), np.float32)
 
     def features(self, gaussians: FlatGaussians) -> Float32[np.ndarray, "n f"]:
@@ -93,8 +92,9 @@ class Deferred:
         if not settings.ambient or progress < settings.secondary_from or AMBIENT not in gaussians.channels:
             return
         parts = settings.ambient_parts
-        turn = int(progress * TURNS) * 7919 % parts
-        ids = np.arange(turn, len(gaussians), parts)
+        if progress != self._turn[1]:  # a training that goes on settles once more where it stopped
+            self._turn = np.array([self._turn[0] + 1, progress])
+        ids = np.arange(int(self._turn[0]) % parts, len(gaussians), parts)
         self.bounce(gaussians, ids, self.look_around(gaussians, ids, tracer), tracer)
 
     def look_around(
@@ -275,12 +275,13 @@ class Deferred:
     def state(self) -> dict[str, np.ndarray]:
         """The environment."""
         own = {f"materials.{name}": value for name, value in self.light.state().items()}
-        return {**own, "materials.started_over": self._started_over}
+        return {**own, "materials.started_over": self._started_over, "materials.turn": self._turn}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Take it back."""
         own = {name.removeprefix("materials."): value for name, value in state.items()}
         self._started_over = own["started_over"].copy()
+        self._turn = own["turn"].copy()
         self.light.restore(own)
 
     def _dimmed(self, seen: TraceResult, buffer: Buffer) -> Surface:

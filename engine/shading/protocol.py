@@ -104,8 +104,9 @@ class ShadingModel(Protocol):
     def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
         """Look around in the scene of which ``tracer`` has just built the hierarchy.
 
-        Channels of the Gaussians, and the features, may be changed: to what follows from their geometry and
-        ``progress`` alone, so that a training that goes on finds the same.
+        Channels of the Gaussians, and the features, may be changed: to what follows from their geometry,
+        ``progress`` and :meth:`state` alone, and no further by a second call with the same ``progress``, so
+        that a training that goes on finds the same.
         """
         ...
 

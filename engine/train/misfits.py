@@ -23,6 +23,8 @@ TILES = 3
 LEAST_VIEWS = 6
 """Among fewer views nobody can say which of them is odd."""
 NEIGHBOURS = 8
+DISTANCES_AT_ONCE = 1 << 22
+"""Distances between views are found in blocks of so many; 2,048 views fit into one."""
 MOST_DB = 100.0
 """A view that is shown without an error counts as so many."""
 FAR_BELOW_DB, FAR_BELOW_SIGMAS = 3.0, 5.0
@@ -110,19 +112,33 @@ def _around(
     counts: Bool[np.ndarray, " v"],
     views: Sequence[View],
 ) -> Float64[np.ndarray, " v"]:
-    """The middle of the PSNR of the nearest views of each among those that count, dB.
+    """Return the middle of the PSNR of the nearest views of each among those that count, dB.
 
-    Near are views from near places that look the same way.
+    Near are views from near places that look the same way. Of many views only a block of distances is held
+    at once, and the usual distance is that of evenly spaced views from all others.
     """
     origins = np.stack([views[i].origin_world for i in indices.tolist()])
     forward = np.stack([views[i].rotation_cam_from_world[2] for i in indices.tolist()])
-    away = np.linalg.norm(origins[:, None] - origins, axis=2)
-    away = away / max(float(np.median(away)), 1e-12) + (1 - forward @ forward.T)
-    away[:, ~counts] = np.inf
-    np.fill_diagonal(away, np.inf)
+    total = len(origins)
+    rows = max(1, DISTANCES_AT_ONCE // total)
+    some = np.unique(np.linspace(0, total - 1, min(rows, total)).astype(np.int64))
+    usual = max(float(np.median(_apart(origins[some], origins))), 1e-12)
     others = min(NEIGHBOURS, int(counts.sum()) - 1)
-    nearest = np.argsort(away, axis=1, kind="stable")[:, :others]
-    return np.asarray(np.median(psnr[nearest], axis=1))
+    result = np.empty(total)
+    for start in range(0, total, rows):
+        part = slice(start, start + rows)
+        away = _apart(origins[part], origins) / usual + (1 - forward[part] @ forward.T)
+        away[:, ~counts] = np.inf
+        away[np.arange(len(away)), np.arange(total)[part]] = np.inf
+        nearest = np.argsort(away, axis=1, kind="stable")[:, :others]
+        result[part] = np.median(psnr[nearest], axis=1)
+    return result
+
+
+def _apart(
+    some: Float64[np.ndarray, "s 3"], others: Float64[np.ndarray, "v 3"]
+) -> Float64[np.ndarray, "s v"]:
+    return np.asarray(np.linalg.norm(some[:, None] - others, axis=2))
 
 
 @dataclass(frozen=True)

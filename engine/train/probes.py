@@ -18,12 +18,23 @@ from octasplat.engine.train.shading import exposures_of
 from octasplat.engine.train.state import TrainState
 from octasplat.engine.train.view_grids import guess_exposures
 
-EMPTY_ALPHA = 0.01
+EMPTY_SHARE = 0.01
+"""A state that covers less than this share of what the photographs cover is broken."""
 
 
 @dataclass(frozen=True)
 class Probe:
-    """Random pixels of some views, over a background."""
+    """Random pixels of some views, over a background.
+
+    Attributes:
+        view: of each pixel.
+        y: row.
+        x: column.
+        rgb_srgb: what the photograph shows there, over the background.
+        weight: 0 where a mask rules the pixel out.
+        background_srgb: the background.
+        alpha: mean coverage of the photographs at the pixels that count.
+    """
 
     view: Int64[np.ndarray, " r"]
     y: Int64[np.ndarray, " r"]
@@ -31,6 +42,7 @@ class Probe:
     rgb_srgb: Float32[np.ndarray, "r 3"]
     weight: Float32[np.ndarray, " r"]
     background_srgb: Float32[np.ndarray, "3"]
+    alpha: float
 
 
 def draw_probe(
@@ -43,13 +55,17 @@ def draw_probe(
     """Draw ``count`` pixels of the views ``indices``."""
     view, y, x = PixelSampler(indices, view_sizes_px(dataset)).pixels(rng, count)
     rgb, alpha, weight = dataset.pixels(view, y, x)
-    return Probe(view, y, x, composited(rgb, alpha, background_srgb), weight, background_srgb)
+    covered = float(np.average(alpha, weights=weight)) if weight.any() else 0.0
+    return Probe(view, y, x, composited(rgb, alpha, background_srgb), weight, background_srgb, covered)
 
 
 def measure(
     probe: Probe, dataset: TrainingData, tracer: Tracer, shading: ShadingModel
 ) -> tuple[float, float]:
-    """PSNR averaged over the views, dB, and the mean accumulated alpha.
+    """Return the PSNR of all rays that count together, dB, and the mean accumulated alpha.
+
+    Errors are pooled, as few rays fall on each view: in one of which they show nothing but background there
+    is no error, and the mean of the views' dB would be that of the empty ones.
 
     All are seen as new views are, but exposed as each is known or guessed to be where exposures are learnt.
     """
@@ -59,11 +75,8 @@ def measure(
     developed = shading.develop(Sight(rays, seen, tracer, view))
     render = np.clip(developed.over(probe.background_srgb), 0, 1)
     error = ((render - probe.rgb_srgb) ** 2).mean(axis=1) * probe.weight
-    views, inverse = np.unique(probe.view, return_inverse=True)
-    sums = np.bincount(inverse, weights=error, minlength=len(views))
-    counts = np.bincount(inverse, weights=probe.weight, minlength=len(views))
-    used = counts > 0
-    psnr = float(np.mean([decibels(value) for value in sums[used] / counts[used]])) if used.any() else 0.0
+    count = float(probe.weight.sum(dtype=np.float64))
+    psnr = decibels(float(error.sum(dtype=np.float64)) / count) if count > 0 else 0.0
     return psnr, float(seen.alpha.mean())
 
 
@@ -121,10 +134,11 @@ class Judge:
             )
         guess_exposures(self._dataset, self._background_srgb, tracer, shading)
         psnr, alpha = measure(self._probe, self._dataset, tracer, shading)
-        if alpha < EMPTY_ALPHA and state.iteration > 0:
+        if alpha < EMPTY_SHARE * self._probe.alpha and state.iteration > 0:
             raise TrainingFailure(
-                f"After iteration {state.iteration} the scene covers only {100 * alpha:.2f} % of the "
-                "photographs; nothing is exported. Check that poses and photographs belong together."
+                f"After iteration {state.iteration} the scene covers only {100 * alpha:.2g} % of the "
+                f"photographs, of which {100 * self._probe.alpha:.2g} % show something; nothing is exported. "
+                "Check that poses and photographs belong together."
             )
         state.probed.append((state.iteration, psnr))
         if psnr > state.best_psnr:

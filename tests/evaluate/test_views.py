@@ -5,6 +5,7 @@ import pytest
 
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.evaluate import metrics
+from octasplat.engine.evaluate.summary import mean_metrics
 from octasplat.engine.evaluate.views import RenderedView, bootstrap_interval, measure_view, summarise
 from octasplat.engine.psnr import colour_corrected, psnr
 
@@ -89,7 +90,11 @@ def test_the_json_has_its_documented_layout():
     content = summarise(rows).as_dict(run)
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     keys = {"psnr", "psnr_colour_corrected", "ssim", "ssim_valid", "ms_ssim", "flip", "psnr_foreground"}
-    assert set(content) == {"mean", "mean_psnr_ci95", "views", "definitions", *run}
+    assert set(content) == {"mean", "mean_left_out", "mean_psnr_ci95", "views", "definitions", *run}
+    assert content["mean_left_out"] == {
+        "psnr": 1, "psnr_colour_corrected": 1, "ms_ssim": 1, "psnr_foreground": 1
+    }  # fmt: skip
+    assert content["mean"]["psnr"] == content["views"]["a.jpg"]["psnr"]
     assert set(content["mean"]) == keys
     assert list(content["views"]) == ["a.jpg", "sub/b.jpg"]
     assert set(content["views"]["a.jpg"]) == keys | {"width", "height"}
@@ -101,7 +106,41 @@ def test_the_json_has_its_documented_layout():
 def test_a_view_without_valid_pixels_does_not_spoil_the_mean():
     empty = view("b.jpg", weight=np.zeros((30, 40), np.float32))
     rows = [measure_view(one).metrics for one in (view(), empty)]
-    assert summarise(rows).mean["psnr"] == rows[0].psnr
+    summary = summarise(rows)
+    for key in ("psnr", "ssim", "ssim_valid", "flip"):
+        assert summary.mean[key] == getattr(rows[0], key)
+        assert summary.left_out[key] == 1
+    assert (rows[1].ssim, rows[1].ssim_valid, rows[1].ms_ssim, rows[1].flip) == (None, None, None, None)
+
+
+def test_a_perfect_view_is_left_out_of_the_mean_and_counted():
+    rows = [measure_view(one).metrics for one in (view("a.jpg"), view("b.jpg", 0.0), view("c.jpg", 0.05))]
+    summary = summarise(rows)
+    assert summary.mean["psnr"] == pytest.approx((rows[0].psnr + rows[2].psnr) / 2)
+    assert summary.left_out == {"psnr": 1, "psnr_colour_corrected": 1, "ms_ssim": 3}
+    content = summary.as_dict({})
+    assert content["views"]["b.jpg"]["psnr"] is None and content["mean"]["psnr"] is not None
+    assert mean_metrics(content).startswith(
+        "Mean over 3 held-out views (1 perfect or wholly masked left out)"
+    )
+
+
+@pytest.mark.parametrize("masked", [0.25, 0.5, 0.9])
+def test_a_mask_makes_an_even_error_look_no_better(masked):
+    rng = np.random.default_rng(4)
+    size = (400, 400)
+    reference = np.full((*size, 3), 0.5, np.float32) + rng.normal(0, 0.05, (*size, 3)).astype(np.float32)
+    render = reference + rng.normal(0, 0.05, (*size, 3)).astype(np.float32)
+    whole = RenderedView("a.jpg", render, reference, np.ones(size, np.float32))
+    weight = np.ones(size, np.float32)
+    weight[: int(masked * size[0])] = 0
+    one, other = (measure_view(each).metrics for each in (whole, whole._replace(weight=weight)))
+    assert other.psnr == pytest.approx(one.psnr, abs=0.1)
+    # Windows at the rim of the mask see the reference on one side: 3 of the 40 rows left, a little each.
+    assert other.ssim == pytest.approx(one.ssim, abs=0.02)
+    assert other.ssim_valid == pytest.approx(one.ssim_valid, abs=0.02)
+    assert other.ms_ssim is None or other.ms_ssim == pytest.approx(one.ms_ssim, abs=0.05)
+    assert other.flip == pytest.approx(one.flip, rel=0.1)
 
 
 def test_the_interval_holds_the_mean_narrows_with_views_and_repeats():

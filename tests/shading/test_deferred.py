@@ -240,6 +240,32 @@ def test_ambient_visibility_under_a_lid_is_its_form_factor() -> None:
     assert found[0] == pytest.approx(1 - radius**2 / (radius**2 + 1), abs=0.05)
 
 
+@pytest.mark.parametrize("rebuilds", [128, 100, 64, 20])
+def test_every_gaussian_has_its_turn_of_ambient_visibility(
+    rebuilds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = MaterialSettings(learn=True, ambient_parts=20, secondary_from=0.0)
+    gaussians = with_first_materials(wall((0, 0, 1), floor(2, 0.25), [0.5, 0.5, 0.5, 0, 0.5]), settings)
+    looked: list[np.ndarray] = []
+
+    def look_around(model: Deferred, gaussians: FlatGaussians, ids: np.ndarray, tracer: object) -> np.ndarray:
+        looked.append(ids)
+        return np.ones(len(ids), np.float32)
+
+    monkeypatch.setattr(Deferred, "look_around", look_around)
+    monkeypatch.setattr(Deferred, "bounce", lambda *_: None)
+    model, tracer = Deferred(settings, extent_world=1.0), CpuTracer(TraceSettings())
+    for turn in range(20):
+        model.settle(gaussians, tracer, progress=turn / rebuilds)
+        if turn == 7:  # stopped and gone on with
+            again = Deferred(settings, extent_world=1.0)
+            again.restore(model.state())
+            model = again
+            model.settle(gaussians, tracer, progress=turn / rebuilds)
+            np.testing.assert_array_equal(looked.pop(), looked[-1])
+    assert sorted(np.concatenate(looked).tolist()) == list(range(len(gaussians)))
+
+
 def train(
     folder: Path, *, stop_after: int | None = None, threads: int = 1, recipe: str = "split_sum"
 ) -> tuple[Deferred, TrainState, list[float]]:

@@ -1,16 +1,21 @@
 """Photographs whose poses are wrong are found, named, and left out where that is asked for."""
 
 import json
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from octasplat.engine.config import resolve_config
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import CheckpointWritten, Event, Warned
 from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.scene import View
 from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.train import misfits as misfit_module
+from octasplat.engine.train.misfits import ViewFits, misfits
 
 SPOILED = ["view_010.png", "view_025.png"]
 SETTINGS = (
@@ -79,3 +84,32 @@ def test_exactly_those_of_wrong_poses_are_named_and_left_out(scene: Path, tmp_pa
     run(scene, tmp_path / "stopped", "leave_out_misfits=true")
     for name in ("scene.ply", "renders/view_008.png"):
         assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "without" / name).read_bytes()
+
+
+def views_of(count: int) -> list[View]:
+    """Views from random places that look along z."""
+    places = np.random.default_rng(0).standard_normal((count, 3))
+    return [View(f"{k}", 0, np.eye(3), -place, 8, 8, Path(f"{k}"), None) for k, place in enumerate(places)]
+
+
+def test_a_misfit_is_found_in_blocks_as_it_is_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, count = views_of(200), 200
+    psnr = 30 + np.random.default_rng(1).standard_normal(count)
+    psnr[[17, 140]] = 12
+    fits = ViewFits(np.arange(count), psnr, psnr)
+    at_once = misfits(fits, views, np.arange(count))
+    assert sorted(at_once.tolist()) == [17, 140]
+    monkeypatch.setattr(misfit_module, "DISTANCES_AT_ONCE", 1000)
+    np.testing.assert_array_equal(misfits(fits, views, np.arange(count)), at_once)
+
+
+def test_memory_grows_with_the_number_of_views_not_its_square() -> None:
+    count = 5000
+    views, psnr = views_of(count), np.full(count, 30.0)
+    psnr[1234] = 12
+    tracemalloc.start()
+    found = misfits(ViewFits(np.arange(count), psnr, psnr), views, np.arange(count))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found.tolist() == [1234]
+    assert peak < 400e6  # at once it would be 1.6 GB, and 16 times that for 20,000 views
