@@ -74,5 +74,11 @@ class Surface(OperationKind):
         return self.resolve({**presets, **kept, **changes})
 
     def places(self, task: Task, options: SurfaceJobOptions) -> dict[str, Path]:
-        """Return where a job reads and writes."""
-        return {**super().places(task, options), "output": task.results / f"surface.{options.format}"}
+        """Return where a job reads and writes.
+
+        Photographs are those of a whole run only: a scene alone may have been moved since.
+        """
+        places = {**super().places(task, options), "output": task.results / f"surface.{options.format}"}
+        if task.source != task.run:
+            places.pop("dataset", None)
+        return places
