@@ -10,6 +10,7 @@ from octasplat.engine.operations.base import Operation
 _MODULES = {
     "reconstruct": "reconstruct",
     "evaluate": "evaluate",
+    "info": "info",
     "surface": "surface",
     "material": "material",
     "render": "render",

@@ -13,7 +13,7 @@ from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.render.images import read_image
 from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds import kind_named
-from octasplat.workers.work.programs import relight
+from octasplat.workers.work.programs import run_operation
 from octasplat.workers.work.task import Task
 
 SIDE = (48, 64)
@@ -98,13 +98,13 @@ def test_a_job_relights_with_files_of_its_own(shiny_run, scene_with_truth, tmp_p
     kind = kind_named("relight")
     asked = {"environments": ["maps/day.hdr", "maps/dim.hdr"], "mode": "views", "format": "png", "samples": 1}
     options = kind.resolve(asked)
-    assert [name for _, name in kind.names_files(options)] == asked["environments"]
+    assert [name for _, name in kind.named_files(options)] == asked["environments"]
     size = Sizes(64, 48, 8)
     assert {demand.of: demand.amount for demand in kind.demands(options, [size])} == {
         "render_pixels": 2 * 8 * 64 * 48, "render_paths": 2 * 8 * 64 * 48,
         "workspace_bytes": round(0.4 * 2 * 8 * 64 * 48),
     }  # fmt: skip
-    relight(Task(tmp_path / "attempt", options.model_dump(mode="json"), threads=1))
+    run_operation(Task(tmp_path / "attempt", options.model_dump(mode="json"), threads=1, kind="relight"))
     views = tmp_path / "attempt" / "results" / "views"
     names = {path.relative_to(views).as_posix() for path in views.rglob("*.png")}
     assert names == {f"{light}/view_00{k}.png" for light in ("day", "dim") for k in (0, 4)}

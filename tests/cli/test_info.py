@@ -1,13 +1,18 @@
 """``octasplat info``: facts on a file or a run."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from octasplat.engine.operations.info import OPERATION, InfoRequest
 from octasplat.engine.render.images import read_image
+from octasplat.workers.work.kinds import kind_named
+from octasplat.workers.work.programs import run_operation
+from octasplat.workers.work.task import Task
 
 
 def test_facts_on_a_file_are_those_of_its_gaussians(run, octasplat, tmp_path):
@@ -41,3 +46,26 @@ def test_a_run_knows_its_photographs_and_has_a_picture(run, octasplat, tmp_path)
 def test_what_is_no_scene_is_one_sentence(octasplat, tmp_path):
     result = octasplat("info", tmp_path / "none.ply")
     assert result.exit_code == 1 and result.stderr.count("\n") == 1 and "none.ply" in result.stderr
+
+
+def test_a_job_and_a_request_tell_what_the_command_tells(run, octasplat, tmp_path):
+    done = octasplat("info", run.output, "--json", "--picture", tmp_path / "look.png", "--threads", 1)
+    facts = json.loads(done.stdout)
+    (tmp_path / "attempt" / "run").mkdir(parents=True)
+    kind = kind_named("info")
+    for name in kind.source_files:
+        if (run.output / name).exists():
+            shutil.copy(run.output / name, tmp_path / "attempt" / "run" / name)
+    heard = []
+    options = kind.resolve({}).model_dump(mode="json")
+    run_operation(Task(tmp_path / "attempt", options, threads=1, listener=heard.append, kind="info"))
+    results = tmp_path / "attempt" / "results"
+    assert sorted(path.name for path in results.iterdir()) == ["info.json", "picture.png"]
+    assert json.loads((results / "info.json").read_text()) == {**facts, "source": "the result"}
+    assert (results / "picture.png").read_bytes() == (tmp_path / "look.png").read_bytes()
+    assert any("the result: " in getattr(event, "message", "") for event in heard)
+
+    result = OPERATION.run(InfoRequest(source=run.output, output=tmp_path / "facts.json"), threads=1)
+    assert json.loads((tmp_path / "facts.json").read_text()) == facts
+    assert result.scene.count == facts["count"] and result.files == (tmp_path / "facts.json",)
+    assert result.lines() == tuple(octasplat("info", run.output).stdout.splitlines())

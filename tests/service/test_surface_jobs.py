@@ -48,7 +48,7 @@ def test_options_are_refused_with_the_sentence_of_the_command(conninfo: str, tmp
             assert made.status_code == 202, made.text
             options = made.json()["options"]
             assert options["unseen"] == "solid" and options["max_triangles"] == ["5000"]
-            for kind in ("evaluate",):
+            for kind in ("info", "evaluate"):
                 made = await http.post("/v1/jobs", json={"kind": kind, "source_id": source})
                 assert made.status_code == 202, made.text
 

@@ -4,7 +4,7 @@ import functools
 import types
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import annotated_types
 import click
@@ -26,6 +26,7 @@ from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import Stopped, orderly_termination, stop_on_signals
 
 Command = Callable[..., Any]
+ResultT = TypeVar("ResultT", bound=Result)
 
 
 def request_options(model: type[BaseModel], *, leave_out: Sequence[str] = ()) -> Callable[[Command], Command]:
@@ -98,8 +99,8 @@ def request_of(model: type[Any], given: dict[str, Any]) -> Any:
 
 
 def run_operation(
-    operation: Operation[Any, Any], request: Any, *, quiet: bool, threads: int = 0, stops: bool = False
-) -> Result:
+    operation: Operation[Any, ResultT], request: Any, *, quiet: bool, threads: int = 0, stops: bool = False
+) -> ResultT:
     """Do a request with its progress shown, print what came of it, and return it.
 
     Raises:
@@ -110,7 +111,7 @@ def run_operation(
         with stop_on_signals() as should_stop:
             try:
                 with show_progress(quiet=quiet, should_stop=should_stop) as progress:
-                    result: Result = operation.run(
+                    result = operation.run(
                         request, progress=progress, should_stop=should_stop, threads=threads
                     )
             except Cancelled as error:

@@ -24,7 +24,7 @@ from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.places import Places
 from octasplat.workers.work.preview import Previews
-from octasplat.workers.work.task import Task
+from octasplat.workers.work.task import FACTS, Task
 
 REPORT = "report.html"
 
@@ -112,7 +112,7 @@ def _publish(task: Task, path: Path, name: str) -> None:
     if name == CONFIG:  # where the photographs lay on this machine is nobody's business
         content = json.loads(path.read_text(encoding="utf-8"))
         write_json(target, {**content, "scene": task.title})
-    elif name in (EVENTS, REPORT):
+    elif name in (EVENTS, REPORT, FACTS):
         target.write_text(_places(task).named(path.read_text(encoding="utf-8")), encoding="utf-8")
     else:
         os.link(path, target)

@@ -16,6 +16,9 @@ SCENE_FILE, CONFIG_FILE = "scene.ply", "config.json"
 FRAMES = "frames"
 """In the engine's output, images of a render that are done; they are kept for later attempts."""
 
+FACTS = "info.json"
+"""The result that tells what is in a scene."""
+
 NO_SPACE = "no_space"
 """Type of the error of a job that met a full disk, which is no fault of its own."""
 EXIT_REFUSED = 1

@@ -10,6 +10,7 @@ from octasplat.engine.operations.crop import OPERATION as CROP
 from octasplat.engine.operations.deform import OPERATION as DEFORM
 from octasplat.engine.operations.edit import OPERATION as EDIT
 from octasplat.engine.operations.evaluate import OPERATION as EVALUATE
+from octasplat.engine.operations.info import OPERATION as INFO
 from octasplat.engine.operations.material import OPERATION as MATERIAL
 from octasplat.engine.operations.merge import OPERATION as MERGE
 from octasplat.engine.operations.reconstruct import OPERATION as RECONSTRUCT
@@ -39,6 +40,7 @@ from octasplat.workers.work.kinds.scene_kinds import (
 )
 from octasplat.workers.work.kinds.surface import Surface
 from octasplat.workers.work.kinds.table import register
+from octasplat.workers.work.task import FACTS, Task
 
 
 class Reconstruct(OperationKind):
@@ -112,6 +114,18 @@ class Evaluate(OperationKind):
         return options.model_copy(update={"all_views": True})
 
 
+class Info(OperationKind):
+    """What is in a scene."""
+
+    def places(self, task: Task, options: Any) -> dict[str, Any]:
+        """Return the scene and the files that tell what is in it; paths are taken out of the facts."""
+        return {
+            "source": task.source,
+            "output": task.folder / FACTS,
+            "picture": task.results / "picture.png",
+        }
+
+
 def register_all() -> None:
     """Register them."""
     register(
@@ -150,6 +164,14 @@ def register_all() -> None:
         )
     )
     register(SceneChange(MATERIAL, title="The scene of a reconstruction with other materials", first=LIGHT))
+    register(
+        Info(
+            INFO,
+            title="What is in the scene of a reconstruction: counts, bounds, sizes, cost",
+            stages=("read",),
+            source_files=(*RUN_FILES[:4], BACKGROUND),
+        )
+    )
     register(Surface())
     register(SceneChange(CROP))
     register(SceneChange(CLEAN))

@@ -1,0 +1,167 @@
+"""``info``: what is in a scene."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, InstanceOf
+
+from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES, QUANTILES, HitFacts, SceneFacts
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import DatasetFolder, Source, Spelling
+from octasplat.engine.operations.axes import Axis, axis_named
+from octasplat.engine.operations.base import Operation, Options, Request, Result, never
+
+_BAR = 24
+
+
+class InfoOptions(Options):
+    """How a scene is looked at."""
+
+    up: Axis | None = Field(None, description="The axis of a file that points up.  [default: -y]")
+
+
+class InfoRequest(InfoOptions, Request):
+    """Tell what is in IN, the folder of a run or a file of Gaussians in any splat format.
+
+    Counts, bounds, the direction that is up, harmonics, opacities, sizes, memory, and how many Gaussians a
+    ray meets. On a terminal it shows a small picture.
+    """
+
+    source: Source = Field(description="The scene to look at: the folder of a run, or a file of any format.")
+    dataset: DatasetFolder = Field(
+        None,
+        description="Take the cameras of the photographs in this folder.  [default: those the run keeps]",
+    )
+    picture: Annotated[Path | None, Spelling(metavar="FILE.png")] = Field(
+        None, description="Write a small picture of the scene, too."
+    )
+    output: Annotated[Path | None, Spelling(("-o", "--output"), metavar="FILE.json")] = Field(
+        None, description="Write everything as JSON, too."
+    )
+
+
+class InfoResult(Result):
+    """What is in a scene.
+
+    Attributes:
+        source: the file or the folder of the run.
+        size_bytes: of the file; None of a run.
+        photographs: how many the run was made from; None of a file.
+        up_world: the direction that points up; known of a run, a guess of a file.
+        scene: counts, bounds and sizes of the Gaussians.
+        hits: how many Gaussians the rays of the picture meet.
+        picture_srgb: the scene from the place of the run's first photograph, or from a turntable; display
+            values, of shape (height, width, 3).
+    """
+
+    source: Path
+    size_bytes: int | None
+    photographs: int | None
+    up_world: tuple[float, float, float]
+    scene: InstanceOf[SceneFacts]
+    hits: InstanceOf[HitFacts]
+    picture_srgb: InstanceOf[np.ndarray] = Field(repr=False)
+
+    def facts(self) -> dict[str, Any]:
+        """Return everything but the picture, as JSON values."""
+        scene = asdict(self.scene)
+        scene["seen"] = {
+            name: value.tolist() if hasattr(value, "tolist") else value
+            for name, value in scene["seen"].items()
+        }
+        return {
+            "source": str(self.source),
+            "photographs": self.photographs,
+            "up_world": list(self.up_world),
+            **scene,
+            "opacity_edges": OPACITY_EDGES,
+            "scale_quantiles_of": QUANTILES,
+            "hits": asdict(self.hits),
+        }
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the facts in words, and a histogram of the opacities."""
+        scene, hits = self.scene, self.hits
+        size = f", {self.size_bytes / 1e6:.1f} MB" if self.size_bytes else ""
+        made_from = f", a run of {self.photographs} photographs" if self.photographs else ""
+        channels = ", ".join(f"{name} ({width})" for name, width in scene.channels.items())
+        up = "of the photographs" if self.photographs else "as most files have it; --up says otherwise"
+        quantiles = " / ".join(f"{value:.3g}" for value in scene.scale_quantiles)
+        box, solid = scene.box, scene.box_solid
+        return (
+            f"{self.source}: {scene.count:,} Gaussians{size}{made_from}",
+            f"  memory      {scene.megabytes:.1f} MB, harmonics of degree {scene.sh_degree}"
+            + (f", channels {channels}" if channels else ""),
+            f"  up          {_vector(self.up_world)} ({up})",
+            f"  centres     {_vector(box.low_world)} to {_vector(box.high_world)}",
+            f"  solid part  {_vector(solid.low_world)} to {_vector(solid.high_world)}",
+            f"  seen        around {_vector(scene.seen.centre_world)}, "
+            f"{2 * scene.seen.half_height:.3g} high, {2 * scene.seen.radius:.3g} across",
+            f"  size        {quantiles} (larger deviation; 1, 10, 50, 90, 99 in 100)",
+            f"  shape       {scene.flatness_median:.2g} (smaller over larger deviation, median)",
+            f"  hits a ray  {hits.mean:.0f}, of one in 20 more than {hits.p95:.0f}; "
+            f"{100 * hits.share:.0f} % of the picture's rays meet any",
+            "  opacity",
+            *self._histogram(),
+        )
+
+    def _histogram(self) -> tuple[str, ...]:
+        counts = self.scene.opacity_counts
+        return tuple(
+            f"    {low:4.2f} to {high:4.2f}  {'#' * round(_BAR * count / max(counts)):<{_BAR}}  {count:,}"
+            for (low, high), count in zip(pairwise(OPACITY_EDGES), counts, strict=True)
+        )
+
+
+def run(
+    request: InfoRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> InfoResult:
+    """Look at a scene; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        ConfigError: the cameras of the photographs share no centre or no up direction.
+        SceneFileError: the scene cannot be read.
+        OutputError: there is no scene yet, or a file cannot be written.
+    """
+    from octasplat.engine.operations.render_source import open_stage_scene
+    from octasplat.engine.operations.scene_inspection import find_facts
+    from octasplat.engine.render.images import write_png
+    from octasplat.engine.writing import write_json
+
+    source = request.source
+    opened = open_stage_scene(source, progress, dataset=request.dataset, threads=threads)
+    found = find_facts(opened, None if request.up is None else axis_named(request.up))
+    x, y, z = found.up_world.tolist()
+    result = InfoResult(
+        files=tuple(path for path in (request.output, request.picture) if path is not None),
+        folder=None if request.output is None else request.output.parent,
+        source=source,
+        size_bytes=source.stat().st_size if source.is_file() else None,
+        photographs=found.photographs,
+        up_world=(x, y, z),
+        scene=found.scene,
+        hits=found.hits,
+        picture_srgb=found.picture_srgb,
+    )
+    if request.picture is not None:
+        write_png(request.picture, found.picture_srgb)
+    if request.output is not None:
+        write_json(request.output, result.facts())
+    return result
+
+
+def _vector(values: Any) -> str:
+    return " ".join(f"{value:.4g}" for value in values)
+
+
+OPERATION = Operation(
+    "info", "What is in a scene: counts, bounds, sizes, cost.", InfoRequest, InfoOptions, run
+)
