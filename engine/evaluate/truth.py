@@ -15,19 +15,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from octasplat.engine.colour import srgb_to_linear
 from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.relative_paths import checked_relative
 from octasplat.engine.render.images import read_image, resized
 
 TRUTH = "truth.json"
 _FORMULA = re.compile(r"\bv(?:/(\d+(?:\.\d+)?))?(?:\*(\d+(?:\.\d+)?))?([+-]\d+(?:\.\d+)?)?(?![\w*/+])")
 _AXES = {f"{sign}{name}": k for k, name in enumerate("xyz") for sign in ("+", "-", "")}
-
-
-def _inside(name: str) -> str:
-    """A path that stays below the folder of the file."""
-    path = PurePosixPath(name)
-    if not name or path.is_absolute() or ".." in path.parts:
-        raise ValueError("is no path below the folder of truth.json")
-    return name
 
 
 def _formula(text: str) -> str:
@@ -36,7 +29,7 @@ def _formula(text: str) -> str:
     return text
 
 
-_Path = Annotated[str, AfterValidator(_inside)]
+_Path = Annotated[str, AfterValidator(checked_relative)]
 _Formula = Annotated[str, AfterValidator(_formula)]
 
 

@@ -12,9 +12,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float, Int64
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.relative_paths import checked_relative
 from octasplat.engine.scene.cameras import Camera
 from octasplat.engine.scene.model import PosedView, SceneModel, SparsePoints, Viewpoints, scene_extent
 from octasplat.engine.scene.split import split_views
@@ -63,7 +64,7 @@ class _Camera(_Frozen):
 
 
 class _View(_Frozen):
-    name: str
+    name: Annotated[str, AfterValidator(checked_relative)]
     camera: Annotated[int, Field(ge=0)]
     rotation_cam_from_world: tuple[_Row, _Row, _Row]
     translation_cam_from_world: _Row

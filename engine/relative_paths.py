@@ -1,0 +1,20 @@
+"""Names in files from elsewhere that become paths: they may lead nowhere but below a folder."""
+
+from pathlib import PurePosixPath, PureWindowsPath
+
+
+def checked_relative(name: str) -> str:
+    """Return a relative path that stays below its folder on every system.
+
+    Raises:
+        ValueError: it is empty or absolute, names a drive, climbs, or holds a character that no path has.
+
+    >>> checked_relative("left/0001.jpg")
+    'left/0001.jpg'
+    """
+    paths = (PurePosixPath(name), PureWindowsPath(name))
+    climbs = any(".." in path.parts for path in paths)
+    elsewhere = any(path.is_absolute() or path.drive or path.root for path in paths)
+    if not name or not any(path.name for path in paths) or climbs or elsewhere or "\0" in name:
+        raise ValueError(f"{name[:60]!r} is no path below the folder of the file")
+    return name
