@@ -8,14 +8,15 @@ from jaxtyping import UInt8
 
 from octasplat.engine.colour import to_bytes
 from octasplat.engine.config import read_config
-from octasplat.engine.errors import DatasetError, OutputError
-from octasplat.engine.events import Listener
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.events import Listener, Noted, Warned
 from octasplat.engine.files import read_facts
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.cameras import RenderCamera
 from octasplat.engine.run_folder import (
     CONFIG,
+    VIEWS,
     found_model,
     is_run,
     open_photographs,
@@ -25,6 +26,7 @@ from octasplat.engine.run_folder import (
     run_viewpoints,
 )
 from octasplat.engine.scene import Dataset, load_scene
+from octasplat.engine.scene.views_file import ViewsRecord, read_views
 from octasplat.engine.shading.exposure import Exposures
 from octasplat.engine.surface.cameras import cameras_around, photograph_cameras
 from octasplat.engine.surface.fitting import Picture
@@ -70,25 +72,54 @@ def training_photographs(
         source: the folder of a run, or a file of Gaussians, which has none.
         dataset: the folder of the photographs; None takes the one that the run was made from.
         threads: for decoding; 0 takes all cores.
-        listener: hears the progress.
+        listener: hears the progress, and why there are none.
 
     Returns:
-        None of them where they are not on this machine, or show reflections that the surface does not.
+        None of them where they show reflections that the surface does not, or where none were named and those
+        of the run are not on this machine, cannot be read, or have other poses than the scene was made with.
+
+    Raises:
+        DatasetError: those that were named cannot be read, or have other poses.
+        OutputError: there is no room to decode them.
     """
     if not (is_run(source) and (source / CONFIG).exists()):
         return ()
     config = read_config(source / CONFIG)
     if config.train.materials.learn:
         return ()
+    instead = "Colours are those that the scene shows, not those of photographs"
     try:
         folder, model = photographs_folder(source, dataset), found_model(source)
-        opened = open_photographs(folder, source, config, threads, listener, model_folder=model)
-    except (DatasetError, OutputError):
+    except DatasetError as error:
+        listener(Noted(f"{instead}. {error}"))
+        return ()
+    try:
+        accept = partial(_check_world, source, folder)
+        opened = open_photographs(
+            folder, source, config, threads, listener, model_folder=model, accept=accept
+        )
+    except DatasetError as error:
+        if dataset is not None:
+            raise
+        listener(Warned(f"{instead}. {error}"))
         return ()
     exposures = None
     if (known := run_exposures(source)) is not None:
         exposures = Exposures.known([view.name for view in opened.views], known)
     return tuple(partial(_photograph, opened, exposures, index) for index in opened.train_indices.tolist())
+
+
+def _check_world(source: Path, folder: Path, found: ViewsRecord) -> None:
+    """Make sure that photographs have the poses that a run was made with, as far as it keeps them.
+
+    Raises:
+        DatasetError: they have not.
+    """
+    if (source / VIEWS).exists() and not read_views(source / VIEWS).is_of_same_world(found):
+        raise DatasetError(
+            f"{folder} is not what {source} was made from: its photographs have other names or poses; name the "
+            "right folder, or use --no-fit to take no colours from them."
+        )
 
 
 def _photograph(

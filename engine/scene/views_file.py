@@ -26,6 +26,8 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Row = tuple[_Finite, _Finite, _Finite]
 _Pixels = Annotated[int, Field(ge=1)]
 _NAMED = 3
+_SAME_POSE = 1e-5
+"""Poses this much apart, as a share of the scene's extent, are one: programs write so many digits."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,21 @@ class ViewsRecord(_Frozen):
         if self.points_sha256 != other.points_sha256:
             return "other sparse points"
         return None if self == other else "another split"
+
+    def is_of_same_world(self, other: "ViewsRecord") -> bool:
+        """Return whether ``other`` has photographs of the same names, and all of them in the same poses."""
+        others = {view.name: view for view in other.views}
+        shared = [(view, others[view.name]) for view in self.views if view.name in others]
+        return bool(shared) and all(
+            np.allclose(one.rotation_cam_from_world, two.rotation_cam_from_world, atol=_SAME_POSE)
+            and np.allclose(
+                one.translation_cam_from_world,
+                two.translation_cam_from_world,
+                rtol=_SAME_POSE,
+                atol=_SAME_POSE * self.extent_world,
+            )
+            for one, two in shared
+        )
 
     def _aspects(self, view: _View) -> dict[str, object]:
         """What is compared of a view, by its name."""

@@ -1,0 +1,71 @@
+"""Whether the photographs that a surface's colours are fitted to are those of its scene."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octasplat.engine.config import resolve_config
+from octasplat.engine.errors import DatasetError, OutputError
+from octasplat.engine.events import Event, Noted, Warned
+from octasplat.engine.operations import surface_inputs
+from octasplat.engine.operations.surface_inputs import training_photographs
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.scene.views_file import read_views, write_views
+
+TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A run's folder, as far as it matters here, and its photographs in ``scene``."""
+    scene, run = tmp_path / "scene", tmp_path / "run"
+    write_generated_scene(
+        scene, GeneratedSceneConfig(views=8, width_px=32, height_px=24, samples_per_side=1, points=100)
+    )
+    run.mkdir()
+    config = resolve_config("fast")
+    content = {"scene": str(scene), "reconstruction": config.model_dump(mode="json")}
+    (run / "config.json").write_text(json.dumps(content))
+    write_views(run / "views.json", Dataset.open(scene, run / "cache").record)
+    shutil.rmtree(run / "cache")
+    return tmp_path
+
+
+def turned(run: Path) -> None:
+    """Make the run one of a world turned by a right angle, as its photographs are not."""
+    write_views(run / "views.json", read_views(run / "views.json").moved(1.0, TURN, np.zeros(3)))
+
+
+def test_photographs_of_the_run_are_taken_wherever_they_are(folder: Path) -> None:
+    events: list[Event] = []
+    train = sum(not view.held_out for view in read_views(folder / "run" / "views.json").views)
+    assert len(training_photographs(folder / "run", None, 1, events.append)) == train
+    (folder / "scene").rename(folder / "elsewhere")
+    assert len(training_photographs(folder / "run", folder / "elsewhere", 1, events.append)) == train
+    assert not [event for event in events if isinstance(event, Warned | Noted)]
+    assert training_photographs(folder / "run", None, 1, events.append) == ()
+    (note,) = (event.message for event in events if isinstance(event, Noted))
+    assert "not on this machine" in note
+
+
+def test_photographs_of_another_model_are_refused_or_left_out_with_a_word(folder: Path) -> None:
+    turned(folder / "run")
+    with pytest.raises(DatasetError, match="other names or poses"):
+        training_photographs(folder / "run", folder / "scene", 1, lambda _event: None)
+    events: list[Event] = []
+    assert training_photographs(folder / "run", None, 1, events.append) == ()
+    (warning,) = (event.message for event in events if isinstance(event, Warned))
+    assert "Colours are those that the scene shows" in warning and "other names or poses" in warning
+
+
+def test_a_full_disk_is_no_reason_for_other_colours(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_arguments: object, **_options: object) -> None:
+        raise OutputError("no room")
+
+    monkeypatch.setattr(surface_inputs, "open_photographs", full)
+    with pytest.raises(OutputError, match="no room"):
+        training_photographs(folder / "run", None, 1, lambda _event: None)
