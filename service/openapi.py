@@ -43,14 +43,17 @@ def type_options(schemas: dict[str, Any]) -> None:
     references, models = models_json_schema(
         [(kind.options, "validation") for kind in kinds], ref_template=_REF + "{model}"
     )
-    for name, schema in models.get("$defs", {}).items():
+    definitions: dict[str, Any] = models.get("$defs", {})
+    by_preset = _decided_by_presets(definitions)
+    for name, found in definitions.items():
+        schema = _fit_for_clients(found, keeps_defaults=name not in by_preset)
         if schemas.setdefault(name, schema) != schema:
             raise ValueError(f"two schemas are called {name}; give the model of the options another name")
     plain = schemas["NewJob"]
     mapping: dict[str, str] = {}
     for kind in kinds:
         name = f"New{kind.name.title().replace('_', '').replace('-', '')}Job"
-        schemas[name] = _new_job(plain, kind, references[kind.options, "validation"])
+        schemas[name] = _new_job(name, plain, kind, references[kind.options, "validation"])
         mapping[kind.name] = _REF + name
     schemas["NewJob"] = {
         "title": plain["title"],
@@ -61,7 +64,7 @@ def type_options(schemas: dict[str, Any]) -> None:
     }
 
 
-def _new_job(plain: dict[str, Any], kind: JobKind[Any], options: dict[str, Any]) -> dict[str, Any]:
+def _new_job(name: str, plain: dict[str, Any], kind: JobKind[Any], options: dict[str, Any]) -> dict[str, Any]:
     """The schema of a new job of one kind."""
     properties = dict(plain["properties"])
     properties["kind"] = {"type": "string", "const": kind.name, "title": "Kind", "default": kind.name}
@@ -72,8 +75,49 @@ def _new_job(plain: dict[str, Any], kind: JobKind[Any], options: dict[str, Any])
     schema = {key: value for key, value in plain.items() if key not in ("examples", "required")}
     return {
         **schema,
-        "title": f"New job: {kind.name}",
+        "title": name,
         "description": f"{kind.title}.",
         "properties": properties,
         **({"required": required} if required else {}),
     }
+
+
+def _decided_by_presets(definitions: dict[str, Any]) -> set[str]:
+    """The names of the schemas below options that have a preset: their defaults are the preset's."""
+    found: set[str] = set()
+    waiting = [
+        reference
+        for schema in definitions.values()
+        if "preset" in schema.get("properties", {})
+        for reference in _references(schema)
+    ]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting += _references(definitions[name])
+    return found
+
+
+def _references(schema: object) -> list[str]:
+    if isinstance(schema, dict):
+        own = [schema["$ref"].removeprefix(_REF)] if isinstance(schema.get("$ref"), str) else []
+        return own + [name for value in schema.values() for name in _references(value)]
+    return [name for item in schema for name in _references(item)] if isinstance(schema, list) else []
+
+
+def _fit_for_clients(schema: dict[str, Any], *, keeps_defaults: bool) -> dict[str, Any]:
+    """The schema without defaults that generated clients would take for what the user wants.
+
+    They send the defaults that they know. Those that a preset decides must stay away, and generators refuse
+    defaults that are objects, whose fields have their own.
+    """
+    properties = {
+        name: {
+            key: value
+            for key, value in given.items()
+            if key != "default" or "const" in given or (keeps_defaults and not isinstance(value, dict))
+        }
+        for name, given in schema.get("properties", {}).items()
+    }
+    return {**schema, "properties": properties} if properties else schema

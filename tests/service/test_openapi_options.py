@@ -52,3 +52,16 @@ def test_examples_of_the_document_fit(document: dict[str, Any]) -> None:
 )
 def test_options_are_those_of_the_kind(document: dict[str, Any], job: dict[str, Any], is_valid: bool) -> None:
     assert fits(document, job) is is_valid
+
+
+def test_defaults_that_a_preset_decides_are_left_out(document: dict[str, Any]) -> None:
+    schemas = document["components"]["schemas"]
+    assert "default" not in schemas["TrainConfig"]["properties"]["rays"]
+    assert schemas["ReconstructOptions"]["properties"]["test_every"]["default"] == 8
+    assert schemas["McmcConfig"]["properties"]["kind"]["default"] == "mcmc"
+
+
+def test_no_default_is_an_object(document: dict[str, Any]) -> None:
+    for name, schema in document["components"]["schemas"].items():
+        for field, given in schema.get("properties", {}).items():
+            assert not isinstance(given.get("default"), dict) or field == "options", name
