@@ -41,7 +41,7 @@ def type_options(schemas: dict[str, Any]) -> None:
     """
     kinds = job_kinds()
     references, models = models_json_schema(
-        [(kind.options, "validation") for kind in kinds], ref_template=_REF + "{model}"
+        [(kind.asked, "validation") for kind in kinds], ref_template=_REF + "{model}"
     )
     definitions: dict[str, Any] = models.get("$defs", {})
     by_preset = _decided_by_presets(definitions)
@@ -53,7 +53,7 @@ def type_options(schemas: dict[str, Any]) -> None:
     mapping: dict[str, str] = {}
     for kind in kinds:
         name = f"New{kind.name.title().replace('_', '').replace('-', '')}Job"
-        schemas[name] = _new_job(name, plain, kind, references[kind.options, "validation"])
+        schemas[name] = _new_job(name, plain, kind, references[kind.asked, "validation"])
         mapping[kind.name] = _REF + name
     schemas["NewJob"] = {
         "title": plain["title"],
@@ -70,7 +70,7 @@ def _new_job(name: str, plain: dict[str, Any], kind: JobKind[Any], options: dict
     properties["kind"] = {"type": "string", "const": kind.name, "title": "Kind", "default": kind.name}
     properties["options"] = {**options, "description": f"See GET /v1/options/{kind.name}."}
     required = [] if kind.name == _DEFAULT_KIND else ["kind"]
-    if kind.options.model_json_schema().get("required"):
+    if kind.asked.model_json_schema().get("required"):
         required.append("options")
     schema = {key: value for key, value in plain.items() if key not in ("examples", "required")}
     return {
@@ -112,12 +112,15 @@ def _fit_for_clients(schema: dict[str, Any], *, keeps_defaults: bool) -> dict[st
     They send the defaults that they know. Those that a preset decides must stay away, and generators refuse
     defaults that are objects, whose fields have their own.
     """
-    properties = {
-        name: {
+    has_preset = "preset" in schema.get("properties", {})
+    properties = {}
+    for name, given in schema.get("properties", {}).items():
+        properties[name] = {
             key: value
             for key, value in given.items()
             if key != "default" or "const" in given or (keeps_defaults and not isinstance(value, dict))
         }
-        for name, given in schema.get("properties", {}).items()
-    }
+        if "properties" in given:
+            inner = _fit_for_clients(properties[name], keeps_defaults=keeps_defaults and not has_preset)
+            properties[name] = inner
     return {**schema, "properties": properties} if properties else schema

@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from octasplat.engine.fields import ADVANCED, BASIC, EXPERIMENTAL, Unit
+from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.settings import FormerSetting, Settings
 
 SEED_SECOND_STAGE = 0.36
@@ -31,7 +31,7 @@ Recipe = Literal["split_sum", "seed"]
 class MaterialSettings(Settings):
     """How materials and an environment are learnt; shares of the training are of all its iterations."""
 
-    learn: Annotated[bool, BASIC] = Field(
+    learn: Annotated[bool, ADVANCED] = Field(
         False,
         description="Learn materials and the light around the scene; nothing else of materials matters if "
         "not. For scenes that reflect; it takes longer and brings settings of its own.",

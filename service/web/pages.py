@@ -170,6 +170,7 @@ async def show_new(
         "new.html",
         who,
         form=options_form(kind, unwritable_formats(workers), ceilings_by_path(kind, service.settings)),
+        from_files=[options_form(other) for other in job_kinds() if other.needs == "files"],
         datasets=[row for row in datasets.rows if row.state == "committed" and row.holds == "photographs"],
         chosen=dataset,
         queues=sorted({"cpu", *(queue for worker in workers for queue in worker.queues)} - {""}),

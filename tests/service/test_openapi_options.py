@@ -56,8 +56,10 @@ def test_options_are_those_of_the_kind(document: dict[str, Any], job: dict[str, 
 
 def test_defaults_that_a_preset_decides_are_left_out(document: dict[str, Any]) -> None:
     schemas = document["components"]["schemas"]
-    assert "default" not in schemas["TrainConfig"]["properties"]["rays"]
-    assert schemas["ReconstructOptions"]["properties"]["test_every"]["default"] == 8
+    options = schemas["ReconstructOptions"]["properties"]
+    assert "default" not in options["train"]["properties"]["rays"]
+    assert "default" not in schemas["LearningRates"]["properties"]["quat"]
+    assert options["test_every"]["default"] == 8
     assert schemas["McmcConfig"]["properties"]["kind"]["default"] == "mcmc"
 
 

@@ -3,11 +3,13 @@
 import json
 from itertools import chain
 
+import pytest
+
 from octasplat.engine.train.config import TrainConfig
 from octasplat.engine.train.preset_names import PRESETS
 from octasplat.service.web.form_fields import Field
 from octasplat.service.web.forms import OptionsForm, options_form
-from octasplat.workers.work.kinds import job_kinds, kind_named
+from octasplat.workers.work.kinds import JobKind, job_kinds, kind_named
 
 
 def fields_of(form: OptionsForm) -> dict[str, Field]:
@@ -62,16 +64,23 @@ def test_files_are_chosen_from_the_formats() -> None:
         kind_named("export").resolve({"files": [name]})
 
 
-def test_every_kind_has_a_form() -> None:
-    for kind in job_kinds():
-        form = options_form(kind)
-        names = list(fields_of(form))
-        assert len(names) == len(set(names))
+@pytest.mark.parametrize("kind", job_kinds(), ids=lambda kind: kind.name)
+def test_every_kind_has_a_form_whose_fields_are_explained(kind: JobKind) -> None:
+    form = options_form(kind)
+    names = [f.path for f in chain(form.first, *(s.fields for s in form.more), form.experimental)]
+    assert names and len(names) == len(set(names))
+    assert [f.path for f in fields_of(form).values() if not f.help] == []
+
+
+def test_texts_of_pairs_are_json() -> None:
+    transform = fields_of(options_form(kind_named("transform")))
+    assert transform["rotate"].control == "json" and transform["translate"].control == "numbers"
+    assert transform["up"].control == "list" and transform["matrix"].control == "upload"
 
 
 def test_basic_fields_are_open_others_folded() -> None:
     form = options_form(kind_named("reconstruct"))
-    assert {"train.iterations", "train.background", "train.materials.learn"} <= {f.path for f in form.first}
+    assert {"train.iterations", "train.background", "materials"} <= {f.path for f in form.first}
     assert {f.group for f in form.first} == {"basic"}
     assert {f.group for section in form.more for f in section.fields} == {"advanced"}
     assert "train.lift_unseen" in {f.path for f in form.experimental}

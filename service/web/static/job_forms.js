@@ -1,10 +1,10 @@
-// Forms that queue a job on the results of a finished one; the files that they ask for are sent first.
+// Forms that queue a job, on the results of a finished one or on files; files are sent first.
 
 import { notify } from "./app.js";
 import { SentFiles } from "./form_parts.js";
 import { filesOf, queueJob, readOptions } from "./options.js";
 
-for (const form of document.querySelectorAll("form.options[data-source]")) {
+for (const form of document.querySelectorAll("form.job-form")) {
     const fault = form.querySelector(".fault"), state = form.querySelector("[role=status]"), button = form.querySelector("[type=submit]");
     const say = (words) => { state.textContent = words; state.hidden = !words; };
     const sent = new SentFiles(form.dataset.kind, Number(form.dataset.maxFile), say);
@@ -13,7 +13,8 @@ for (const form of document.querySelectorAll("form.options[data-source]")) {
         button.disabled = true;
         fault.hidden = true;
         try {
-            const body = { kind: form.dataset.kind, source_id: form.dataset.source, options: readOptions(form) };
+            const body = { kind: form.dataset.kind, options: readOptions(form) };
+            if (form.dataset.source) body.source_id = form.dataset.source;
             const files = filesOf(form);
             if (files.length) body.files_id = await sent.dataset(files);
             location.href = `/jobs/${await queueJob(body, crypto.randomUUID?.() ?? String(Math.random()))}`;
