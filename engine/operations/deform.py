@@ -17,6 +17,7 @@ from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Spelling, Unit
 from octasplat.engine.files import Mesh, read_mesh
 from octasplat.engine.operations.base import Operation, Options, ScenesWritten, never, options_of
+from octasplat.engine.operations.patterns import expanded
 from octasplat.engine.operations.sequence_request import SequenceRequest
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ def run(
     """
     from octasplat.engine.edit.deform import deform_to, deformation_corners
     from octasplat.engine.operations.scenes import edit_note, open_scene
-    from octasplat.engine.operations.sequences import Frames, expanded
+    from octasplat.engine.operations.sequences import Frames
 
     source: Path = request.source
     paths = expanded(request.deformed)

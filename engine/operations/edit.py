@@ -12,6 +12,7 @@ from octasplat.engine.edit.reports import EditReport
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Spelling
 from octasplat.engine.operations.base import Operation, Options, ScenesWritten, never, options_of, warn
+from octasplat.engine.operations.patterns import expanded
 from octasplat.engine.operations.sequence_request import SequenceRequest
 
 
@@ -59,7 +60,7 @@ def run(
     from octasplat.engine.edit.recovery import recover_edit
     from octasplat.engine.files import read_mesh
     from octasplat.engine.operations.scenes import edit_note, open_scene
-    from octasplat.engine.operations.sequences import Frames, expanded
+    from octasplat.engine.operations.sequences import Frames
 
     source: Path = request.source
     meshes = expanded(request.meshes)

@@ -157,7 +157,7 @@ async def _make_job(connection: Connection, service: Service, who: Principal, as
 
 async def _inputs(connection: Connection, who: Principal, asked: _Asked) -> _Inputs:
     """What the job works on, checked."""
-    needed = _source if asked.kind.needs == "result" else _dataset
+    needed = {"result": _source, "dataset": _dataset, "files": _files}[asked.kind.needs]
     inputs = await needed(connection, who, asked)
     files_id = asked.new.files_id
     await check_named_files(connection, who, asked.kind, inputs.options, files_id)
@@ -185,7 +185,23 @@ async def _source(connection: Connection, who: Principal, asked: _Asked) -> _Inp
             detail = "The dataset holds no COLMAP model, which says where in the scene its photographs are."
             raise input_problem("dataset_id", detail)
         return _Inputs(dataset.id, source.id, kind.on_other_photographs(asked.options))
-    return _Inputs(source.dataset_id, source.id, asked.options)
+    if source.dataset_id is None and kind.needs_photographs(asked.options):
+        detail = (
+            "The scene of the job in source_id is not where photographs show it; name some as dataset_id."
+        )
+        raise input_problem("source_id", detail)
+    return _Inputs(source.dataset_id if kind.keeps_world else None, source.id, asked.options)
+
+
+async def _files(connection: Connection, who: Principal, asked: _Asked) -> _Inputs:
+    new, name = asked.new, asked.kind.name
+    for place in ("source_id", "dataset_id"):
+        if getattr(new, place) is not None:
+            raise input_problem(place, f"A job of the kind {name} works on files_id alone.")
+    if new.files_id is None:
+        detail = f"A job of the kind {name} works on files_id, a dataset that holds files."
+        raise input_problem("files_id", detail)
+    return _Inputs(None, None, asked.options)
 
 
 async def _dataset(connection: Connection, who: Principal, asked: _Asked) -> _Inputs:

@@ -19,7 +19,7 @@ MAX_TEXT_LINE_BYTES = 1 << 16
 _BEGINNINGS = {".glb": b"glTF", ".ply": b"ply"}
 _UNKNOWN = frozenset({".splat", ".spz"})
 """Nothing in their first bytes says what they are; whoever reads them says so."""
-_TEXTS = frozenset({".obj", ".mtl"})
+_TEXTS = frozenset({".obj", ".mtl", ".txt"})
 SUFFIXES = frozenset({".sog", *_TEXTS, *_BEGINNINGS, *_UNKNOWN, *IMAGE_SUFFIXES})
 
 
@@ -32,8 +32,8 @@ def check_input_name(name: str) -> None:
     FileNames().add(name)
     if is_clutter(name) or PurePosixPath(name).suffix.lower() not in SUFFIXES:
         detail = (
-            f"{shown_name(name)} is none of the files that a stage can name: meshes (.obj .mtl .ply .glb), "
-            "surroundings (.hdr .exr), textures and splats."
+            f"{shown_name(name)} is none of the files that options can name: meshes (.obj .mtl .ply .glb), "
+            "surroundings (.hdr .exr), textures, splats and matrices (.txt)."
         )
         raise IntakeRefused(Fault("name-unexpected", detail, name))
 

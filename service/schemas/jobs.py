@@ -46,7 +46,9 @@ class NewJob(Strict):
     )
     source_id: uuid.UUID | None = Field(None, description="A job that succeeded, for kinds that work on one.")
     files_id: uuid.UUID | None = Field(
-        None, description="A committed dataset that holds the files which the options name."
+        None,
+        description="A committed dataset that holds the files which the options name; kinds that work on "
+        "files need nothing else.",
     )
     options: dict[str, Any] = Field(default_factory=dict, description="See GET /v1/options/{kind}.")
     label: str | None = Field(None, max_length=200)

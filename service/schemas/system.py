@@ -11,7 +11,10 @@ class KindView(BaseModel):
 
     name: str
     title: str
-    needs: Literal["dataset", "result"]
+    needs: Literal["dataset", "result", "files"] = Field(
+        description="What it works on: photographs, the results of a job, or nothing but the files that its "
+        "options name."
+    )
     options: dict[str, Any] = Field(description="JSON Schema of its options.")
     ceilings: dict[str, int] = Field(description="What options may ask for at most here, by their path.")
 

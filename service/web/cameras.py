@@ -7,7 +7,7 @@ camera out.
 
 import io
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import IO, Any
 
@@ -67,6 +67,27 @@ def read_poses(cameras: IO[bytes], images: IO[bytes], *, binary: bool) -> list[P
     except (struct.error, ValueError, UnicodeDecodeError, OverflowError, IndexError, EOFError) as error:
         raise CamerasUnreadable(str(error)) from None
     return sorted(poses, key=lambda pose: pose.name)
+
+
+def poses_of_views(content: Mapping[str, Any]) -> list[PhotographPose]:
+    """The posed photographs of a run's ``views.json``, by name; none where it holds something else."""
+    try:
+        poses = [_pose_of_view(view, content["cameras"]) for view in content["views"][:MAX_CAMERAS]]
+    except (KeyError, IndexError, TypeError, ValueError):
+        return []
+    return sorted((pose for pose in poses if pose is not None), key=lambda pose: pose.name)
+
+
+def _pose_of_view(view: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> PhotographPose | None:
+    camera = cameras[view["camera"]]
+    fy = float(camera["params"][0 if camera["model"] in _ONE_FOCAL_NAMES else 1])
+    seen = _optics(camera["width_px"], camera["height_px"], fy)
+    rotation = np.array(view["rotation_cam_from_world"], np.float64)
+    translation = np.array(view["translation_cam_from_world"], np.float64)
+    if seen is None or not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return None
+    centre = -rotation.T @ translation
+    return PhotographPose(str(view["name"]), rotation, centre, seen.fov_y_degrees, seen.aspect)
 
 
 def viewer_cameras(poses: list[PhotographPose], held_out: Iterable[str] = ()) -> dict[str, object]:

@@ -22,7 +22,12 @@ from octasplat.service.queue_facts import unwritable_formats
 from octasplat.service.schemas.jobs import JobChange, RetryRequest
 from octasplat.service.state import Service, ServiceDep
 from octasplat.service.threads import Threads, in_thread
-from octasplat.service.web.cameras import CamerasUnreadable, read_poses, viewer_cameras
+from octasplat.service.web.cameras import (
+    CamerasUnreadable,
+    poses_of_views,
+    read_poses,
+    viewer_cameras,
+)
 from octasplat.service.web.forms import WITH_ANOTHER_FORM, options_form
 from octasplat.service.web.light import light_form
 from octasplat.service.web.reading import job_counts, job_detail, job_lines, photographs_of
@@ -34,6 +39,7 @@ from octasplat.service.web.results import (
     METRICS,
     REPORT,
     SCENE,
+    VIEWS,
     downloads,
     measured,
     read_json,
@@ -266,6 +272,10 @@ def _cameras(
     if not found:
         found = {name: row.sha256 for name, row in _model(files).items()}
     names = read_names(service.storage, held_out)
+    views = next((row for row in artifacts if row.name == VIEWS), None)
+    if not found and views is not None:  # of a scene that was moved away from its photographs
+        poses = poses_of_views(read_json(service.storage, views))
+        return viewer_cameras(poses, names) if poses else {"views": []}
     for suffix in (".bin", ".txt"):
         if f"cameras{suffix}" not in found or f"images{suffix}" not in found:
             continue

@@ -17,6 +17,7 @@ from octasplat.workers.store.protocol import Storage
 logger = logging.getLogger(__name__)
 
 MAX_JSON_BYTES = 16 << 20
+VIEWS = "views.json"
 SCENE, METRICS, REPORT, CONFIG, HELD_OUT = (
     "scene.ply", "metrics.json", "report.html", "config.json", "held_out.json",
 )  # fmt: skip

@@ -94,7 +94,14 @@ def submit(
 
 @click.command(short_help="Queue a job on the results of a finished one, such as a render.")
 @click.argument("kind")
-@click.argument("job_id", metavar="JOB")
+@click.argument("job_id", metavar="[JOB]", required=False)
+@click.option(
+    "--file",
+    "files",
+    multiple=True,
+    metavar="OPTION=PATH",
+    help="A file for an option that names one, such as meshes=edited.ply, which is sent; may be repeated.",
+)
 @click.option(
     "--stage",
     type=click.Path(path_type=Path),
@@ -124,23 +131,32 @@ def submit(
 @server_option
 @quiet_option
 def derive(
-    kind: str, job_id: str, stage: Path | None, environments: tuple[Path, ...], on: Path | None, wait: bool,
-    output: Path | None, server: str | None, quiet: bool, **given: Any,
+    kind: str, job_id: str | None, stage: Path | None, environments: tuple[Path, ...], on: Path | None,
+    wait: bool, output: Path | None, server: str | None, quiet: bool, **given: Any,
 ) -> None:  # fmt: skip
-    """Queue a job of a KIND such as render, surface or material on the results of JOB.
+    """Queue a job of a KIND such as render, crop or edit on the results of JOB, or one on files alone.
 
-    'last' is the newest job. For example: octasplat derive render last --stage stage.toml --set frames=60,
-    or: octasplat derive material last --set set.roughness=0.3 --set where="metallic > 0.5" --wait
+    'last' is the newest job; octasplat verbs lists the kinds. For example:
+    octasplat derive render last --stage stage.toml --set frames=60, or:
+    octasplat derive material last --set set.roughness=0.3 --set where="metallic > 0.5" --wait, or:
+    octasplat derive edit last --file meshes=edited.ply, or: octasplat derive import --file file=a.splat
     """
     from octasplat.workers.cli.submitting import derive, submit_and_wait
-    from octasplat.workers.client.submission import Derivation, with_environments, with_stage
+    from octasplat.workers.client.submission import (
+        Derivation,
+        with_environments,
+        with_named_files,
+        with_stage,
+    )
 
+    files = [_file_given(text) for text in given["files"]]
     with connected(server) as api:
-        source = _job(api, job_id)["id"]
+        source = None if job_id is None else _job(api, job_id)["id"]
         what = Derivation(
             source, kind, _assigned({}, given["assignments"]), scene=on,
             label=given["label"], queue=given["queue"], priority=given["priority"],
         )  # fmt: skip
+        what = with_named_files(what, files)
         if stage is not None:
             what = with_stage(what, stage)
         if environments:
@@ -277,6 +293,14 @@ def _changes(given: dict[str, Any], *, training: bool) -> dict[str, Any]:
     if not training:
         return _assigned(options, given["assignments"])
     return options | ({"assignments": list(given["assignments"])} if given["assignments"] else {})
+
+
+def _file_given(text: str) -> tuple[str, Path]:
+    """What ``--file`` says: the option, and the file."""
+    name, equals, path = text.partition("=")
+    if not equals or not path:
+        raise ConfigError(f"--file {text}: write it as option=path, e.g. meshes=edited.ply.")
+    return name.strip(), Path(path)
 
 
 def _assigned(options: dict[str, Any], assignments: tuple[str, ...]) -> dict[str, Any]:
