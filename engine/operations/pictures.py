@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.fields import DatasetFolder, Output, Source, Spelling, Unit
+from octasplat.engine.fields import ADVANCED, DatasetFolder, Output, Source, Spelling, Unit
 from octasplat.engine.operations.axes import Axis
 from octasplat.engine.operations.base import Options, Request
 from octasplat.engine.render.names import IMAGE_SUFFIXES, names_by_number
@@ -62,19 +62,19 @@ class PictureOptions(Options):
         description="Render one image with a camera at this position, which looks at the middle of the scene "
         "or at another point that is given.",
     )
-    look_at: Annotated[Point | None, Spelling(metavar="X Y Z")] = Field(
+    look_at: Annotated[Point | None, ADVANCED, Spelling(metavar="X Y Z")] = Field(
         None,
         description="Turntable, single camera: the point that is looked at.  [default: the middle of the "
         "scene]",
     )
-    distance: Annotated[float | None, Unit("scene units")] = Field(
+    distance: Annotated[float | None, Unit("scene units"), ADVANCED] = Field(
         None,
         gt=0,
         allow_inf_nan=False,
         description="Turntable: distance of the camera from the point that is looked at, in scene units.  "
         "[default: as photographed, or what fits]",
     )
-    elevation_degrees: Annotated[float | None, Unit("degrees"), Spelling(("--elevation",))] = Field(
+    elevation_degrees: Annotated[float | None, Unit("degrees"), ADVANCED, Spelling(("--elevation",))] = Field(
         None,
         ge=-89,
         le=89,
@@ -84,13 +84,13 @@ class PictureOptions(Options):
     frames: Annotated[int, Unit("images")] = Field(
         120, ge=1, le=MAX_FRAMES, description="Turntable: number of images of one turn."
     )
-    seconds: Annotated[float | None, Unit("s")] = Field(
+    seconds: Annotated[float | None, Unit("s"), ADVANCED] = Field(
         None,
         gt=0,
         allow_inf_nan=False,
         description="Turntable: duration of one turn in seconds, instead of a number of images.",
     )
-    fps: Annotated[float | None, Unit("images/s")] = Field(
+    fps: Annotated[float | None, Unit("images/s"), ADVANCED] = Field(
         None,
         gt=0,
         le=1000,
@@ -108,15 +108,17 @@ class PictureOptions(Options):
         le=MAX_SIDE_PX,
         description="Turntable, single camera: height of the images in pixels.",
     )
-    fov_y_degrees: Annotated[float | None, Unit("degrees"), Spelling(("--fov",))] = Field(
+    fov_y_degrees: Annotated[float | None, Unit("degrees"), ADVANCED, Spelling(("--fov",))] = Field(
         None,
         ge=1,
         le=170,
         description="Turntable, single camera: field of view from the top of the image to its bottom, in "
         "degrees.  [default: that of the photographs, or 50]",
     )
-    up: Axis | None = Field(
-        None, description="The axis of the world that points up.  [default: that of the run, of a file -y]"
+    up: Annotated[Axis | None, ADVANCED] = Field(
+        None,
+        description="The axis of a file that points up; the photographs of a run say so themselves.  "
+        "[default: -y]",
     )
     max_side: Annotated[int | None, Unit("px"), Spelling(metavar="PX")] = Field(
         None,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from octasplat.engine.events import Listener, ignore
-from octasplat.engine.fields import InputFile, Spelling, Unit
-from octasplat.engine.operations.axes import light_up
+from octasplat.engine.fields import ADVANCED, InputFile, Spelling, Unit
+from octasplat.engine.operations.axes import Axis, light_up
 from octasplat.engine.operations.base import Operation, never
 from octasplat.engine.operations.pictures import PictureOptions, PictureRequest
 from octasplat.engine.operations.render import RenderResult
@@ -57,6 +57,11 @@ class RelightOptions(PictureOptions):
         "and weaker lamps.",
     )
     spin: bool = Field(False, description="Turn the light once round from the first image to the last.")
+    up: Annotated[Axis | None, ADVANCED] = Field(
+        None,
+        description="The axis of the world that points up, for the light and in a file for the cameras.  "
+        "[default: that of the run, of a file -y]",
+    )
     background: Literal["black", "white", "transparent", "environment"] | None = Field(
         None,
         description="Behind the scene; transparent gives images alpha.  [default: that of the run's "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from octasplat.engine.events import Listener, Warned, ignore
-from octasplat.engine.fields import Spelling
+from octasplat.engine.fields import ADVANCED, Spelling
 from octasplat.engine.light.stage import Stage
 from octasplat.engine.light.stage_file import read_stage
 from octasplat.engine.operations.base import Operation, Result, never
@@ -55,13 +55,13 @@ class RenderOptions(PictureOptions):
         "describes: an object, or the text of a stage file. The files that it names are those of the job's "
         "files_id.",
     )
-    preview: bool = Field(
+    preview: Annotated[bool, ADVANCED] = Field(
         False, description="Stage: render the first image only, to one file, finer and finer."
     )
-    layers: bool = Field(
+    layers: Annotated[bool, ADVANCED] = Field(
         False, description="Stage: write EXR files with background, shadow and things, for a compositor."
     )
-    denoise: bool = Field(
+    denoise: Annotated[bool, ADVANCED] = Field(
         False, description="Stage: remove the noise of the light from the images; needs the extra denoise."
     )
 

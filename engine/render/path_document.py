@@ -1,6 +1,8 @@
-"""What a camera path file says, checked; see ``docs/cameras.md``. Imports numpy when it is needed only."""
+"""What a camera path file says, checked; see ``docs/cameras.md``. Imports no numpy, as clients use it."""
 
 import json
+import math
+import operator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +12,8 @@ from octasplat.engine.errors import ConfigError
 
 MAX_FRAMES = 100_000
 _RIGID_TOLERANCE = 1e-3
+"""Files have rounded numbers."""
+_LAST = (0.0, 0.0, 0.0, 1.0)
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -32,17 +36,27 @@ class PathFrame(BaseModel):
     def _check(self) -> "PathFrame":
         if (self.fov_y_degrees is None) == (self.fy is None) or (self.fx is None) != (self.fy is None):
             raise ValueError("needs either fov_y_degrees or both fx and fy")
-        import numpy as np
-
-        pose = np.array(self.camera_to_world)
-        rotation = pose[:3, :3]
-        rigid = np.allclose(rotation.T @ rotation, np.eye(3), atol=_RIGID_TOLERANCE)
-        if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], [0, 0, 0, 1]):
+        if not _is_pose(self.camera_to_world):
             raise ValueError(
                 "camera_to_world must be a rotation without scale or mirroring, a position, "
                 "and a last row of 0 0 0 1"
             )
         return self
+
+
+def _is_pose(matrix: tuple[_Row, _Row, _Row, _Row]) -> bool:
+    """Whether it is a rotation, a translation and a last row of 0 0 0 1; without numpy, for clients."""
+    x, y, z = ([row[k] for row in matrix[:3]] for k in range(3))
+    across = [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
+    axes = (x, y, z)
+    is_rigid = all(
+        math.isclose(sum(map(operator.mul, axes[i], axes[j])), float(i == j), abs_tol=_RIGID_TOLERANCE)
+        for i in range(3)
+        for j in range(3)
+    )
+    is_right_handed = sum(map(operator.mul, across, z)) > 0
+    ends = all(math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-8) for a, b in zip(matrix[3], _LAST, strict=True))
+    return is_rigid and is_right_handed and ends
 
 
 class PathDocument(BaseModel):

@@ -32,13 +32,15 @@ ResultT = TypeVar("ResultT", bound=Result)
 def request_options(model: type[BaseModel], *, leave_out: Sequence[str] = ()) -> Callable[[Command], Command]:
     """Return a decorator that gives a command the options of a request.
 
-    The command is called with one keyword argument for each field; what the user did not give is None.
+    The command is called with one keyword argument for each field; what the user did not give is None. What
+    has to be given comes first.
 
     Args:
         model: class of the request.
         leave_out: fields that the command spells in another way.
     """
-    fields = {name: info for name, info in model.model_fields.items() if name not in leave_out}
+    listed = sorted(model.model_fields.items(), key=lambda field: not field[1].is_required())
+    fields = {name: info for name, info in listed if name not in leave_out}
     decorators = [_decorator(name, info) for name, info in fields.items() if not _spelling(info).hidden]
 
     def decorate(command: Command) -> Command:

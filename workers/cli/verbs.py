@@ -55,7 +55,7 @@ def verbs() -> tuple[Verb, ...]:
             Verb(
                 name=entry.name,
                 title=entry.title,
-                command=f"octasplat {entry.name}" if has_command(entry.name) else "",
+                command=_command(entry.name),
                 job_kind=kind.name if kind else "",
                 works_on=kind.needs if kind else "",
                 http=f'POST /v1/jobs {{"kind": "{kind.name}", ...}}' if kind else "",
@@ -68,6 +68,12 @@ def verbs() -> tuple[Verb, ...]:
 def verbs_page() -> str:
     """Return ``docs/verbs.md``."""
     return _PAGE + "".join(f"| {' | '.join(_columns(verb))} |\n" for verb in verbs())
+
+
+def _command(name: str) -> str:
+    """Return the command of a verb; ``stage-init`` is ``octasplat stage init``."""
+    words = name.split("-")
+    return f"octasplat {' '.join(words)}" if has_command(words[0]) else ""
 
 
 def _python_call(entry: Operation[Any, Any]) -> str:

@@ -12,6 +12,7 @@ from octasplat.engine.light.companions import companions
 from octasplat.engine.light.stage_file import named_files, read_stage, with_files
 from octasplat.engine.operations import operation, operation_names
 from octasplat.engine.operations.patterns import expanded
+from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.stages import counted_stage
 from octasplat.workers.client.api import Api
 from octasplat.workers.client.download import download_results
@@ -112,6 +113,16 @@ def with_stage(what: Derivation, stage: Path) -> Derivation:
             files[(PurePosixPath(sent).parent / beside).as_posix()] = path.parent / beside
     options = {**what.options, "stage": with_files(read, names).model_dump(mode="json")}
     return replace(what, options=options, files={**what.files, **files})
+
+
+def with_camera_path(what: Derivation, path: Path) -> Derivation:
+    """Return the same with the cameras of a path file, whose content goes into the options.
+
+    Raises:
+        ConfigError: the file cannot be read, or is no camera path.
+    """
+    document = read_path_document(path).model_dump(mode="json", exclude_none=True)
+    return replace(what, options={**what.options, "mode": "path", "camera_path": document})
 
 
 def with_environments(what: Derivation, maps: Sequence[Path]) -> Derivation:

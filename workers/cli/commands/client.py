@@ -109,6 +109,13 @@ def submit(
     help="Render: the stage; it and the files that it names are sent.",
 )
 @click.option(
+    "--path",
+    "path_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Render, relight: the cameras of a JSON file, which docs/cameras.md describes.",
+)
+@click.option(
     "--environment",
     "environments",
     type=click.Path(path_type=Path),
@@ -131,8 +138,9 @@ def submit(
 @server_option
 @quiet_option
 def derive(
-    kind: str, job_id: str | None, stage: Path | None, environments: tuple[Path, ...], on: Path | None,
-    wait: bool, output: Path | None, server: str | None, quiet: bool, **given: Any,
+    kind: str, job_id: str | None, stage: Path | None, path_file: Path | None,
+    environments: tuple[Path, ...], on: Path | None, wait: bool, output: Path | None, server: str | None,
+    quiet: bool, **given: Any,
 ) -> None:  # fmt: skip
     """Queue a job of a KIND such as render, crop or edit on the results of JOB, or one on files alone.
 
@@ -144,6 +152,7 @@ def derive(
     from octasplat.workers.cli.submitting import derive, submit_and_wait
     from octasplat.workers.client.submission import (
         Derivation,
+        with_camera_path,
         with_environments,
         with_named_files,
         with_stage,
@@ -159,6 +168,8 @@ def derive(
         what = with_named_files(what, files)
         if stage is not None:
             what = with_stage(what, stage)
+        if path_file is not None:
+            what = with_camera_path(what, path_file)
         if environments:
             what = with_environments(what, environments)
         if wait:

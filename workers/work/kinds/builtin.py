@@ -17,6 +17,7 @@ from octasplat.engine.operations.reconstruct import OPERATION as RECONSTRUCT
 from octasplat.engine.operations.reconstruct import options_of
 from octasplat.engine.operations.relight import OPERATION as RELIGHT
 from octasplat.engine.operations.render import OPERATION as RENDER
+from octasplat.engine.operations.stage_init import OPERATION as STAGE_INIT
 from octasplat.engine.operations.transform import OPERATION as TRANSFORM
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
 from octasplat.workers.records.sizes import Sizes
@@ -161,6 +162,15 @@ def register_all() -> None:
             RELIGHT,
             title="The scene of a reconstruction with materials in other light",
             source_files=(LIGHT, *RUN_FILES[:4]),
+        )
+    )
+    register(
+        OperationKind(
+            STAGE_INIT,
+            title="A commented stage that fits the scene of a reconstruction",
+            stages=("read",),
+            source_files=(*RUN_FILES[:4], BACKGROUND),
+            output="stage.toml",
         )
     )
     register(SceneChange(MATERIAL, title="The scene of a reconstruction with other materials", first=LIGHT))
