@@ -1,4 +1,4 @@
-"""Jobs of the kinds ``render`` and ``relight``: the bytes of the commands, kept frames, and options of old."""
+"""Jobs of the kinds ``render`` and ``relight``: the bytes of the commands, kept frames, former options."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ from octasplat.workers.work.task import Task
 POSE = [[1, 0, 0, 2], [0, 0, -1, 14], [0, 1, 0, 3], [0, 0, 0, 1]]
 PATH = {
     "width": 32, "height": 24, "fps": 5,
-    "frames": [{"camera_to_world": POSE, "fov_y_degrees": 40}, {"camera_to_world": POSE, "fov_y_degrees": 50}],
+    "frames": [{"camera_to_world": POSE, "fov_y_degrees": degrees} for degrees in (40, 50)],
 }  # fmt: skip
 SIZE = {"width_px": 32, "height_px": 24}
 SIZE_WORDS = ("--width", 32, "--height", 24)
