@@ -112,7 +112,8 @@ class RelitPaint:
         plain = background_colour("white" if self.background == "white" else "black")
         rgb = image.over(surroundings(environment, rays) if self.background == "environment" else plain)
         if is_exr:
-            linear = srgb_to_linear(rgb)
+            is_transparent = self.background == "transparent"
+            linear = image.linear * image.coverage[..., None] if is_transparent else srgb_to_linear(rgb)
             write_exr(path, {**{name: linear[..., k] for k, name in enumerate("RGB")}, "A": image.coverage})
         else:
             write_png(path, np.clip(rgb, 0, 1))

@@ -117,8 +117,8 @@ def _check_world(source: Path, folder: Path, found: ViewsRecord) -> None:
     """
     if (source / VIEWS).exists() and not read_views(source / VIEWS).is_of_same_world(found):
         raise DatasetError(
-            f"{folder} is not what {source} was made from: its photographs have other names or poses; name the "
-            "right folder, or use --no-fit to take no colours from them."
+            f"{folder} is not what {source} was made from: its photographs have other names or poses; name "
+            "the right folder, or use --no-fit to take no colours from them."
         )
 
 

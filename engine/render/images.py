@@ -28,12 +28,15 @@ def exr_layers(
     alpha: Float32[np.ndarray, "h w"] | None = None,
     depth: Float32[np.ndarray, "h w"] | None = None,
     normals_world: Float32[np.ndarray, "h w 3"] | None = None,
+    transparent: bool = False,
 ) -> dict[str, Float32[np.ndarray, "h w"]]:
     """A render as named EXR channels.
 
     Args:
         rgb_srgb: The render, composited on display values; it becomes linear R, G, B as displayed, that is,
             with its background and not divided by alpha.
+        transparent: The render is over black, which stands for nothing: R, G, B become linear colours
+            multiplied by alpha, as EXR has them, so that other programs can lay them over anything.
         alpha: Becomes A.
         depth: Distance in scene units; becomes Z.
         normals_world: Becomes N.x, N.y, N.z.
@@ -41,7 +44,11 @@ def exr_layers(
     Returns:
         The channels by name, ready for ``write_exr``.
     """
-    linear = srgb_to_linear(rgb_srgb)
+    if transparent and alpha is not None:
+        # Multiplied in linear light, not before it: decoding what was multiplied darkens every edge.
+        linear = alpha[..., None] * srgb_to_linear(rgb_srgb / np.maximum(alpha, 1e-6)[..., None])
+    else:
+        linear = srgb_to_linear(rgb_srgb)
     layers = {name: linear[..., k] for k, name in enumerate("RGB")}
     if alpha is not None:
         layers["A"] = alpha

@@ -147,7 +147,8 @@ def scene_paint(
     Args:
         tracer: with the scene built.
         background: display colour behind the scene.
-        transparent: PNG get straight colours and alpha; the background should be black.
+        transparent: PNG get straight colours and alpha, EXR linear ones multiplied by alpha; the background
+            should be black.
         trained_rad: angle of a pixel of the training views; larger pixels get several rays, so that what is
             smaller than they neither sparkles nor breaks up. 0 where it is not known: one ray each.
         shading: what develops the rays: a learnt background, say.
@@ -158,7 +159,11 @@ def scene_paint(
         image = render_averaged(tracer, rays, background, shading, rays_across(rays, trained_rad))
         if path.suffix.lower() == ".exr":
             layers = exr_layers(
-                image.rgb_srgb, alpha=image.alpha, depth=image.depth, normals_world=image.normal_world
+                image.rgb_srgb,
+                alpha=image.alpha,
+                depth=image.depth,
+                normals_world=image.normal_world,
+                transparent=transparent,
             )
             write_exr(path, layers)
         elif transparent:

@@ -88,3 +88,14 @@ def test_an_unwritable_place_is_an_output_error(tmp_path, picture):
         images.write_png(tmp_path / "file" / "a.png", picture)
     with pytest.raises(OutputError, match="unknown"):
         images.write_png(tmp_path / "a.unknown", picture)
+
+
+def test_a_transparent_exr_holds_linear_colours_times_alpha():
+    alpha = np.array([[0.0, 0.1, 0.5, 1.0]], np.float32)
+    straight = np.full(1, 0.8, np.float32)
+    display = np.repeat((alpha * straight)[..., None], 3, axis=-1)
+    layers = images.exr_layers(display, alpha=alpha, transparent=True)
+    np.testing.assert_allclose(layers["R"], alpha * srgb_to_linear(straight), rtol=1e-5)
+    np.testing.assert_array_equal(layers["A"], alpha)
+    opaque = images.exr_layers(display, alpha=alpha)  # over a black background that is part of the picture
+    np.testing.assert_array_equal(opaque["R"], srgb_to_linear(display)[..., 0])
