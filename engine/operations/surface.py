@@ -24,6 +24,7 @@ from octasplat.engine.surface.options import ExtractionOptions
 
 if TYPE_CHECKING:
     from octasplat.engine.surface.extract import ExtractedSurface
+    from octasplat.engine.surface.fitting import Picture
 
 MATERIAL_DEFAULTS: Mapping[str, object] = {"texture_side": 1024, "max_triangles": 60_000}
 """With materials, where nothing else is said."""
@@ -138,6 +139,11 @@ class SurfaceRequest(SurfaceOptions, Request):
         description="Take the cameras of the photographs in this folder, and of a run the colours.  "
         "[default: the cameras that a run keeps; else none]",
     )
+    photographs: Annotated[Path | None, Spelling(hidden=True)] = Field(
+        None,
+        description="A copy of the photographs that the run was made from, for colours alone; left out if it "
+        "has other poses.",
+    )
 
     @property
     def outputs(self) -> tuple[Path, ...]:
@@ -217,7 +223,7 @@ def run(
     from octasplat.engine.files import check_surface_path, write_surface
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scenes import open_scene
-    from octasplat.engine.operations.surface_inputs import camera_views, training_photographs
+    from octasplat.engine.operations.surface_inputs import camera_views
     from octasplat.engine.run_folder import SCENE, is_run
     from octasplat.engine.shading.environment_frame import environment_frame
     from octasplat.engine.surface.extract import extract_levels
@@ -250,7 +256,7 @@ def run(
         tuple(request.levels.values()) or (None,),
         scratch=output.parent,
         light_frame=frame,
-        photographs=training_photographs(source, request.dataset, threads, progress) if request.fit else (),
+        photographs=_photographs(request, threads, progress),
         listener=progress,
         should_stop=should_stop,
     )
@@ -261,6 +267,14 @@ def run(
     environment = None if light is None else _copied(light, output)
     files = (*(path for level in levels for path in level.files), *([environment] if environment else []))
     return SurfaceResult(files=files, folder=output.parent, levels=levels, environment=environment)
+
+
+def _photographs(request: SurfaceRequest, threads: int, progress: Listener) -> "tuple[Picture, ...]":
+    from octasplat.engine.operations.surface_inputs import training_photographs
+
+    if not request.fit:
+        return ()
+    return training_photographs(request.source, request.dataset, threads, progress, copy=request.photographs)
 
 
 def _level(extracted: "ExtractedSurface", files: tuple[Path, ...]) -> SurfaceLevel:

@@ -64,7 +64,7 @@ def camera_views(
 
 
 def training_photographs(
-    source: Path, dataset: Path | None, threads: int, listener: Listener
+    source: Path, dataset: Path | None, threads: int, listener: Listener, *, copy: Path | None = None
 ) -> tuple[Picture, ...]:
     """Return the training photographs of a run, all as exposed as the scene.
 
@@ -73,6 +73,7 @@ def training_photographs(
         dataset: the folder of the photographs; None takes the one that the run was made from.
         threads: for decoding; 0 takes all cores.
         listener: hears the progress, and why there are none.
+        copy: another folder of the photographs that the run was made from.
 
     Returns:
         None of them where they show reflections that the surface does not, or where none were named and those
@@ -89,7 +90,7 @@ def training_photographs(
         return ()
     instead = "Colours are those that the scene shows, not those of photographs"
     try:
-        folder, model = photographs_folder(source, dataset), found_model(source)
+        folder, model = photographs_folder(source, dataset or copy), found_model(source)
     except DatasetError as error:
         listener(Noted(f"{instead}. {error}"))
         return ()

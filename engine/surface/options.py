@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
 from octasplat.engine.fields import Group, Spelling, Unit
 
@@ -131,12 +131,13 @@ class ExtractionOptions(BaseModel):
         4.0, gt=0, description="Refuse a volume that takes more memory than this."
     )
 
-    @model_validator(mode="after")
-    def _consistent(self) -> "ExtractionOptions":
-        if self.unbounded and self.bounds is not None:
+    @field_validator("bounds")
+    @classmethod
+    def _is_box(cls, bounds: Box | None, info: Any) -> Box | None:
+        if bounds is None:
+            return None
+        if info.data.get("unbounded"):
             raise ValueError("bounds and unbounded contradict each other")
-        if self.bounds is not None and not all(
-            low < high for low, high in zip(self.bounds[:3], self.bounds[3:], strict=True)
-        ):
+        if not all(low < high for low, high in zip(bounds[:3], bounds[3:], strict=True)):
             raise ValueError("bounds must be x0,y0,z0,x1,y1,z1 with x0 < x1, y0 < y1 and z0 < z1")
-        return self
+        return bounds

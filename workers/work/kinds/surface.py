@@ -74,11 +74,8 @@ class Surface(OperationKind):
         return self.resolve({**presets, **kept, **changes})
 
     def places(self, task: Task, options: SurfaceJobOptions) -> dict[str, Path]:
-        """Return where a job reads and writes.
-
-        Photographs are those of a whole run only: a scene alone may have been moved since.
-        """
-        places = {**super().places(task, options), "output": task.results / f"surface.{options.format}"}
-        if task.source != task.run:
-            places.pop("dataset", None)
+        """Return where a job reads and writes; photographs are those of a whole run only."""
+        places = {"source": task.source, "output": task.results / f"surface.{options.format}"}
+        if task.scene is not None and task.source == task.run:
+            places["photographs"] = task.scene
         return places
