@@ -7,11 +7,12 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.fields import ADVANCED, Spelling
 from octasplat.engine.refusals import Refusal, SettingsRefused, refusals_of, submodels, unknown_setting
 from octasplat.engine.run_settings import RunSettings
 from octasplat.engine.settings import Settings
@@ -23,6 +24,33 @@ class ReconstructionConfig(RunSettings):
     """Everything that decides what a reconstruction gives; the number of threads does not."""
 
     train: TrainConfig = Field(TrainConfig(), description="The settings of the training.")
+    evaluate_background: Annotated[Literal["black", "white"], Spelling(("--background",)), ADVANCED] = Field(
+        "black", description="What lies behind renders and photographs with alpha when they are compared."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _measured_as_trained(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping) or values.get("evaluate_background") is not None:
+            return values
+        train = values.get("train", {})
+        behind = train.get("background") if isinstance(train, Mapping) else train.background
+        return {**values, "evaluate_background": "white" if behind == "white" else "black"}
+
+    def background_mismatch(self, has_alpha: bool) -> str | None:
+        """Return a sentence where views are measured on another background than they were trained on.
+
+        Args:
+            has_alpha: whether the photographs have alpha, so that they have no background of their own.
+        """
+        shown = self.evaluate_background
+        trained = self.train.background if self.train.background != "auto" else "black"
+        if has_alpha or trained not in ("black", "white") or trained == shown:
+            return None
+        return (
+            f"The scene is trained on {trained} and measured on {shown}, which shows where it does "
+            "not cover a photograph; leave the background of the evaluation out."
+        )
 
     def with_poses_decided(self, has_model: bool) -> "ReconstructionConfig":
         """Return the same with ``poses`` as they come out for a dataset with or without a COLMAP model."""

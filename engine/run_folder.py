@@ -198,4 +198,6 @@ def open_photographs(
     )
     for warning in dataset.warnings:
         tell(Warned(warning))
+    if (mismatch := config.background_mismatch(dataset.has_alpha)) is not None:
+        tell(Warned(mismatch))
     return dataset

@@ -46,9 +46,12 @@ class RunSettings(BaseModel):
         description="What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as "
         "the alpha, for objects that are cut out.",
     )
-    evaluate_background: Annotated[Literal["black", "white"], Spelling(("--background",)), ADVANCED] = Field(
-        "black",
-        description="What lies behind renders and photographs with alpha when they are compared.",
+    evaluate_background: Annotated[
+        Literal["black", "white"] | None, Spelling(("--background",)), ADVANCED
+    ] = Field(
+        None,
+        description="What lies behind renders and photographs with alpha when they are compared; by default "
+        "that of the training: white where train.background is white, else black.",
     )
     minutes: Annotated[float | None, Unit("minutes"), BASIC] = Field(
         None,

@@ -27,7 +27,7 @@ from octasplat.engine.render.orbit import (
 )
 from octasplat.engine.render.path_file import path_cameras
 from octasplat.engine.render.renderer import background_colour
-from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_background, run_viewpoints
+from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_background, run_near_world, run_viewpoints
 from octasplat.engine.scene.model import Viewpoints
 from octasplat.engine.scene.views_file import SplitViewpoints
 from octasplat.engine.shading.learnt_background import LearntBackground
@@ -96,7 +96,7 @@ def read_render_source(
     return RenderSource(
         read_gaussian_ply(source / SCENE)[0],
         config.train.trace,
-        config.train.near * viewpoints.extent,
+        run_near_world(source, viewpoints),
         config.evaluate_background,
         viewpoints,
         config.max_side,

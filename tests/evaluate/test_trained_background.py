@@ -1,0 +1,46 @@
+"""A scene is measured on the background that it was trained on; another one is told."""
+
+from pathlib import Path
+
+import pytest
+
+from octasplat.engine.config import ReconstructionConfig, read_config, resolve_config
+from octasplat.engine.events import Event, Warned
+from octasplat.engine.run_folder import open_photographs
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.engine.writing import write_json
+
+
+@pytest.mark.parametrize(
+    ("trained", "measured"), [("auto", "black"), ("black", "black"), ("white", "white"), ("random", "black")]
+)
+def test_the_default_is_that_of_the_training(trained: str, measured: str) -> None:
+    config = resolve_config("fast", assignments=[f"background={trained}"])
+    assert config.evaluate_background == measured
+
+
+def test_another_one_is_taken_where_it_is_asked_for(tmp_path: Path) -> None:
+    asked = {"evaluate_background": "black"}
+    config = resolve_config("fast", settings=asked, assignments=["background=white"])
+    assert config.evaluate_background == "black"
+    write_json(tmp_path / "config.json", {"reconstruction": config.model_dump(mode="json")})
+    assert read_config(tmp_path / "config.json") == config
+    assert ReconstructionConfig.model_validate(config.model_dump()) == config
+
+
+def test_a_mismatch_is_told_for_photographs_without_alpha(tmp_path: Path) -> None:
+    config = GeneratedSceneConfig(views=4, width_px=16, height_px=12, samples_per_side=1, points=60)
+    write_generated_scene(tmp_path / "scene", config)
+
+    def told(**settings: str) -> list[str]:
+        events: list[Event] = []
+        resolved = resolve_config("fast", settings=settings, assignments=["background=white"])
+        open_photographs(tmp_path / "scene", tmp_path / "run", resolved, 1, events.append)
+        return [event.message for event in events if isinstance(event, Warned)]
+
+    assert not any("measured on" in message for message in told())
+    assert any("trained on white and measured on black" in m for m in told(evaluate_background="black"))
+    mismatched = resolve_config(
+        "fast", settings={"evaluate_background": "black"}, assignments=["background=white"]
+    )
+    assert mismatched.background_mismatch(has_alpha=True) is None
