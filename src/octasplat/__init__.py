@@ -73,7 +73,13 @@ def __getattr__(name: str) -> object:
     if name not in _SOURCES:
         raise AttributeError(f"module 'octasplat' has no attribute '{name}'")
     module, attribute = _SOURCES[name]
-    value: object = getattr(import_module(f"octasplat.{module}"), attribute)
+    try:
+        value: object = getattr(import_module(f"octasplat.{module}"), attribute)
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"octasplat.{name} needs '{error.name}', which is not installed; install octasplat, of which "
+            "octasplat-client is only the part that talks to a service."
+        ) from error
     globals()[name] = value
     return value
 
