@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -57,6 +58,10 @@ class Result(BaseModel):
     def lines(self) -> tuple[str, ...]:
         """Return what a command prints about the result, a sentence each."""
         return tuple(f"Wrote {path}." for path in self.files)
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return "<br>".join(escape(line) for line in self.lines())
 
 
 class ScenesWritten(Result):

@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from octasplat.engine.render.cameras import RenderCamera as Camera
     from octasplat.engine.trace.protocol import TraceSettings
     from octasplat.images import Image, render
+    from octasplat.runs import Run
     from octasplat.scenes import Scene, load, save
     from octasplat.tracing import GaussianTensors, Rays, TracedRays, trace
+    from octasplat.verbs import crop, evaluate, material
 
 _SOURCES = {
     "Camera": ("engine.render.cameras", "RenderCamera"),
@@ -37,10 +39,14 @@ _SOURCES = {
     "Job": ("client", "Job"),
     "OctasplatError": ("engine.errors", "OctasplatError"),
     "Rays": ("tracing", "Rays"),
+    "Run": ("runs", "Run"),
     "Scene": ("scenes", "Scene"),
     "TraceSettings": ("engine.trace.protocol", "TraceSettings"),
     "TracedRays": ("tracing", "TracedRays"),
+    "crop": ("verbs", "crop"),
+    "evaluate": ("verbs", "evaluate"),
     "load": ("scenes", "load"),
+    "material": ("verbs", "material"),
     "render": ("images", "render"),
     "save": ("scenes", "save"),
     "trace": ("tracing", "trace"),
@@ -57,11 +63,15 @@ __all__ = [
     "Job",
     "OctasplatError",
     "Rays",
+    "Run",
     "Scene",
     "TraceSettings",
     "TracedRays",
     "__version__",
+    "crop",
+    "evaluate",
     "load",
+    "material",
     "render",
     "save",
     "trace",

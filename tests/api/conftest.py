@@ -1,6 +1,7 @@
 """A small scene that the examples of the documentation and the tests of the package work on."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,8 +12,16 @@ from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
 from octasplat.engine.gaussians.harmonics import spread_directions
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
+from octasplat.workers.work.kinds.options import resolve_reconstruction
 
 COUNT = 1200
+RUN_OPTIONS = {
+    "preset": "fast",
+    "train": {"iterations": 60, "rays": 512, "sh_degree": 0, "max_gaussians": 300, "initial_points": 300},
+    "exports": ["mesh.ply"],
+}
 
 
 def small_scene() -> FlatGaussians:
@@ -39,9 +48,35 @@ def scene_file(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of nine small photographs with their poses."""
+    folder = tmp_path_factory.mktemp("photographs") / "photos"
+    config = GeneratedSceneConfig(views=9, width_px=48, height_px=36, samples_per_side=1, points=300)
+    write_generated_scene(folder, config)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished_run(photographs: Path) -> Path:
+    """A run on the photographs that was soon over."""
+    folder = photographs.parent / "run"
+    reconstruct(photographs, folder, resolve_reconstruction(RUN_OPTIONS))
+    return folder
+
+
 @pytest.fixture
-def in_folder(scene_file: Path) -> Iterator[Path]:
-    """The folder that holds ``scene.ply``, as the current one."""
+def in_folder(scene_file: Path, photographs: Path, finished_run: Path) -> Iterator[Path]:
+    """A folder with ``scene.ply``, ``shiny.ply``, ``photos`` and ``run``, as the current one."""
+    folder = scene_file.parent
+    half = np.zeros((COUNT, 1), np.float32)
+    half[::2] = 1
+    shiny = small_scene().with_channels(
+        {"albedo": np.full((COUNT, 3), 0.5, np.float32), "metallic": half, "roughness": 0.5 - 0.2 * half}
+    )
+    write_gaussian_ply(shiny, folder / "shiny.ply")
+    shutil.copytree(photographs, folder / "photos")
+    shutil.copytree(finished_run, folder / "run")
     before = Path.cwd()
     os.chdir(scene_file.parent)
     yield scene_file.parent

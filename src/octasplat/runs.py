@@ -1,0 +1,146 @@
+"""Runs: reconstructions in folders, begun, stopped, gone on with, and looked at."""
+
+import json
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from octasplat.engine.errors import Cancelled, ConfigError
+from octasplat.engine.events import Event, Listener, TrainingProgress
+from octasplat.notebook import default_listener, table_html
+from octasplat.operating import run_operation
+from octasplat.places import PathLike
+from octasplat.scenes import Scene, load
+
+_CONFIG, _METRICS, _REPORT, _SCENE, _TRAINING = (
+    "config.json", "metrics.json", "report.html", "scene.ply", "training.json",
+)  # fmt: skip
+OnStep = Callable[[TrainingProgress], bool | None]
+"""Called with the state of the training every few iterations; returning False stops it."""
+
+
+def reconstruct_into(
+    values: Mapping[str, Any],
+    on_step: OnStep | None,
+    progress: Listener | None,
+    should_stop: Callable[[], bool],
+    threads: int,
+) -> "Run":
+    """Do the request of a reconstruction; where ``on_step`` returns False, return the unfinished run.
+
+    Raises:
+        Cancelled: ``should_stop`` returned True.
+        OctasplatError: as the operation does.
+    """
+    stopped = False
+    shown = progress or default_listener()
+
+    def listen(event: Event) -> None:
+        nonlocal stopped
+        shown(event)
+        if on_step is not None and isinstance(event, TrainingProgress) and on_step(event) is False:
+            stopped = True
+
+    try:
+        run_operation("reconstruct", values, listen, lambda: stopped or should_stop(), threads)
+    except Cancelled:
+        if not stopped:
+            raise
+    return Run(values["output"])
+
+
+class Run:
+    """A reconstruction in a folder, finished or not; wherever a path is asked for, it stands for its folder.
+
+    >>> import octasplat as osp
+    >>> run = osp.Run("run")
+    >>> run.is_finished, run.psnr > 10, run.report.name
+    (True, True, 'report.html')
+    >>> len(run.scene) > 100, run.scene.sh_degree
+    (True, 0)
+    >>> sorted(run.views)
+    ['view_000.png', 'view_008.png']
+    """
+
+    def __init__(self, folder: PathLike) -> None:
+        """Open a folder.
+
+        Raises:
+            ConfigError: it is not that of a run.
+        """
+        self.path = Path(folder)
+        if not (self.path / _CONFIG).is_file():
+            raise ConfigError(f"{self.path} holds no {_CONFIG}; name the folder of a run.")
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether its scene was trained and measured; if not, :func:`reconstruct` goes on with it."""
+        return (self.path / _SCENE).exists() and (self.path / _METRICS).exists()
+
+    @property
+    def metrics(self) -> Mapping[str, Any]:
+        """What was measured, as ``metrics.json`` holds it; empty before."""
+        return _json(self.path / _METRICS)
+
+    @property
+    def psnr(self) -> float | None:
+        """Mean PSNR of the held-out views in dB; None where nothing was measured."""
+        value = self.metrics.get("mean", {}).get("psnr")
+        return None if value is None else float(value)
+
+    @property
+    def views(self) -> Mapping[str, Mapping[str, float]]:
+        """Figures of each held-out view, by the name of its photograph."""
+        found: Mapping[str, Mapping[str, float]] = self.metrics.get("views", {})
+        return found
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """All settings."""
+        found: Mapping[str, Any] = _json(self.path / _CONFIG).get("reconstruction", {})
+        return found
+
+    @property
+    def training(self) -> Mapping[str, Any]:
+        """What is noted of the training, such as its ``seconds`` and ``iterations``; empty before its end."""
+        return _json(self.path / _TRAINING)
+
+    @property
+    def report(self) -> Path:
+        """The page that shows what was measured."""
+        return self.path / _REPORT
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene, read when it is first asked for."""
+        return load(self.path)
+
+    def __repr__(self) -> str:
+        state = "unfinished" if not self.is_finished else _decibels(self.psnr)
+        return f"Run({str(self.path)!r}, {state})"
+
+    def _repr_html_(self) -> str:
+        rows: dict[str, object] = {"state": "finished" if self.is_finished else "unfinished"}
+        mean = self.metrics.get("mean", {})
+        rows |= {name: f"{value:.4g}" for name, value in mean.items() if isinstance(value, int | float)}
+        if "seconds" in self.training:
+            rows["training"] = f"{self.training['seconds']:.0f} s"
+        if self.report.exists():
+            rows["report"] = self.report
+        return table_html(f"Run {self.path}", rows)
+
+
+def _decibels(psnr: float | None) -> str:
+    return "not measured" if psnr is None else f"PSNR {psnr:.2f} dB"
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    return content

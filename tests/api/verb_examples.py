@@ -1,0 +1,21 @@
+"""The example of each verb's docstring; the tests run them in a folder with ``scene.ply`` and ``run``."""
+
+EXAMPLES = {
+    "evaluate": """
+>>> import octasplat as osp
+>>> found = osp.evaluate("run")
+>>> found.psnr > 10, len(found.views)
+(True, 2)
+""",
+    "material": """
+>>> import octasplat as osp
+>>> osp.material("shiny.ply", "dull.ply", where="metallic > 0.5", set={"roughness": 0.9}).changed
+600
+""",
+    "crop": """
+>>> import octasplat as osp
+>>> cropped = osp.crop("scene.ply", "half.ply", where="z < 0")
+>>> cropped.kept, cropped.count
+(600, 1200)
+""",
+}

@@ -1,0 +1,169 @@
+"""Writes src/octasplat/verbs.py: a Python function for each operation, made from the fields of its request.
+
+Run it (``python tests/api/write_verbs.py``) after a change of a request; test_verbs.py compares.
+"""
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from pydantic import BaseModel, BeforeValidator
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+from verb_examples import EXAMPLES
+
+from octasplat.engine.fields import Positional
+from octasplat.engine.operations.base import Operation
+from octasplat.engine.operations.registry import operations
+
+VERBS = Path(__file__).parents[2] / "src" / "octasplat" / "verbs.py"
+PYTHON_NAMES = {"import": "import_"}
+HEAD = '''"""The verbs of octasplat on files: a function for each, with the options of its command.
+
+Written by tests/api/write_verbs.py from the requests of :mod:`octasplat.engine.operations`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel
+
+from octasplat.engine.events import Listener
+from octasplat.engine.operations.base import never
+from octasplat.operating import run_operation
+from octasplat.places import PathLike
+from octasplat.runs import OnStep, Run, reconstruct_into
+
+if TYPE_CHECKING:
+{imports}
+'''
+ON_STEP = "on_step: OnStep | None = None"
+ON_STEP_ARGUMENT = (
+    "on_step: called with the state of the training every few iterations; returning False stops it after a "
+    "checkpoint, and the run that is returned is unfinished. With ``resume=True`` another call goes on."
+)
+LAST_PARAMETERS = (
+    "progress: Listener | None = None",
+    "should_stop: Callable[[], bool] = never",
+    "threads: int = 0",
+)
+LAST_ARGUMENTS = (
+    "progress: told each event; by default they are logged, or shown in a notebook.",
+    "should_stop: asked now and then; True ends the work with ``Cancelled``.",
+    "threads: number of threads; 0 takes all cores. The result does not depend on it.",
+)
+
+
+def type_text(annotation: Any, metadata: tuple[Any, ...] = ()) -> str:
+    """Return the type of what a field takes, as source."""
+    parts = [_one(annotation)]
+    for mark in metadata:
+        if isinstance(mark, BeforeValidator):
+            more = mark.json_schema_input_type
+            parts.append("str" if more is PydanticUndefined else type_text(more))
+    alternatives = list(dict.fromkeys(alternative for part in parts for alternative in part.split(" | ")))
+    if "Any" in alternatives:
+        return "Any"
+    alternatives.sort(key=lambda alternative: alternative == "None")
+    return " | ".join(alternatives)
+
+
+def _one(annotation: Any) -> str:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return type_text(arguments[0], arguments[1:])
+    if origin in (Union, UnionType):
+        return " | ".join(type_text(argument) for argument in arguments)
+    if origin is Literal:
+        return f"Literal[{', '.join(map(_quoted, arguments))}]"
+    if origin in (tuple, list, set, frozenset):
+        inner = sorted({type_text(argument) for argument in arguments if argument is not Ellipsis})
+        return f"Sequence[{' | '.join(inner)}]"
+    if origin is dict or annotation is dict:
+        return "Mapping[str, Any]"
+    if isinstance(annotation, type):
+        if issubclass(annotation, BaseModel):
+            return "BaseModel | Mapping[str, Any]"
+        known = {NoneType: "None", Path: "PathLike", str: "str", int: "int", float: "float", bool: "bool"}
+        return known.get(annotation, "Any")
+    return "Any"
+
+
+def _quoted(value: object) -> str:
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def _default(info: FieldInfo) -> str:
+    value = info.default
+    if info.default_factory is not None or isinstance(value, BaseModel):
+        return "None"
+    return _quoted(value)
+
+
+def _parameters(fields: dict[str, FieldInfo]) -> Iterator[tuple[str, str, bool]]:
+    """Yield name, declaration and whether it may be given by position."""
+    for name, info in fields.items():
+        text = type_text(info.annotation, tuple(info.metadata))
+        places = name == "output" or any(isinstance(mark, Positional) for mark in info.metadata)
+        if info.is_required():
+            yield name, f"{name}: {text}", places
+            continue
+        default = _default(info)
+        if default == "None" and "None" not in text.split(" | ") and text != "Any":
+            text += " | None"
+        yield name, f"{name}: {text} = {default}", places
+
+
+def function(verb: "Operation[Any, Any]") -> str:
+    """Return the source of a verb's function."""
+    fields = verb.request.model_fields
+    declared = list(_parameters(fields))
+    first = [text for _, text, places in declared if places and "=" not in text]
+    first += [text for _, text, places in declared if places and "=" in text]
+    others = [text for _, text, places in declared if not places]
+    result, more, told = get_type_hints(verb.run)["return"].__name__, [], []
+    if verb.name == "reconstruct":
+        result, more, told = "Run", [ON_STEP], [ON_STEP_ARGUMENT]
+    signature = ",\n    ".join([*first, "*", *others, *more, *LAST_PARAMETERS])
+    order = [text.partition(":")[0] for text in (*first, *others)]
+    arguments = [f"{name}: {' '.join((fields[name].description or '').split())}" for name in order]
+    wrapped = "\n".join(
+        textwrap.fill(text, 104, initial_indent=" " * 8, subsequent_indent=" " * 12, break_long_words=False)
+        for text in (*arguments, *told, *LAST_ARGUMENTS)
+    )
+    example = textwrap.indent(EXAMPLES[verb.name].strip(), " " * 4)
+    values = "{" + ", ".join(f'"{name}": {name}' for name in fields) + "}"
+    call = f'run_operation("{verb.name}", {values}, progress, should_stop, threads)'
+    if verb.name == "reconstruct":
+        call = f"reconstruct_into({values}, on_step, progress, should_stop, threads)"
+    return (
+        f'def {PYTHON_NAMES.get(verb.name, verb.name)}(\n    {signature},\n) -> "{result}":\n'
+        f'    """{verb.title}\n\n    Args:\n{wrapped}\n\n    Raises:\n'
+        "        OctasplatError: something cannot be read, done or written; the text says what.\n\n"
+        f'{example}\n    """\n'
+        f"    return {call}\n"
+    )
+
+
+def source() -> str:
+    """Return what the module should be, formatted."""
+    verbs = operations()
+    found = [get_type_hints(verb.run)["return"] for verb in verbs if verb.name != "reconstruct"]
+    results = sorted((result.__module__, result.__name__) for result in found)
+    imports = "\n".join(f"    from {module} import {name}" for module, name in results)
+    text = "\n\n".join([HEAD.format(imports=imports), *map(function, verbs)])
+    for arguments in (
+        ("check", "--fix", "--exit-zero", "--quiet"),
+        ("format",),
+    ):  # without imports that nothing needs
+        command = (sys.executable, "-m", "ruff", *arguments, "--stdin-filename", str(VERBS), "-")
+        text = subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
+    return text
+
+
+if __name__ == "__main__":
+    VERBS.write_text(source(), encoding="utf-8")
