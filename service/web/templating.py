@@ -45,18 +45,21 @@ def page(
         status: of the answer.
         values: what the template shows.
     """
-    text = (
-        _environment()
-        .get_template(template)
-        .render(
-            who=who,
-            signed_in=session_secret(request) is not None,
-            path=request.url.path,
-            version=__version__,
-            **values,
-        )
+    text = render_template(
+        template,
+        who=who,
+        signed_in=session_secret(request) is not None,
+        path=request.url.path,
+        version=__version__,
+        **values,
     )
     return HTMLResponse(text, status, headers=PAGE_HEADERS)
+
+
+def render_template(template: str, **values: object) -> str:
+    """Return the text of a file in ``templates/`` that shows ``values``."""
+    text: str = _environment().get_template(template).render(**values)
+    return text
 
 
 @cache

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from octasplat.runs import Run
     from octasplat.scenes import Scene, load, save
     from octasplat.tracing import GaussianTensors, Rays, TracedRays, trace
-    from octasplat.verbs import crop, evaluate, material
+    from octasplat.verbs import crop, evaluate, material, surface
+    from octasplat.viewer import Viewer, view
 
 _SOURCES = {
     "Camera": ("engine.render.cameras", "RenderCamera"),
@@ -43,13 +44,16 @@ _SOURCES = {
     "Scene": ("scenes", "Scene"),
     "TraceSettings": ("engine.trace.protocol", "TraceSettings"),
     "TracedRays": ("tracing", "TracedRays"),
+    "Viewer": ("viewer", "Viewer"),
     "crop": ("verbs", "crop"),
     "evaluate": ("verbs", "evaluate"),
     "load": ("scenes", "load"),
     "material": ("verbs", "material"),
     "render": ("images", "render"),
     "save": ("scenes", "save"),
+    "surface": ("verbs", "surface"),
     "trace": ("tracing", "trace"),
+    "view": ("viewer", "view"),
 }
 """Module below this one, and the name in it, of everything public."""
 
@@ -67,6 +71,7 @@ __all__ = [
     "Scene",
     "TraceSettings",
     "TracedRays",
+    "Viewer",
     "__version__",
     "crop",
     "evaluate",
@@ -74,7 +79,9 @@ __all__ = [
     "material",
     "render",
     "save",
+    "surface",
     "trace",
+    "view",
 ]
 
 

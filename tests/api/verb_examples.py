@@ -12,6 +12,11 @@ EXAMPLES = {
 >>> osp.material("shiny.ply", "dull.ply", where="metallic > 0.5", set={"roughness": 0.9}).changed
 600
 """,
+    "surface": """
+>>> import octasplat as osp
+>>> osp.surface("run", "surface.glb", max_triangles=500).files[0].name
+'surface.glb'
+""",
     "crop": """
 >>> import octasplat as osp
 >>> cropped = osp.crop("scene.ply", "half.ply", where="z < 0")

@@ -208,6 +208,15 @@ const steps = {
         return found;
     },
 
+    /** The page of one scene, as octasplat.view serves it. */
+    async scene() {
+        const page = await open();
+        await page.goto(job.url);
+        await page.waitForSelector("#viewer[data-ready=yes]");
+        await page.waitForTimeout(500);
+        return { heading: await page.textContent("h1"), count: await page.textContent("#viewer .count"), shown: await brightness(page) };
+    },
+
     /** From the list to the viewer and back with keys alone; nothing is clicked. */
     async keyboard() {
         const found = {};

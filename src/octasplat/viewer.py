@@ -1,0 +1,123 @@
+"""A scene in a browser of this machine: the viewer of the service's page, without the service."""
+
+import math
+import tempfile
+import weakref
+import webbrowser
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.run_folder import CONFIG, is_run, run_viewpoints
+from octasplat.places import PathLike
+from octasplat.runs import Run
+from octasplat.scenes import Scene, load
+from octasplat.service.web.cameras import PhotographPose, viewer_cameras
+from octasplat.service.web.one_scene import SceneServer, ShownScene
+
+
+class Viewer:
+    """A page with a 3D view, served as long as this process runs or until it is closed.
+
+    >>> import octasplat as osp
+    >>> with osp.view("scene.ply", open_browser=False) as viewer:
+    ...     viewer.url.startswith("http://127.0.0.1:")
+    True
+    """
+
+    def __init__(self, server: SceneServer, folder: "tempfile.TemporaryDirectory[str]") -> None:
+        """Take over a running server; :func:`view` starts one."""
+        self._server = server
+        self._end = weakref.finalize(self, _end, server, folder)
+
+    @property
+    def url(self) -> str:
+        """The address of the page, for browsers of this machine."""
+        return self._server.url
+
+    def close(self) -> None:
+        """End the server; the page goes on with what it has loaded."""
+        self._end()
+
+    def wait(self) -> None:
+        """Wait until the viewer is closed, or for Ctrl-C: at the end of a script."""
+        self._server.wait()
+
+    def __enter__(self) -> "Viewer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Viewer({self.url!r})"
+
+    def _repr_html_(self) -> str:
+        return f'<a href="{self.url}" target="_blank">Open the scene at {self.url}</a>'
+
+
+def view(
+    source: Scene | PathLike,
+    *,
+    open_browser: bool = True,
+    port: int = 0,
+    background: str = "black",
+) -> Viewer:
+    """Show a scene in a browser, and return the viewer, which is to be kept.
+
+    The page draws the octagons as the tracer sees them and comes from this process alone. Of a run, one can
+    go from photograph to photograph.
+
+    Args:
+        source: a scene, a file of any format, or a run.
+        open_browser: open the page; else its address is all.
+        port: where to serve it; 0 takes a free one.
+        background: ``black`` or ``white``, to begin with.
+
+    Raises:
+        OctasplatError: the source cannot be read.
+
+    >>> import octasplat as osp
+    >>> viewer = osp.view(osp.load("scene.ply"), open_browser=False)
+    >>> viewer.close()
+    """
+    scene = source if isinstance(source, Scene) else load(source)
+    path = None if isinstance(source, Scene) else Path(source)
+    run = path if path is not None and is_run(path) and (path / CONFIG).exists() else None
+    folder = tempfile.TemporaryDirectory(prefix="octasplat-view-")
+    ply = Path(folder.name) / "scene.ply"
+    write_gaussian_ply(scene.gaussians, ply, facts=scene.facts)
+    name = "Scene" if path is None else path.resolve().name
+    q = None if run is None else float(Run(run).settings["train"]["trace"]["q"])
+    shown = ShownScene(name, ply, {"views": []} if run is None else _cameras(run), q, background)
+    viewer = Viewer(SceneServer(shown, port), folder)
+    if open_browser:
+        webbrowser.open(viewer.url)
+    return viewer
+
+
+def _cameras(run: Path) -> Mapping[str, Any]:
+    """Where the photographs of a run were taken, for the page."""
+    viewpoints = run_viewpoints(run)
+    poses = []
+    for shot in viewpoints.views:
+        camera = viewpoints.cameras[shot.camera_index]
+        # Of a pinhole camera; other lenses are shown as if they were one.
+        fov = 2 * math.degrees(math.atan(shot.height_px * math.tan(camera.pixel_rad) / 2))
+        poses.append(
+            PhotographPose(
+                shot.name,
+                shot.rotation_cam_from_world,
+                shot.origin_world,
+                fov,
+                shot.width_px / shot.height_px,
+            )
+        )
+    held_out = [viewpoints.views[number].name for number in viewpoints.test_indices.tolist()]
+    return viewer_cameras(poses, held_out)
+
+
+def _end(server: SceneServer, folder: "tempfile.TemporaryDirectory[str]") -> None:
+    server.close()
+    folder.cleanup()
