@@ -23,11 +23,12 @@ if TYPE_CHECKING:
     from octasplat.engine.errors import Cancelled, ConfigError, OctasplatError
     from octasplat.engine.render.cameras import RenderCamera as Camera
     from octasplat.engine.trace.protocol import TraceSettings
-    from octasplat.images import Image, render
+    from octasplat.images import Image
+    from octasplat.rendering import render
     from octasplat.runs import Run
     from octasplat.scenes import Scene, load, save
     from octasplat.tracing import GaussianTensors, Rays, TracedRays, trace
-    from octasplat.verbs import crop, evaluate, material, surface
+    from octasplat.verbs import crop, evaluate, material, relight, stage_init, surface
     from octasplat.viewer import Viewer, view
 
 _SOURCES = {
@@ -49,8 +50,10 @@ _SOURCES = {
     "evaluate": ("verbs", "evaluate"),
     "load": ("scenes", "load"),
     "material": ("verbs", "material"),
-    "render": ("images", "render"),
+    "relight": ("verbs", "relight"),
+    "render": ("rendering", "render"),
     "save": ("scenes", "save"),
+    "stage_init": ("verbs", "stage_init"),
     "surface": ("verbs", "surface"),
     "trace": ("tracing", "trace"),
     "view": ("viewer", "view"),
@@ -77,8 +80,10 @@ __all__ = [
     "evaluate",
     "load",
     "material",
+    "relight",
     "render",
     "save",
+    "stage_init",
     "surface",
     "trace",
     "view",

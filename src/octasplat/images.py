@@ -99,22 +99,16 @@ class Image:
         return f'<img src="data:image/png;base64,{source}" alt="{html.escape(repr(self))}">'
 
 
-def render(
+def render_view(
     scene: Scene, camera: RenderCamera, *, background: Background = "black", threads: int = 0
 ) -> Image:
-    """Return what a camera sees of a scene in memory.
+    """Return what a camera sees of a scene in memory, see :func:`octasplat.rendering.render`.
 
     Args:
         scene: the scene.
         camera: where from; :meth:`Scene.camera` and :meth:`Camera.looking_at` make some.
         background: what lies behind, by name or as display values in [0, 1].
         threads: 0 takes all cores; the result does not depend on it.
-
-    >>> import octasplat as osp
-    >>> scene = osp.load("scene.ply")
-    >>> camera = osp.Camera.looking_at((0, 0, -4), (0, 0, 0), 96, 64)
-    >>> osp.render(scene, camera, background="white")
-    Image(96 x 64)
     """
     from octasplat.engine.render.oversampling import rays_across, render_averaged
     from octasplat.engine.render.renderer import background_colour

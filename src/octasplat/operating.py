@@ -22,7 +22,7 @@ def run_operation(
 
     Args:
         name: of the operation.
-        values: those of its request by field; what equals the default counts as not given.
+        values: those of its request by field; None, and a boolean that is the default, count as not given.
         progress: told the events; None logs them, or shows them in a notebook.
         should_stop: asked now and then; True ends the work with ``Cancelled``.
         threads: 0 takes all cores.
@@ -41,7 +41,7 @@ def run_operation(
 
 
 def _is_default(value: Any, field: Any) -> bool:
-    return value is None or (type(value) is type(field.default) and bool(value == field.default))
+    return value is None or (isinstance(value, bool) and value is field.default)
 
 
 def _plain(value: Any) -> Any:

@@ -13,6 +13,7 @@ from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
 from octasplat.engine.gaussians.harmonics import spread_directions
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.pipeline import reconstruct
+from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 from octasplat.workers.work.kinds.options import resolve_reconstruction
 
@@ -75,6 +76,7 @@ def in_folder(scene_file: Path, photographs: Path, finished_run: Path) -> Iterat
         {"albedo": np.full((COUNT, 3), 0.5, np.float32), "metallic": half, "roughness": 0.5 - 0.2 * half}
     )
     write_gaussian_ply(shiny, folder / "shiny.ply")
+    write_environment(folder / "studio.hdr", np.ones((16, 32, 3), np.float32))
     shutil.copytree(photographs, folder / "photos")
     shutil.copytree(finished_run, folder / "run")
     before = Path.cwd()

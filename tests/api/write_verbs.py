@@ -21,14 +21,16 @@ from octasplat.engine.operations.base import Operation
 from octasplat.engine.operations.registry import operations
 
 VERBS = Path(__file__).parents[2] / "src" / "octasplat" / "verbs.py"
-PYTHON_NAMES = {"import": "import_"}
+PYTHON_NAMES = {"import": "import_", "stage-init": "stage_init"}
+DECIDED_BY_OTHERS = {"mode", "format"}
+"""Fields whose default is what fits the other fields."""
 HEAD = '''"""The verbs of octasplat on files: a function for each, with the options of its command.
 
 Written by tests/api/write_verbs.py from the requests of :mod:`octasplat.engine.operations`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from pydantic import BaseModel
 
@@ -97,11 +99,15 @@ def _quoted(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-def _default(info: FieldInfo) -> str:
-    value = info.default
-    if info.default_factory is not None or isinstance(value, BaseModel):
-        return "None"
-    return _quoted(value)
+def _default(name: str, info: FieldInfo) -> str:
+    """Return the default as a sentence, nothing where the description says it or others decide it."""
+    value, text = info.default, info.description or ""
+    known = (
+        isinstance(value, str | int | float | tuple) and not isinstance(value, bool) and value not in ("", ())
+    )
+    if not known or "default" in text or name in DECIDED_BY_OTHERS:
+        return ""
+    return f" Default: {value}."
 
 
 def _parameters(fields: dict[str, FieldInfo]) -> Iterator[tuple[str, str, bool]]:
@@ -112,10 +118,12 @@ def _parameters(fields: dict[str, FieldInfo]) -> Iterator[tuple[str, str, bool]]
         if info.is_required():
             yield name, f"{name}: {text}", places
             continue
-        default = _default(info)
-        if default == "None" and "None" not in text.split(" | ") and text != "Any":
+        if isinstance(info.default, bool):
+            yield name, f"{name}: {text} = {info.default}", places
+            continue
+        if "None" not in text.split(" | ") and text != "Any":
             text += " | None"
-        yield name, f"{name}: {text} = {default}", places
+        yield name, f"{name}: {text} = None", places
 
 
 def function(verb: "Operation[Any, Any]") -> str:
@@ -130,7 +138,10 @@ def function(verb: "Operation[Any, Any]") -> str:
         result, more, told = "Run", [ON_STEP], [ON_STEP_ARGUMENT]
     signature = ",\n    ".join([*first, "*", *others, *more, *LAST_PARAMETERS])
     order = [text.partition(":")[0] for text in (*first, *others)]
-    arguments = [f"{name}: {' '.join((fields[name].description or '').split())}" for name in order]
+    arguments = [
+        f"{name}: {' '.join((fields[name].description or '').split())}{_default(name, fields[name])}"
+        for name in order
+    ]
     wrapped = "\n".join(
         textwrap.fill(text, 104, initial_indent=" " * 8, subsequent_indent=" " * 12, break_long_words=False)
         for text in (*arguments, *told, *LAST_ARGUMENTS)
@@ -149,13 +160,23 @@ def function(verb: "Operation[Any, Any]") -> str:
     )
 
 
+def options(verb: "Operation[Any, Any]") -> str:
+    """Return the source of a dictionary type that holds what is not given by position, for overloads."""
+    declared = [text for _, text, places in _parameters(verb.request.model_fields) if not places]
+    rows = "\n    ".join(text.partition(" = ")[0] for text in (*declared, *LAST_PARAMETERS))
+    name = f"{verb.name.title()}Arguments"
+    told = f'"""What :func:`{verb.name}` takes by name."""'
+    return f"class {name}(TypedDict, total=False):\n    {told}\n\n    {rows}\n"
+
+
 def source() -> str:
     """Return what the module should be, formatted."""
     verbs = operations()
     found = [get_type_hints(verb.run)["return"] for verb in verbs if verb.name != "reconstruct"]
     results = sorted((result.__module__, result.__name__) for result in found)
     imports = "\n".join(f"    from {module} import {name}" for module, name in results)
-    text = "\n\n".join([HEAD.format(imports=imports), *map(function, verbs)])
+    typed = [options(verb) for verb in verbs if verb.name == "render"]
+    text = "\n\n".join([HEAD.format(imports=imports), *typed, *map(function, verbs)])
     for arguments in (
         ("check", "--fix", "--exit-zero", "--quiet"),
         ("format",),

@@ -1,0 +1,55 @@
+"""Pictures: of a scene in memory as arrays, of a file or run as files."""
+
+from typing import TYPE_CHECKING, Any, Unpack, overload
+
+from octasplat import verbs
+from octasplat.engine.render.cameras import RenderCamera
+from octasplat.images import Background, Image, render_view
+from octasplat.places import PathLike
+from octasplat.scenes import Scene
+
+if TYPE_CHECKING:
+    from octasplat.engine.operations.render import RenderResult
+
+
+@overload
+def render(
+    source: Scene, camera: RenderCamera, /, *, background: Background = "black", threads: int = 0
+) -> Image: ...
+
+
+@overload
+def render(
+    source: PathLike, output: PathLike, /, **options: Unpack[verbs.RenderArguments]
+) -> "RenderResult": ...
+
+
+def render(source: Scene | PathLike, target: RenderCamera | PathLike, /, **options: Any) -> Any:
+    """Return what a camera sees of a scene in memory, or write pictures of a file or run.
+
+    Of a scene in memory:
+
+    Args:
+        source: the scene.
+        target: the camera; :meth:`Scene.camera`, :meth:`Scene.turntable` and :meth:`Camera.looking_at` make
+            some.
+        options: ``background``, what lies behind, by name or as display values in [0, 1]; ``threads``, of
+            which 0 takes all cores.
+
+    >>> import octasplat as osp
+    >>> scene = osp.load("scene.ply")
+    >>> camera = osp.Camera.looking_at((0, 0, -4), (0, 0, 0), 96, 64)
+    >>> osp.render(scene, camera, background="white")
+    Image(96 x 64)
+
+    Of a file or a run, ``target`` is where to write, and the options are those of the command ``octasplat
+    render``, see :func:`octasplat.verbs.render`:
+
+    >>> osp.render("run", "turntable/", mode="turntable", frames=3, width_px=64, height_px=48).images
+    3
+    """
+    if isinstance(source, Scene) and isinstance(target, RenderCamera):
+        return render_view(source, target, **options)
+    if isinstance(source, Scene) or isinstance(target, RenderCamera):
+        raise TypeError("a scene in memory goes with a camera, a file or run with a place for pictures")
+    return verbs.render(source, target, **options)
