@@ -28,7 +28,21 @@ if TYPE_CHECKING:
     from octasplat.runs import Run
     from octasplat.scenes import Scene, load, save
     from octasplat.tracing import GaussianTensors, Rays, TracedRays, trace
-    from octasplat.verbs import crop, evaluate, material, relight, stage_init, surface
+    from octasplat.verbs import (
+        clean,
+        crop,
+        deform,
+        edit,
+        evaluate,
+        export,
+        import_,
+        material,
+        merge,
+        relight,
+        stage_init,
+        surface,
+        transform,
+    )
     from octasplat.viewer import Viewer, view
 
 _SOURCES = {
@@ -46,16 +60,23 @@ _SOURCES = {
     "TraceSettings": ("engine.trace.protocol", "TraceSettings"),
     "TracedRays": ("tracing", "TracedRays"),
     "Viewer": ("viewer", "Viewer"),
+    "clean": ("verbs", "clean"),
     "crop": ("verbs", "crop"),
+    "deform": ("verbs", "deform"),
+    "edit": ("verbs", "edit"),
     "evaluate": ("verbs", "evaluate"),
+    "export": ("verbs", "export"),
+    "import_": ("verbs", "import_"),
     "load": ("scenes", "load"),
     "material": ("verbs", "material"),
+    "merge": ("verbs", "merge"),
     "relight": ("verbs", "relight"),
     "render": ("rendering", "render"),
     "save": ("scenes", "save"),
     "stage_init": ("verbs", "stage_init"),
     "surface": ("verbs", "surface"),
     "trace": ("tracing", "trace"),
+    "transform": ("verbs", "transform"),
     "view": ("viewer", "view"),
 }
 """Module below this one, and the name in it, of everything public."""
@@ -76,16 +97,23 @@ __all__ = [
     "TracedRays",
     "Viewer",
     "__version__",
+    "clean",
     "crop",
+    "deform",
+    "edit",
     "evaluate",
+    "export",
+    "import_",
     "load",
     "material",
+    "merge",
     "relight",
     "render",
     "save",
     "stage_init",
     "surface",
     "trace",
+    "transform",
     "view",
 ]
 

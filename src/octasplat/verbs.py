@@ -14,13 +14,20 @@ from octasplat.operating import run_operation
 from octasplat.places import PathLike
 
 if TYPE_CHECKING:
+    from octasplat.engine.operations.clean import CleanResult
     from octasplat.engine.operations.crop import CropResult
+    from octasplat.engine.operations.deform import DeformResult
+    from octasplat.engine.operations.edit import EditResult
     from octasplat.engine.operations.evaluate import EvaluateResult
+    from octasplat.engine.operations.export import ExportResult
+    from octasplat.engine.operations.import_ import ImportResult
     from octasplat.engine.operations.material import MaterialResult
+    from octasplat.engine.operations.merge import MergeResult
     from octasplat.engine.operations.relight import RelightResult
     from octasplat.engine.operations.render import RenderResult
     from octasplat.engine.operations.stage_init import StageInitResult
     from octasplat.engine.operations.surface import SurfaceResult
+    from octasplat.engine.operations.transform import TransformResult
 
 
 class RenderArguments(TypedDict, total=False):
@@ -440,6 +447,7 @@ def relight(
     source: PathLike,
     output: PathLike,
     *,
+    environments: Sequence[PathLike],
     mode: Literal["turntable", "views", "path", "camera"] | None = None,
     views: Literal["held-out", "train", "all"] | None = None,
     photographs: Sequence[str] | None = None,
@@ -462,7 +470,6 @@ def relight(
     resume: bool = False,
     or_anew: bool = False,
     frames_folder: PathLike | None = None,
-    environments: Sequence[PathLike],
     by: Literal["split-sum", "path"] | None = None,
     samples: int | None = None,
     depth: int | None = None,
@@ -480,6 +487,7 @@ def relight(
     Args:
         source: The scene to render: the folder of a run, or a file of any format.
         output: A folder, a pattern such as frames/%04d.png (or .exr), or a video such as turn.mp4.
+        environments: Equirectangular HDR or EXR image of the light; several are done one after another.
         mode: The cameras: one turn round the scene, the views of the photographs, a camera path, or a
             single camera.
         views: Render the views of the photographs: those held out, those trained on, or all. Only of a
@@ -511,7 +519,6 @@ def relight(
         resume: Go on with a render that was stopped, if there is one.
         or_anew: Begin anew where the images that are there are of another render.
         frames_folder: Where a video keeps its frames until it is whole. [default: beside it]
-        environments: Equirectangular HDR or EXR image of the light; several are done one after another.
         by: Method: split-sum is fast, as in training, with traced visibility; path is right, by paths
             of light. Default: split-sum.
         samples: Rays or paths per pixel. [default: 4 rays of split-sum, 64 paths]
@@ -616,6 +623,332 @@ def stage_init(
     )
 
 
+def export(
+    source: PathLike,
+    files: Sequence[PathLike],
+    *,
+    min_opacity: float | None = None,
+    sh_pad_degree: int | None = None,
+    spz_version: Literal[3, 4] | None = None,
+    opaque: bool = False,
+    chunks: int | None = None,
+    texture_size: int | None = None,
+    ids: bool = True,
+    q: float | None = None,
+    colour: Literal["cameras", "constant"] | Sequence[float] | str | None = None,
+    for_viewers: bool = False,
+    materials: bool = False,
+    up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
+    format: str | None = None,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "ExportResult":
+    """Gaussians to meshes and other formats.
+
+    Args:
+        source: The scene to read: a file of any format, or the folder of a run.
+        files: Files to write; their names say the formats.
+        min_opacity: Leave fainter Gaussians out. Default: 0.0.
+        sh_pad_degree: Gaussian PLY: pad the spherical harmonics with zeros up to this degree.
+        spz_version: SPZ: 3 (gzip), which every viewer reads, or 4 (Zstandard). Default: 3.
+        opaque: GLB: cut alpha at a threshold instead of blending, for programs that cannot sort.
+        chunks: GLB: most spatial chunks, which programs sort by distance; rounded down to a power of
+            two. Default: 64.
+        texture_size: GLB, OBJ: side of the texture that holds the fall-off. Default: 128.
+        ids: GLB: write the numbers by which edits find back to their Gaussians.
+        q: Meshes: squared radius of the octagons in standard deviations. [default: that of the run, of
+            a file 9.21]
+        colour: Formats with one colour for each Gaussian: the one that loses least seen from the
+            photographs' places of a run, or from all around a file; the harmonics' constant part; or
+            the one seen along a direction. [default: cameras for a run, constant for a file]
+        for_viewers: GLB: for programs that sort chunks at best: solid middles beneath, and in a run
+            whose photographs were taken from one side, the order that is right from most of them.
+            Carries no numbers for edits.
+        materials: GLB: base colour, metallic and roughness instead of colours that have their light in
+            them.
+        up: With materials: the axis that points up. [default: the run's, of a file -y]
+        format: The format, if OUT's name does not say it.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> [path.name for path in osp.export("run", ["scene.glb", "scene.splat"]).files]
+    ['scene.glb', 'scene.splat']
+    """
+    return run_operation(
+        "export",
+        {
+            "source": source,
+            "min_opacity": min_opacity,
+            "sh_pad_degree": sh_pad_degree,
+            "spz_version": spz_version,
+            "opaque": opaque,
+            "chunks": chunks,
+            "texture_size": texture_size,
+            "ids": ids,
+            "q": q,
+            "colour": colour,
+            "for_viewers": for_viewers,
+            "materials": materials,
+            "up": up,
+            "files": files,
+            "format": format,
+        },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+def import_(
+    file: PathLike,
+    output: PathLike,
+    *,
+    format: str | None = None,
+    drop_invalid: bool = False,
+    sh_degree: int | None = None,
+    channels: Literal["own", "all"] | Sequence[str] | str | None = None,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "ImportResult":
+    """Splats of any format to a scene of flat Gaussians.
+
+    Args:
+        file: The scene to read, a file of any known format.
+        output: The scene to write.
+        format: The format, if the file does not show it.
+        drop_invalid: Leave out Gaussians with values that are not finite numbers.
+        sh_degree: Keep the spherical harmonics up to this degree only.
+        channels: Further numbers of each Gaussian to keep, as albedo,metallic; all for whatever is
+            there; own for those that octasplat wrote. Default: own.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> splats = osp.save(osp.load("scene.ply"), "foreign.splat")
+    >>> osp.import_(splats, "imported.ply").files[0].name
+    'imported.ply'
+    """
+    return run_operation(
+        "import",
+        {
+            "file": file,
+            "format": format,
+            "drop_invalid": drop_invalid,
+            "sh_degree": sh_degree,
+            "channels": channels,
+            "output": output,
+        },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+def edit(
+    source: PathLike,
+    output: PathLike,
+    *,
+    meshes: Sequence[PathLike],
+    report: PathLike | None = None,
+    method: Literal["least-squares", "three-point"] | None = None,
+    damaged: Literal["repair", "drop"] | None = None,
+    axes: Literal["auto"] | Literal["x0", "x90", "x180", "x270"] | None = None,
+    q: float | None = None,
+    min_opacity: float | None = None,
+    max_residual: float | None = None,
+    whole_octagons: bool = False,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "EditResult":
+    """A mesh edited elsewhere back to Gaussians.
+
+    Args:
+        source: The scene to read: a file of any format, or the folder of a run.
+        output: The scene to write; the suffix says in which format. Of a run, a name without suffix
+            writes a folder that is a run again, with what of it stays valid. For a sequence a pattern
+            such as out/%04d.ply, or a folder.
+        meshes: The edited mesh (.ply, .obj or .glb); several, or here a quoted pattern such as
+            'frames/*.ply', are a sequence.
+        report: Write all counts there.
+        method: How a frame follows from the corners of its octagon: least-squares over all of them, or
+            three-point, the rule of the paper from corners 0, 2 and 6, which drops shear. Default:
+            least-squares.
+        damaged: What becomes of octagons that lost corners, flipped or crumpled: repair fits them to
+            the corners left, turns them back or moves them as their neighbours were; drop leaves them
+            out. Default: repair.
+        axes: Turn of the mesh about x, in degrees, that brings it back to the scene's axes. Default:
+            auto.
+        q: What the mesh was exported with, should it not say.
+        min_opacity: Least opacity that the mesh was exported with, should it not say; without it every
+            Gaussian that can have an octagon is taken to have one.
+        max_residual: Octagons further from an affine image than this many standard deviations are
+            crumpled. Default: 1.0.
+        whole_octagons: Octagons of which only some corners moved move as a whole, or not at all if most
+            stayed.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> len(osp.load(osp.edit("run", "edited.ply", meshes=["run/mesh.ply"]).files[0])) > 100
+    True
+    """
+    return run_operation(
+        "edit",
+        {
+            "source": source,
+            "output": output,
+            "report": report,
+            "method": method,
+            "damaged": damaged,
+            "axes": axes,
+            "q": q,
+            "min_opacity": min_opacity,
+            "max_residual": max_residual,
+            "whole_octagons": whole_octagons,
+            "meshes": meshes,
+        },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+def deform(
+    source: PathLike,
+    output: PathLike,
+    *,
+    proxy: PathLike,
+    deformed: Sequence[PathLike],
+    report: PathLike | None = None,
+    method: Literal["nearest", "mvc"] | None = None,
+    reach: float | None = None,
+    axes: Literal["x0", "x90", "x180", "x270"] | None = None,
+    mirrored: Literal["auto", "yes", "no"] | None = None,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "DeformResult":
+    """A scene that follows a deformed cage or coarse mesh.
+
+    Args:
+        source: The scene to read: a file of any format, or the folder of a run.
+        output: The scene to write; the suffix says in which format. Of a run, a name without suffix
+            writes a folder that is a run again, with what of it stays valid. For a sequence a pattern
+            such as out/%04d.ply, or a folder.
+        proxy: The mesh at rest (.ply, .obj or .glb), lying on or around what is to move.
+        deformed: The same mesh deformed; several, or here a quoted pattern such as 'frames/*.obj', are
+            a sequence.
+        report: Write all counts there.
+        method: nearest: follow the triangles close by; mvc: mean-value coordinates of a closed cage.
+            Default: nearest.
+        reach: Follow fully up to this distance from the mesh, and not at all beyond twice of it; inf
+            for everything. [default: nearest: a tenth of the mesh's diagonal; mvc: inside of the cage]
+        axes: Turn of both meshes about x, in degrees, that brings them to the scene's axes; x90 for
+            what Blender saves as OBJ or GLB beside a scene imported as PLY. Default: x0.
+        mirrored: Whether the deformed mesh was mirrored; auto looks at it, which a flat mesh cannot
+            show. Default: auto.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> osp.deform("scene.ply", "bent.ply", proxy="cage.obj", deformed=["bent.obj"]).moving
+    1200
+    """
+    return run_operation(
+        "deform",
+        {
+            "source": source,
+            "output": output,
+            "report": report,
+            "proxy": proxy,
+            "deformed": deformed,
+            "method": method,
+            "reach": reach,
+            "axes": axes,
+            "mirrored": mirrored,
+        },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+def transform(
+    source: PathLike,
+    output: PathLike,
+    *,
+    matrix: PathLike | None = None,
+    up: Sequence[Literal["x", "-x", "y", "-y", "z", "-z"]] | None = None,
+    scale: float | None = None,
+    rotate: Sequence[Sequence[Literal["x", "y", "z"] | float]] | None = None,
+    translate: Sequence[float] | None = None,
+    about: Sequence[float] | None = None,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "TransformResult":
+    """Move, turn or scale a scene.
+
+    Args:
+        source: The scene to read: a file of any format, or the folder of a run.
+        output: The scene to write; the suffix says in which format. Of a run, a name without suffix
+            writes a folder that is a run again, with what of it stays valid.
+        matrix: A text file with an affine 4 x 4 or 3 x 4 matrix, row by row, that maps old points to
+            new ones.
+        up: Turn the axis that points up to another: -y z from COLMAP's usual frame to Blender's.
+        scale: Scale by a factor.
+        rotate: Turn about an axis, counter-clockwise seen from its tip; may be repeated.
+        translate: Move.
+        about: The point that up, scale and rotate leave where it is. Default: (0.0, 0.0, 0.0).
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> osp.transform("scene.ply", "moved.ply", translate=(0, 0, 1), scale=2).count
+    1200
+    """
+    return run_operation(
+        "transform",
+        {
+            "source": source,
+            "output": output,
+            "matrix": matrix,
+            "up": up,
+            "scale": scale,
+            "rotate": rotate,
+            "translate": translate,
+            "about": about,
+        },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
 def crop(
     source: PathLike,
     output: PathLike,
@@ -632,7 +965,8 @@ def crop(
 
     Args:
         source: The scene to read: a file of any format, or the folder of a run.
-        output: The scene to write; the suffix says in which format.
+        output: The scene to write; the suffix says in which format. Of a run, a name without suffix
+            writes a folder that is a run again, with what of it stays valid.
         where: Comparisons joined by and, or, not that hold for them, of x, y, z, opacity and channels
             such as metallic, roughness and albedo.r: 'metallic > 0.5 and z < 0'.
         box: Two corners of a box that their centres lie in, smallest coordinates first.
@@ -659,6 +993,112 @@ def crop(
             "box": box,
             "sphere": sphere,
             "inverse": inverse,
+        },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+def merge(
+    source: PathLike,
+    output: PathLike,
+    scenes: Sequence[PathLike] | None = None,
+    *,
+    sh_degree: int | None = None,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "MergeResult":
+    """Put scenes together.
+
+    Args:
+        source: The scene to read: a file of any format, or the folder of a run.
+        output: The scene to write; the suffix says in which format. Of a run, a name without suffix
+            writes a folder that is a run again, with what of it stays valid.
+        scenes: The other scenes: files of any format, each in the same frame.
+        sh_degree: Degree of the colours' harmonics. [default: the highest among the scenes]
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> len(osp.load(osp.merge("scene.ply", "both.ply", ["shiny.ply"]).files[0]))
+    2400
+    """
+    return run_operation(
+        "merge",
+        {"source": source, "output": output, "scenes": scenes, "sh_degree": sh_degree},
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+def clean(
+    source: PathLike,
+    output: PathLike | None = None,
+    *,
+    min_opacity: float | None = None,
+    min_scale: float | None = None,
+    max_scale: float | None = None,
+    floaters: bool = True,
+    min_group: int | None = None,
+    link: float | None = None,
+    neighbours: int | None = None,
+    near_share: float | None = None,
+    dry_run: bool = False,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "CleanResult":
+    """Remove faint Gaussians, oversized ones and floaters.
+
+    Args:
+        source: The scene to read: a file of any format, or the folder of a run.
+        output: The scene to write; the suffix says in which format. Of a run, a name without suffix
+            writes a folder that is a run again, with what of it stays valid.
+        min_opacity: Remove fainter ones; below 0.01 they cannot be seen. Default: 0.01.
+        min_scale: Remove those whose larger standard deviation is smaller, in the scene's units.
+            Default: 0.0.
+        max_scale: Remove those whose larger standard deviation is larger, in the scene's units.
+        floaters: Remove small groups by themselves.
+        min_group: Groups of fewer Gaussians are floaters. Default: 20.
+        link: Neighbours belong together if their centres are no further apart than this many times the
+            sum of their standard deviations. Default: 1.0.
+        neighbours: How many nearest neighbours of a Gaussian may belong to its group. Default: 12.
+        near_share: In a run: remove those nearer to the camera of a training view than this share of
+            the distance at which the sparse points around it begin; 0 for none. Default: 0.25.
+        dry_run: Only count.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> cleaned = osp.clean("scene.ply", "cleaned.ply", min_opacity=0.5, floaters=False)
+    >>> cleaned.count, cleaned.kept + cleaned.faint
+    (1200, 1200)
+    """
+    return run_operation(
+        "clean",
+        {
+            "source": source,
+            "min_opacity": min_opacity,
+            "min_scale": min_scale,
+            "max_scale": max_scale,
+            "floaters": floaters,
+            "min_group": min_group,
+            "link": link,
+            "neighbours": neighbours,
+            "near_share": near_share,
+            "output": output,
+            "dry_run": dry_run,
         },
         progress,
         should_stop,

@@ -76,6 +76,11 @@ def in_folder(scene_file: Path, photographs: Path, finished_run: Path) -> Iterat
         {"albedo": np.full((COUNT, 3), 0.5, np.float32), "metallic": half, "roughness": 0.5 - 0.2 * half}
     )
     write_gaussian_ply(shiny, folder / "shiny.ply")
+    for name, height in (("cage", 2.0), ("bent", 2.5)):
+        corners = [(x, y, z * height) for x in (-2, 2) for y in (-2, 2) for z in (-1, 1)]
+        faces = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
+        lines = [*("v {} {} {}".format(*corner) for corner in corners), *(f"f {face}" for face in faces)]
+        (folder / f"{name}.obj").write_text("\n".join(lines) + "\n")
     write_environment(folder / "studio.hdr", np.ones((16, 32, 3), np.float32))
     shutil.copytree(photographs, folder / "photos")
     shutil.copytree(finished_run, folder / "run")

@@ -43,4 +43,41 @@ EXAMPLES = {
 >>> cropped.kept, cropped.count
 (600, 1200)
 """,
+    "export": """
+>>> import octasplat as osp
+>>> [path.name for path in osp.export("run", ["scene.glb", "scene.splat"]).files]
+['scene.glb', 'scene.splat']
+""",
+    "import": """
+>>> import octasplat as osp
+>>> splats = osp.save(osp.load("scene.ply"), "foreign.splat")
+>>> osp.import_(splats, "imported.ply").files[0].name
+'imported.ply'
+""",
+    "edit": """
+>>> import octasplat as osp
+>>> len(osp.load(osp.edit("run", "edited.ply", meshes=["run/mesh.ply"]).files[0])) > 100
+True
+""",
+    "deform": """
+>>> import octasplat as osp
+>>> osp.deform("scene.ply", "bent.ply", proxy="cage.obj", deformed=["bent.obj"]).moving
+1200
+""",
+    "transform": """
+>>> import octasplat as osp
+>>> osp.transform("scene.ply", "moved.ply", translate=(0, 0, 1), scale=2).count
+1200
+""",
+    "merge": """
+>>> import octasplat as osp
+>>> len(osp.load(osp.merge("scene.ply", "both.ply", ["shiny.ply"]).files[0]))
+2400
+""",
+    "clean": """
+>>> import octasplat as osp
+>>> cleaned = osp.clean("scene.ply", "cleaned.ply", min_opacity=0.5, floaters=False)
+>>> cleaned.count, cleaned.kept + cleaned.faint
+(1200, 1200)
+""",
 }

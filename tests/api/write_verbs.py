@@ -133,6 +133,7 @@ def function(verb: "Operation[Any, Any]") -> str:
     first = [text for _, text, places in declared if places and "=" not in text]
     first += [text for _, text, places in declared if places and "=" in text]
     others = [text for _, text, places in declared if not places]
+    others.sort(key=lambda text: "=" in text)  # what must be given comes first
     result, more, told = get_type_hints(verb.run)["return"].__name__, [], []
     if verb.name == "reconstruct":
         result, more, told = "Run", [ON_STEP], [ON_STEP_ARGUMENT]
