@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from octasplat.engine.events import Listener
 from octasplat.engine.operations.base import build
 from octasplat.engine.operations.registry import operation
@@ -32,16 +34,20 @@ def run_operation(
         OctasplatError: as the operation does.
     """
     verb = operation(name)
-    fields = verb.request.model_fields
-    given = {field: _plain(value) for field, value in values.items() if not _is_default(value, fields[field])}
-    request = build(verb.request, given)
+    request = build(verb.request, given_values(verb.request, values))
     return verb.run(
         request, progress=progress or default_listener(), should_stop=should_stop, threads=threads
     )
 
 
-def _is_default(value: Any, field: Any) -> bool:
-    return value is None or (isinstance(value, bool) and value is field.default)
+def given_values(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those values of a model's fields that a caller gave, as the model takes them."""
+    fields = model.model_fields
+    return {
+        name: _plain(value)
+        for name, value in values.items()
+        if value is not None and not (isinstance(value, bool) and value is fields[name].default)
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.events import Event, Listener, TrainingProgress
 from octasplat.notebook import default_listener, table_html
-from octasplat.operating import run_operation
+from octasplat.operating import given_values, run_operation
 from octasplat.places import PathLike
 from octasplat.scenes import Scene, load
 
@@ -33,6 +33,11 @@ def reconstruct_into(
         Cancelled: ``should_stop`` returned True.
         OctasplatError: as the operation does.
     """
+    from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, options_of
+
+    given = given_values(ReconstructRequest, values)
+    # Refused here, so that the sentence is that of a setting wherever it is given.
+    options_of({name: value for name, value in given.items() if name in ReconstructOptions.model_fields})
     stopped = False
     shown = progress or default_listener()
 

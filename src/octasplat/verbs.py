@@ -12,6 +12,7 @@ from octasplat.engine.events import Listener
 from octasplat.engine.operations.base import never
 from octasplat.operating import run_operation
 from octasplat.places import PathLike
+from octasplat.runs import OnStep, Run, reconstruct_into
 
 if TYPE_CHECKING:
     from octasplat.engine.operations.clean import CleanResult
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from octasplat.engine.operations.evaluate import EvaluateResult
     from octasplat.engine.operations.export import ExportResult
     from octasplat.engine.operations.import_ import ImportResult
+    from octasplat.engine.operations.info import InfoResult
     from octasplat.engine.operations.material import MaterialResult
     from octasplat.engine.operations.merge import MergeResult
     from octasplat.engine.operations.relight import RelightResult
@@ -65,6 +67,124 @@ class RenderArguments(TypedDict, total=False):
     progress: Listener | None
     should_stop: Callable[[], bool]
     threads: int
+
+
+def reconstruct(
+    source: PathLike,
+    output: PathLike,
+    *,
+    preset: Literal["fast", "standard", "high", "paper"] | None = None,
+    max_side: int | None = None,
+    test_every: int | None = None,
+    held_out: Sequence[str] | None = None,
+    poses: Literal["given", "auto", "missing"] | None = None,
+    masks: Literal["ignore", "alpha"] | None = None,
+    evaluate_background: Literal["black", "white"] | None = None,
+    minutes: float | None = None,
+    exports: Sequence[str] | None = None,
+    materials: bool = False,
+    for_surface: bool = False,
+    iterations: int | None = None,
+    rays: int | None = None,
+    max_gaussians: int | None = None,
+    sh_degree: int | None = None,
+    seed: int | None = None,
+    train: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] | None = None,
+    resume: bool = False,
+    on_step: OnStep | None = None,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "Run":
+    """Photographs to a scene, its meshes, and measurements.
+
+    Args:
+        source: The folder of the photographs.
+        output: Folder for the results.
+        preset: Where the settings of the training come from: fast is a first look, standard is better,
+            high is better yet and takes about three times as many iterations, paper has the published
+            settings. Default: standard.
+        max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
+            for a quick try, or where memory is short.
+        test_every: Every how-manieth view by name is held out to be measured; 0 holds out none, so that
+            all are trained on. Default: 8.
+        held_out: Names of the views to hold out instead of every how-manieth.
+        poses: Where the poses of the cameras come from: given takes the COLMAP model of the dataset
+            (photographs far from where matches put them are moved, see place_misfits); auto finds the
+            poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
+            holds no model. Default: missing.
+        masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
+            alpha, for objects that are cut out. Default: ignore.
+        evaluate_background: What lies behind renders and photographs with alpha when they are compared.
+            Default: black.
+        minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
+            pace of the machine that begins it; by default the other settings do.
+        exports: Files to write besides scene.ply; their names say the format. Default: ('mesh.ply',
+            'mesh.obj', 'mesh.glb').
+        materials: Learn materials and the environment of shiny things; environment.hdr lies beside the
+            scene then.
+        for_surface: Hold normals and depths together, so that a surface made of the scene is smoother.
+        iterations: Iterations of the training; 0 asks the photographs' pixels.
+        rays: Rays of one iteration.
+        max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
+        sh_degree: Degree of the spherical harmonics of the colours, 0 to 3.
+        seed: Seed of everything random. [default: 0]
+        train: Settings of the training that are to be otherwise than the preset's.
+        assignments: Any other setting, e.g. rates.quat=0.02 or test_every=4, values as JSON; octasplat
+            config list shows them.
+        resume: Go on with the run in the output folder, if there is one; without other options its own
+            settings are taken.
+        on_step: called with the state of the training every few iterations; returning False stops it
+            after a checkpoint, and the run that is returned is unfinished. With ``resume=True`` another
+            call goes on.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> def stop_early(step):
+    ...     return step.iteration < 20
+    >>> small = {"preset": "fast", "iterations": 60, "max_gaussians": 300, "exports": ["mesh.ply"]}
+    >>> run = osp.reconstruct("photos", "out", **small, on_step=stop_early)
+    >>> run.is_finished
+    False
+    >>> run = osp.reconstruct("photos", "out", resume=True)
+    >>> run.is_finished, run.training["iterations"]
+    (True, 60)
+    """
+    return reconstruct_into(
+        {
+            "preset": preset,
+            "max_side": max_side,
+            "test_every": test_every,
+            "held_out": held_out,
+            "poses": poses,
+            "masks": masks,
+            "evaluate_background": evaluate_background,
+            "minutes": minutes,
+            "exports": exports,
+            "materials": materials,
+            "for_surface": for_surface,
+            "iterations": iterations,
+            "rays": rays,
+            "max_gaussians": max_gaussians,
+            "sh_degree": sh_degree,
+            "seed": seed,
+            "train": train,
+            "assignments": assignments,
+            "source": source,
+            "output": output,
+            "resume": resume,
+        },
+        on_step,
+        progress,
+        should_stop,
+        threads,
+    )
 
 
 def evaluate(
@@ -113,6 +233,45 @@ def evaluate(
             "dataset": dataset,
             "on": on,
         },
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+def info(
+    source: PathLike,
+    output: PathLike | None = None,
+    *,
+    up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
+    dataset: PathLike | None = None,
+    picture: PathLike | None = None,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "InfoResult":
+    """What is in a scene: counts, bounds, sizes, cost.
+
+    Args:
+        source: The scene to look at: the folder of a run, or a file of any format.
+        output: Write everything as JSON, too.
+        up: The axis of a file that points up. [default: -y]
+        dataset: Take the cameras of the photographs in this folder. [default: those the run keeps]
+        picture: Write a small picture of the scene, too.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> osp.info("scene.ply").scene.count
+    1200
+    """
+    return run_operation(
+        "info",
+        {"up": up, "source": source, "dataset": dataset, "picture": picture, "output": output},
         progress,
         should_stop,
         threads,

@@ -4,23 +4,27 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import octasplat as osp
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
 from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
 from octasplat.engine.gaussians.harmonics import spread_directions
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.pipeline import reconstruct
 from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
-from octasplat.workers.work.kinds.options import resolve_reconstruction
 
 COUNT = 1200
-RUN_OPTIONS = {
+RUN_OPTIONS: dict[str, Any] = {
     "preset": "fast",
-    "train": {"iterations": 60, "rays": 512, "sh_degree": 0, "max_gaussians": 300, "initial_points": 300},
+    "iterations": 60,
+    "rays": 512,
+    "sh_degree": 0,
+    "max_gaussians": 300,
+    "train": {"initial_points": 300},
     "exports": ["mesh.ply"],
 }
 
@@ -62,7 +66,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished_run(photographs: Path) -> Path:
     """A run on the photographs that was soon over."""
     folder = photographs.parent / "run"
-    reconstruct(photographs, folder, resolve_reconstruction(RUN_OPTIONS))
+    osp.reconstruct(photographs, folder, **RUN_OPTIONS)
     return folder
 
 

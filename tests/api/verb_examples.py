@@ -80,4 +80,21 @@ True
 >>> cleaned.count, cleaned.kept + cleaned.faint
 (1200, 1200)
 """,
+    "reconstruct": """
+>>> import octasplat as osp
+>>> def stop_early(step):
+...     return step.iteration < 20
+>>> small = {"preset": "fast", "iterations": 60, "max_gaussians": 300, "exports": ["mesh.ply"]}
+>>> run = osp.reconstruct("photos", "out", **small, on_step=stop_early)
+>>> run.is_finished
+False
+>>> run = osp.reconstruct("photos", "out", resume=True)
+>>> run.is_finished, run.training["iterations"]
+(True, 60)
+""",
+    "info": """
+>>> import octasplat as osp
+>>> osp.info("scene.ply").scene.count
+1200
+""",
 }

@@ -3,13 +3,14 @@
 Run it (``python tests/api/write_verbs.py``) after a change of a request; test_verbs.py compares.
 """
 
+import inspect
 import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
@@ -134,7 +135,7 @@ def function(verb: "Operation[Any, Any]") -> str:
     first += [text for _, text, places in declared if places and "=" in text]
     others = [text for _, text, places in declared if not places]
     others.sort(key=lambda text: "=" in text)  # what must be given comes first
-    result, more, told = get_type_hints(verb.run)["return"].__name__, [], []
+    result, more, told = inspect.signature(verb.run).return_annotation.__name__, [], []
     if verb.name == "reconstruct":
         result, more, told = "Run", [ON_STEP], [ON_STEP_ARGUMENT]
     signature = ",\n    ".join([*first, "*", *others, *more, *LAST_PARAMETERS])
@@ -173,7 +174,7 @@ def options(verb: "Operation[Any, Any]") -> str:
 def source() -> str:
     """Return what the module should be, formatted."""
     verbs = operations()
-    found = [get_type_hints(verb.run)["return"] for verb in verbs if verb.name != "reconstruct"]
+    found = [inspect.signature(verb.run).return_annotation for verb in verbs if verb.name != "reconstruct"]
     results = sorted((result.__module__, result.__name__) for result in found)
     imports = "\n".join(f"    from {module} import {name}" for module, name in results)
     typed = [options(verb) for verb in verbs if verb.name == "render"]

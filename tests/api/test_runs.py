@@ -1,0 +1,150 @@
+"""Runs from Python: begun, stopped, gone on with, in threads, with their progress told."""
+
+import logging
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import octasplat as osp
+from conftest import RUN_OPTIONS
+from octasplat.engine.events import Event, StageFinished, TrainingProgress
+
+
+def test_run_stopped_by_a_step_goes_on_to_the_same_bytes(
+    photographs: Path, finished_run: Path, tmp_path: Path
+) -> None:
+    seen: list[int] = []
+
+    def stop(step: TrainingProgress) -> bool:
+        seen.append(step.iteration)
+        return step.iteration < 20
+
+    run = osp.reconstruct(photographs, tmp_path / "run", **RUN_OPTIONS, on_step=stop)
+    assert seen == [10, 20]
+    assert not run.is_finished and run.psnr is None and "unfinished" in repr(run)
+    run = osp.reconstruct(photographs, run, resume=True, on_step=lambda step: seen.append(step.iteration))
+    assert seen == [10, 20, 30, 40, 50, 60]
+    assert run.is_finished
+    assert (run.path / "scene.ply").read_bytes() == (finished_run / "scene.ply").read_bytes()
+
+
+def test_should_stop_raises_and_on_step_does_not(photographs: Path, tmp_path: Path) -> None:
+    with pytest.raises(osp.Cancelled):
+        osp.reconstruct(photographs, tmp_path / "run", **RUN_OPTIONS, should_stop=lambda: True)
+
+
+def test_run_says_what_was_measured(finished_run: Path) -> None:
+    run = osp.Run(finished_run)
+    measured = osp.evaluate(run)
+    assert run.psnr == measured.psnr and set(run.views) == set(measured.views)
+    assert run.report.is_file() and run.settings["train"]["iterations"] == 60
+    assert len(osp.load(run)) == len(run.scene)
+    assert f"{run.psnr:.2f} dB" in repr(run)
+    assert "psnr" in run._repr_html_() and "dB" in measured._repr_html_()
+
+
+def test_folder_without_a_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(osp.ConfigError, match=r"holds no config\.json"):
+        osp.Run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "options", [{"preset": "fastest"}, {"assignments": ["iteratoins=3"]}, {"train": {"raise": 3}}]
+)
+def test_refused_settings_have_the_sentence_of_the_command(
+    options: dict[str, Any], photographs: Path, tmp_path: Path
+) -> None:
+    from octasplat.engine.errors import OctasplatError
+    from octasplat.engine.operations.reconstruct import options_of
+
+    with pytest.raises(OctasplatError) as expected:
+        options_of(options).config()
+    with pytest.raises(OctasplatError) as found:
+        osp.reconstruct(photographs, tmp_path / "run", **options)
+    assert str(found.value) == str(expected.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_python_means_the_settings_of_the_request(photographs: Path, tmp_path: Path) -> None:
+    from octasplat.engine.operations.reconstruct import ReconstructOptions
+
+    run = osp.reconstruct(photographs, tmp_path / "run", **RUN_OPTIONS, on_step=lambda _step: False)
+    assert run.settings == ReconstructOptions.model_validate(RUN_OPTIONS).config().model_dump(mode="json")
+
+
+def test_work_in_a_thread_is_logged_and_prints_nothing(
+    scene_file: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            camera = {"camera": (0, 0, -4), "look_at": (0, 0, 0), "width_px": 32, "height_px": 24}
+            osp.render(scene_file, tmp_path / "a.png", **camera)  # type: ignore[call-overload]
+        except Exception as error:  # noqa: BLE001 - the thread's, looked at below
+            failed.append(error)
+
+    with caplog.at_level(logging.INFO, logger="octasplat"):
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    assert failed == [] and (tmp_path / "a.png").is_file()
+    assert any(line.startswith("Rendered 1 image") for line in caplog.messages)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_notebook_shows_progress_and_ends_with_lines() -> None:
+    from IPython.core.interactiveshell import InteractiveShell
+    from IPython.utils.capture import capture_output
+
+    from octasplat.engine.events import StageProgress, StageStarted, Warned
+    from octasplat.notebook import EventLog, NotebookProgress, default_listener
+
+    assert isinstance(default_listener(), EventLog)
+    shell = InteractiveShell.instance()
+    try:
+        shell.kernel = object()
+        listener = default_listener()
+        assert isinstance(listener, NotebookProgress)
+        events: list[Event] = [
+            StageStarted("render", 4), StageProgress("render", 1, 4), Warned("a < b"),
+            StageFinished("render", 2.0),
+        ]  # fmt: skip
+        with capture_output() as captured:
+            for event in events:
+                listener(event)
+    finally:
+        InteractiveShell.clear_instance()
+    shown = [output.data["text/html"] for output in captured.outputs]
+    assert "Rendering" in shown[0]
+    assert any('<progress value="0.2500" max="1">' in text and "a &lt; b" in text for text in shown)
+    assert "Rendered" in shown[-1] and "<progress" not in shown[-1]
+
+
+def test_images_of_a_run_are_written_as_the_operation_says(finished_run: Path, tmp_path: Path) -> None:
+    found = osp.render(osp.Run(finished_run), tmp_path / "views", views="held-out")
+    assert found.images == 2 and all(path.is_file() for path in found.files)
+    with pytest.raises(TypeError, match="goes with a camera"):
+        osp.render(osp.load(finished_run), tmp_path / "views")  # type: ignore[call-overload]
+
+
+def test_viewer_of_a_run_knows_its_cameras(finished_run: Path) -> None:
+    import json
+    import urllib.request
+
+    with (
+        osp.view(finished_run, open_browser=False) as viewer,
+        urllib.request.urlopen(f"{viewer.url}cameras.json", timeout=10) as answer,
+    ):
+        cameras = json.load(answer)
+    assert len(cameras["views"]) == 9
+    assert [view["name"] for view in cameras["views"] if view["held_out"]] == ["view_000.png", "view_008.png"]
+    fov = cameras["views"][0]["fov_y_degrees"]
+    centre = osp.Camera.looking_at((0, 0, -1), (0, 0, 0), 48, 36, fov_y_degrees=fov)
+    assert np.isfinite(centre.fy_px) and 10 < fov < 120
