@@ -3,7 +3,7 @@
     python -m benchmarks.scene_path                     # this tree
     python -m benchmarks.scene_path --root ELSEWHERE    # another checkout
 
-A small generated scene is reconstructed while every call that ``engine/pipeline.py`` makes into another
+A small generated scene is reconstructed while every call that ``engine/pipeline`` makes into another
 folder of the engine is noted. A return is a visit to a folder that was left before.
 """
 
@@ -31,7 +31,8 @@ class Visits:
         if event != "call" or frame.f_back is None:
             return
         caller, callee = (f.f_globals.get("__name__", "") for f in (frame.f_back, frame))
-        if caller == PIPELINE and callee.startswith("octasplat.engine.") and callee != PIPELINE:
+        inside = (caller.startswith(PIPELINE), callee.startswith(PIPELINE))
+        if inside == (True, False) and callee.startswith("octasplat.engine."):
             room = callee.split(".")[2]
             if not self.rooms or self.rooms[-1] != room:
                 self.rooms.append(room)

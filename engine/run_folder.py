@@ -20,6 +20,7 @@ from octasplat.engine.shading.learnt_background import LearntBackground
 CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
     "config.json", "events.jsonl", "held_out.json", "scene.ply", "training.json", "views.json",
 )  # fmt: skip
+METRICS, REPORT = "metrics.json", "report.html"
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 PLAN = "plan.json"
 ENVIRONMENT = "environment.hdr"

@@ -1,0 +1,12 @@
+"""The main job, from photographs to a measured scene and its meshes.
+
+Each step leaves its result on disk and is skipped when the result is there, so that a run that was stopped
+or killed goes on where it was.
+
+    (find poses ->) open the dataset (-> mend poses and lenses) -> train -> evaluate -> export
+"""
+
+from octasplat.engine.pipeline.reconstruct import reconstruct
+from octasplat.engine.pipeline.run import Watcher
+
+__all__ = ["Watcher", "reconstruct"]

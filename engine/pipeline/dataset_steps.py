@@ -1,0 +1,78 @@
+"""The steps before the training: poses are found, and the dataset is opened."""
+
+from octasplat.engine.config import read_config
+from octasplat.engine.pipeline.output_folder import write_config
+from octasplat.engine.pipeline.run import Run
+from octasplat.engine.run_folder import (
+    CONFIG,
+    HELD_OUT,
+    VIEWS,
+    found_model,
+    open_photographs,
+    run_scene,
+)
+from octasplat.engine.run_poses import find_missing_poses, free_lenses, place_misfits
+from octasplat.engine.scene import Dataset, write_held_out
+from octasplat.engine.scene.views_file import write_views
+from octasplat.engine.stages import stage
+from octasplat.engine.train.batches import BatchSource
+
+
+class FindPoses:
+    """Find the poses of the photographs, where that is asked for; goes on where it was stopped."""
+
+    is_needed_later = True
+
+    def is_done(self, run: Run) -> bool:
+        """Return False: what is there is looked at by the search itself."""
+        return False
+
+    def __call__(self, run: Run) -> None:
+        """Find them."""
+        find_missing_poses(run.scene, run.output, run.config, run.threads, run.progress, run.should_stop)
+
+
+class OpenDataset:
+    """Open the photographs with their poses; those of a new run are mended first."""
+
+    is_needed_later = True
+
+    def is_done(self, run: Run) -> bool:
+        """Return False: each run opens its photographs, from a cache if it has one."""
+        return False
+
+    def __call__(self, run: Run) -> None:
+        """Open them, and write down which they are."""
+        output = run.output
+        run.dataset = _load(run)
+        if run.recorded is None:
+            _mend(run)
+            write_views(output / VIEWS, run.dataset.record)
+        held_out = [run.dataset.views[i].name for i in run.dataset.test_indices]
+        write_held_out(output / HELD_OUT, held_out)
+        if run_scene(output) != run.scene.resolve() or read_config(output / CONFIG) != run.config:
+            # The photographs have moved, or other files are wanted.
+            write_config(run.scene, output, run.config)
+
+
+def _mend(run: Run) -> None:
+    """Mend poses and lenses that the photographs contradict; loads them anew where the model changed."""
+    if place_misfits(run.dataset, run.output, run.config, run.threads, run.progress, run.should_stop):
+        run.dataset = _load(run)
+    if free_lenses(run.dataset, run.output, run.config, run.progress, run.should_stop):
+        run.dataset = _load(run)
+
+
+def _load(run: Run) -> Dataset:
+    with stage("load", run.progress):
+        dataset = open_photographs(
+            run.scene,
+            run.output,
+            run.config,
+            run.threads,
+            run.progress,
+            model_folder=found_model(run.output),
+            accept=run.accept,
+        )
+        BatchSource(dataset, run.config.train)  # refuses settings that do not suit the photographs
+    return dataset

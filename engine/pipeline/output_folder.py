@@ -1,0 +1,89 @@
+"""The folder of a run: claimed before the work, and freed again where the work cannot begin."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from octasplat.engine.config import ReconstructionConfig, read_config
+from octasplat.engine.errors import ConfigError, DatasetError, OutputError
+from octasplat.engine.run_folder import CONFIG, EVENTS, POSES
+from octasplat.engine.scene.colmap import has_model
+from octasplat.engine.versions import versions
+from octasplat.engine.writing import write_json
+
+
+def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume: bool) -> bool:
+    """Create the folder and its ``config.json``, or make sure that it is the run to go on with.
+
+    Returns:
+        Whether the run is new.
+
+    Raises:
+        OutputError: the folder holds something else or cannot be written.
+        ConfigError: the run in it has other settings.
+    """
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output} is a file; name a folder for the results.")
+    if (output / CONFIG).exists():
+        if not resume:
+            raise OutputError(
+                f"{output} already holds a run; add --resume to go on with it, or name another folder."
+            )
+        _check_settings(scene, output, config)
+        return False
+    if output.is_dir() and any(not path.name.startswith(".") for path in output.iterdir()):
+        raise OutputError(f"{output} is not empty and holds no run; name an empty or a new folder.")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        for left in output.glob(".*.partial.*"):  # by a run that was killed while it wrote
+            left.unlink()
+        write_config(scene, output, config)
+    except OSError as error:
+        raise OutputError(
+            f"{output} cannot be written to ({error.strerror or error}); name another folder."
+        ) from None
+    return True
+
+
+@contextmanager
+def freed_if_refused(output: Path, *, is_new: bool, is_made: bool) -> Iterator[None]:
+    """Free the folder of a new run if its photographs or settings are refused, for the corrected command.
+
+    Args:
+        output: the folder.
+        is_new: whether the run was begun by this command.
+        is_made: whether the folder was made by it, too.
+    """
+    try:
+        yield
+    except (DatasetError, ConfigError):
+        if is_new:
+            (output / CONFIG).unlink()
+            (output / EVENTS).unlink()
+            shutil.rmtree(output / POSES, ignore_errors=True)
+            if is_made:
+                with suppress(OSError):  # it holds something
+                    output.rmdir()
+        raise
+
+
+def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> None:
+    """Write ``config.json``: where the photographs are, all settings, and the versions of what computes."""
+    content = {
+        "scene": str(scene.resolve()),
+        "reconstruction": config.model_dump(mode="json"),
+        "versions": versions(),
+    }
+    write_json(output / CONFIG, content)
+
+
+def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> None:
+    """Refuse settings that are not the run's, but for the files to export."""
+    is_posed = has_model(scene)
+    before = read_config(output / CONFIG).model_copy(update={"exports": config.exports})
+    if before.with_poses_decided(is_posed) != config.with_poses_decided(is_posed):
+        raise ConfigError(
+            f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
+            "or name another folder."
+        )

@@ -1,0 +1,74 @@
+"""The steps after the training: the scene is measured, and written in other formats."""
+
+from octasplat.engine.errors import ExportFailed
+from octasplat.engine.evaluate.runs import measure_run
+from octasplat.engine.events import StageProgress, Warned
+from octasplat.engine.files import ExportOptions, export_losses, read_facts
+from octasplat.engine.files.gaussian_ply import read_gaussian_ply
+from octasplat.engine.files.several import export_files, known_targets
+from octasplat.engine.pipeline.run import Run
+from octasplat.engine.plain_colours import PlainScene
+from octasplat.engine.run_folder import METRICS, REPORT, SCENE, not_exported
+from octasplat.engine.stages import stage
+
+
+class Evaluate:
+    """Measure the held-out views; files are exported even if that fails."""
+
+    is_needed_later = False
+
+    def is_done(self, run: Run) -> bool:
+        """Return whether the measurements and the report are there."""
+        return (run.output / METRICS).exists() and (run.output / REPORT).exists()
+
+    def __call__(self, run: Run) -> None:
+        """Measure them."""
+        with stage("evaluate", run.progress, len(run.dataset.test_indices)):
+            measure_run(run.dataset, run.output, run.config, run.threads, run.progress)
+
+
+class Export:
+    """Write the files that are missing, all that can be written."""
+
+    is_needed_later = True
+
+    def is_done(self, run: Run) -> bool:
+        """Return False: the stage is told even if all files are there."""
+        return False
+
+    def __call__(self, run: Run) -> None:
+        """Write them.
+
+        Raises:
+            ExportFailed: some could not be written.
+        """
+        with stage("export", run.progress, len(run.config.exports)):
+            missing = [name for name in run.config.exports if not (run.output / name).exists()]
+            failed = _export(run, missing) if missing else None
+        if failed is not None:
+            raise ExportFailed(f"{failed} Everything else is there.")
+
+
+def _export(run: Run, names: list[str]) -> str | None:
+    """Write files; returns what could not be written and why."""
+    output, progress = run.output, run.progress
+    gaussians, _ = read_gaussian_ply(output / SCENE)
+    if (left_out := not_exported(output)) is not None:
+        progress(Warned(left_out))
+    options = ExportOptions(q=run.config.train.trace.q, facts=read_facts(output))
+    plain = PlainScene(
+        gaussians,
+        output,
+        threads=run.threads,
+        on_pass=lambda _done, _total: progress(StageProgress("export", 0, len(names))),
+        on_unknown=lambda text: progress(Warned(text)),
+    )
+    targets = [output / name for name in names]
+    for lost in export_losses(gaussians, known_targets(targets)):
+        progress(Warned(lost))
+    _, failed = export_files(
+        targets,
+        lambda exporter: (gaussians if exporter.holds_harmonics else plain.gaussians, options),
+        on_done=lambda done: progress(StageProgress("export", done, len(names))),
+    )
+    return failed

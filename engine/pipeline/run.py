@@ -1,0 +1,93 @@
+"""A run, and the steps that it consists of."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.errors import Cancelled, ExportFailed
+from octasplat.engine.events import Listener
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.views_file import ViewsRecord
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.trace.protocol import Tracer
+
+Watcher = Callable[[int, Dataset, Tracer, ShadingModel], None]
+"""Called between two iterations of a training: iterations done, photographs, tracer and shading."""
+
+
+@dataclass
+class Run:
+    """What the steps of a run share.
+
+    Attributes:
+        scene: folder of the photographs.
+        output: folder of the results.
+        config: all settings.
+        threads: for everything; 0 means all cores.
+        progress: called with each event.
+        should_stop: asked now and then; True stops the run after a checkpoint.
+        on_step: called with the training after each iteration.
+        recorded: the photographs of a run that goes on; None for a new one.
+        accept: called with the photographs that were found before anything is written; to refuse them, it
+            raises.
+    """
+
+    scene: Path
+    output: Path
+    config: ReconstructionConfig
+    threads: int
+    progress: Listener
+    should_stop: Callable[[], bool]
+    on_step: Watcher | None = None
+    recorded: ViewsRecord | None = None
+    accept: Callable[[ViewsRecord], None] | None = None
+    _dataset: Dataset | None = None
+
+    @property
+    def dataset(self) -> Dataset:
+        """The photographs, which a step has opened."""
+        assert self._dataset is not None, "a step asks for the photographs before they are open"
+        return self._dataset
+
+    @dataset.setter
+    def dataset(self, dataset: Dataset) -> None:
+        self._dataset = dataset
+
+
+@runtime_checkable
+class Step(Protocol):
+    """A part of a run.
+
+    Attributes:
+        is_needed_later: whether the steps after it can do nothing if it fails.
+    """
+
+    is_needed_later: bool
+
+    def is_done(self, run: Run) -> bool:
+        """Return whether its result is there."""
+
+    def __call__(self, run: Run) -> None:
+        """Make its result."""
+
+
+def run_steps(steps: Sequence[Step], run: Run) -> None:
+    """Do all steps whose results are missing; if one fails without which the others can go on, they do.
+
+    Raises:
+        OctasplatError: as the step that failed first does.
+    """
+    for place, step in enumerate(steps):
+        try:
+            if not step.is_done(run):
+                step(run)
+        except Cancelled:
+            raise
+        except Exception:
+            if not step.is_needed_later:
+                with suppress(ExportFailed):
+                    run_steps(steps[place + 1 :], run)
+            raise

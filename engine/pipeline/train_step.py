@@ -1,0 +1,182 @@
+"""The step that trains: its result is the scene, and what the training learnt beside it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from octasplat.engine.config import ReconstructionConfig
+from octasplat.engine.events import Listener, Warned
+from octasplat.engine.files.gaussian_ply import write_gaussian_ply
+from octasplat.engine.gaussians.materials import reflective_share
+from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import SceneFacts
+from octasplat.engine.pipeline.run import Run
+from octasplat.engine.render.environment_map import write_background, write_environment
+from octasplat.engine.render.jobs import trained_pixel_rad
+from octasplat.engine.run_folder import BACKGROUND, CHECKPOINTS, ENVIRONMENT, PLAN, SCENE, TRAINING
+from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.near import NearZones, nearest_distances
+from octasplat.engine.scene.seen import SeenSpace
+from octasplat.engine.shading.protocol import ShadingModel
+from octasplat.engine.stages import StageClock, stage
+from octasplat.engine.threads import use_threads
+from octasplat.engine.train.checkpoint import newest_state
+from octasplat.engine.train.config import TrainConfig, iteration_count
+from octasplat.engine.train.exposure_changes import with_exposure_decided
+from octasplat.engine.train.fingerprint import run_fingerprint
+from octasplat.engine.train.first_state import first_state
+from octasplat.engine.train.floors import ScaleFloor
+from octasplat.engine.train.shading import background_of, deferred_of, exposures_of
+from octasplat.engine.train.shown import shown_share
+from octasplat.engine.train.trainer import Trainer
+from octasplat.engine.train.within import make_plan, read_plan, write_plan
+from octasplat.engine.writing import write_json
+
+LEAST_REFLECTIVE = 0.01
+"""Share of the surface that must reflect for materials and the environment to be more than guesses."""
+
+
+class Train:
+    """Train the scene; goes on from the newest checkpoint."""
+
+    is_needed_later = True
+
+    def is_done(self, run: Run) -> bool:
+        """Return whether the scene is there."""
+        return (run.output / SCENE).exists()
+
+    def __call__(self, run: Run) -> None:
+        """Train, and write the scene after everything else."""
+        dataset, config = run.dataset, run.config
+        steps = 0
+        if not config.minutes:
+            steps = iteration_count(config.train, dataset.train_pixel_count, shown_share(dataset))
+        with stage("train", run.progress, steps) as clock:
+            gaussians = _train(run, clock)
+            facts = SceneFacts(
+                near_world=dataset.near_world,
+                pixel_rad=trained_pixel_rad(dataset.viewpoints),
+                turned_beyond=config.train.trace.turned_beyond,
+            )
+            write_gaussian_ply(gaussians, run.output / SCENE, facts=facts)
+
+
+def _train(run: Run, clock: StageClock) -> FlatGaussians:
+    config = _planned(run.dataset, run.output, run.config, run.threads, run.should_stop, clock)
+    nearest_world = nearest_distances(run.dataset.viewpoints, run.dataset.points)
+    trainer = _trainer(run, config, nearest_world, clock)
+    gaussians = trainer.run()
+    _write_surroundings(trainer.shading, gaussians, run.output, run.progress)
+    _write_record(
+        trainer, run.dataset, nearest_world, clock, run.output, keeps_near_free=config.near_share > 0
+    )
+    return gaussians
+
+
+def _trainer(
+    run: Run, config: TrainConfig, nearest_world: Float64[np.ndarray, " views"], clock: StageClock
+) -> Trainer:
+    """The training as it begins, or as its newest checkpoint left it."""
+    dataset, progress, folder = run.dataset, run.progress, run.output / CHECKPOINTS
+    config, exposure_changes = with_exposure_decided(config, dataset)
+    fingerprint = run_fingerprint(dataset, config)
+    state = newest_state(folder, fingerprint, progress)
+    if state is None:
+        state = first_state(dataset, config, threads=use_threads(run.threads))
+        if exposure_changes is not None:
+            progress(Warned(f"{exposure_changes} That is learnt; exposure=false leaves it out."))
+        state.seconds = clock.seconds()
+    else:
+        clock.add(state.seconds)
+    zones = NearZones.of(dataset.viewpoints, config.near_share * nearest_world, dataset.train_indices)
+    seen = SeenSpace.of(dataset.viewpoints, dataset.train_indices)
+    trainer: Trainer = Trainer(
+        dataset,
+        config,
+        state,
+        folder=folder,
+        fingerprint=fingerprint,
+        listener=progress,
+        threads=run.threads,
+        should_stop=run.should_stop,
+        scale_floor=_scale_floor(dataset, config),
+        near_zones=zones if config.near_share > 0 else None,
+        seen_space=seen if config.materials.clears_unseen else None,
+        onlooker=None
+        if (on_step := run.on_step) is None
+        else lambda done, tracer: on_step(done, dataset, tracer, trainer.shading),
+    )
+    return trainer
+
+
+def _write_surroundings(
+    shading: ShadingModel, gaussians: FlatGaussians, output: Path, progress: Listener
+) -> None:
+    """Write the environment and the background that were learnt, if they were."""
+    if (deferred := deferred_of(shading)) is not None:
+        write_environment(output / ENVIRONMENT, deferred.light.radiance_linear)
+        if reflective_share(gaussians) < LEAST_REFLECTIVE:
+            progress(
+                Warned(
+                    "Nothing was seen that reflects its surroundings clearly: metallic, roughness and the "
+                    "environment are guesses, and relighting will show it."
+                )
+            )
+    if (background := background_of(shading)) is not None:
+        write_background(output / BACKGROUND, background.rgb_srgb)
+
+
+def _write_record(
+    trainer: Trainer,
+    dataset: Dataset,
+    nearest_world: Float64[np.ndarray, " views"],
+    clock: StageClock,
+    output: Path,
+    *,
+    keeps_near_free: bool,
+) -> None:
+    """Write what later steps and commands need to know of a training that is over."""
+    record: dict[str, object] = {"seconds": clock.stop(), "iterations": trainer.state.iteration}
+    if trainer.schedule.hastened_after is not None:
+        record["planned_iterations"] = trainer.schedule.planned
+    if trainer.views is not None:
+        record["training_views"] = trainer.views.as_dict()
+    if trainer.poses is not None:
+        record["poses"] = trainer.poses.as_dict()
+    if (exposures := exposures_of(trainer.shading)) is not None:
+        record["exposures"] = exposures.as_dict([view.name for view in dataset.views])
+    if keeps_near_free:
+        record["taken_near"] = trainer.state.taken_near
+    distances = dict(zip((view.name for view in dataset.views), nearest_world.tolist(), strict=True))
+    record["nearest_world"] = {name: distance for name, distance in distances.items() if distance > 0}
+    write_json(output / TRAINING, record)
+
+
+def _scale_floor(dataset: Dataset, config: TrainConfig) -> ScaleFloor | None:
+    if config.min_scale_px == 0:
+        return None
+    pixel_rad = trained_pixel_rad(dataset.viewpoints)
+    origins = np.stack([dataset.views[i].origin_world for i in dataset.train_indices.tolist()])
+    return ScaleFloor(origins, config.min_scale_px * pixel_rad)
+
+
+def _planned(
+    dataset: Dataset,
+    output: Path,
+    settings: ReconstructionConfig,
+    threads: int,
+    should_stop: Callable[[], bool],
+    clock: StageClock,
+) -> TrainConfig:
+    """The settings of the training; those that the time decides are written down the first time."""
+    config = settings.train
+    if settings.minutes is None:
+        return config
+    if not (output / PLAN).exists():
+        first = first_state(dataset, config, threads=use_threads(threads)).gaussians
+        left = 60 * settings.minutes - 2 * clock.seconds()  # the first Gaussians are made once more
+        plan = make_plan(dataset, config, first, seconds=left, threads=threads, should_stop=should_stop)
+        write_plan(output / PLAN, plan)
+    return read_plan(output / PLAN).applied(config)
