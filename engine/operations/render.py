@@ -174,7 +174,9 @@ def run(
     told = "Stopped; the preview is as fine as it was." if request.preview else None
     tell = stopping(progress, should_stop, told)
     max_side = request.max_side or (PREVIEW_SIDE_PX if request.preview else None)
-    source = read_render_source(request.source, tell, dataset=request.dataset, max_side=max_side)
+    source = read_render_source(
+        request.source, tell, dataset=request.dataset, max_side=max_side, full_size=request.stage is not None
+    )
     cameras = requested_cameras(request, source)
     shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
     resumption = Resumption(request.resume, request.or_anew, request.frames_folder)
@@ -238,10 +240,7 @@ def _render_on_stage(
     if source.learnt is not None and request.background is None and stage.environment is None:
         progress(Warned(STAGE_LACKS_BACKGROUND))
     background = background_colour(request.background or source.background)
-    scene = stage_scene(
-        request.source, source, request.stage_folder, background, progress,
-        dataset=request.dataset, threads=threads,
-    )  # fmt: skip
+    scene = stage_scene(source, request.stage_folder, background, progress, threads=threads)
     if request.preview:
         compile_stage(stage, scene, shots).preview(shots[0], request.output, progress)
         return (request.output,)

@@ -50,6 +50,7 @@ class RenderSource:
         max_side: longer side of the photographs in the training, px.
         trained_rad: angle of a pixel of the training.
         learnt: background that the run has learnt.
+        photographs: where the photographs were taken from, at their full size, if that was asked for.
     """
 
     gaussians: FlatGaussians
@@ -60,6 +61,7 @@ class RenderSource:
     max_side: int | None = None
     trained_rad: float = 0.0
     learnt: LearntBackground | None = None
+    photographs: Viewpoints | None = None
 
     @property
     def extent_world(self) -> float:
@@ -70,7 +72,12 @@ class RenderSource:
 
 
 def read_render_source(
-    source: Path, progress: Listener, *, dataset: Path | None = None, max_side: int | None = None
+    source: Path,
+    progress: Listener,
+    *,
+    dataset: Path | None = None,
+    max_side: int | None = None,
+    full_size: bool = False,
 ) -> RenderSource:
     """Read a scene to render.
 
@@ -79,6 +86,7 @@ def read_render_source(
         progress: told what reading lost.
         dataset: folder of photographs whose cameras to take, instead of those that the run keeps.
         max_side: cap on the longer side of the views, px; None takes the run's.
+        full_size: whether to read the cameras at the full size of the photographs, too, as stages need them.
 
     Raises:
         OctasplatError: it cannot be read.
@@ -93,6 +101,8 @@ def read_render_source(
             f"{source} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume."
         )
     viewpoints = run_viewpoints(source, scene=dataset, max_side=max_side)
+    photographs = run_viewpoints(source, scene=dataset, max_side=ANY_SIDE_PX) if full_size else None
+    learnt = run_background(source)
     return RenderSource(
         read_gaussian_ply(source / SCENE)[0],
         config.train.trace,
@@ -101,7 +111,8 @@ def read_render_source(
         viewpoints,
         config.max_side,
         read_facts(source).pixel_rad,
-        run_background(source),
+        learnt,
+        photographs,
     )
 
 
@@ -163,41 +174,27 @@ def requested_views(request: PictureRequest, source: RenderSource) -> tuple[Shot
     return view_shots(viewpoints, indices, source.near_world)
 
 
-def photographs_at_full_size(source: Path, dataset: Path | None) -> Viewpoints | None:
-    """Return where the photographs of a run were taken from, at their full size; None of a file."""
-    if not is_run(source):
-        return None
-    return run_viewpoints(source, scene=dataset, max_side=ANY_SIDE_PX)
-
-
 def stage_scene(
-    request_source: Path,
     source: RenderSource,
     folder: Path,
     background_srgb: Float32[np.ndarray, "3"],
     progress: Listener,
     *,
-    dataset: Path | None = None,
     threads: int = 0,
 ) -> StageScene:
     """Return the scene as a stage is put into it.
 
     Args:
-        request_source: the folder of the run, or the file.
-        source: what was read there.
+        source: the scene, with the cameras at full size.
         folder: where the names of the stage's files are relative to.
         background_srgb: display colour behind everything.
         progress: told what reading files of the stage loses.
-        dataset: folder of the photographs, if the run does not keep their cameras.
         threads: to use; 0 takes all.
-
-    Raises:
-        OctasplatError: the cameras of the photographs cannot be read.
     """
     return StageScene(
         source.gaussians,
         source.settings,
-        photographs_at_full_size(request_source, dataset),
+        source.photographs,
         folder,
         lambda path: open_scene(path, progress),
         background_srgb,
@@ -220,6 +217,6 @@ def open_stage_scene(
     Raises:
         OctasplatError: it cannot be read.
     """
-    found = read_render_source(source, progress, dataset=dataset)
+    found = read_render_source(source, progress, dataset=dataset, full_size=True)
     background = background_colour(found.background)
-    return stage_scene(source, found, source.parent, background, progress, dataset=dataset, threads=threads)
+    return stage_scene(found, source.parent, background, progress, threads=threads)
