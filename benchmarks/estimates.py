@@ -20,8 +20,8 @@ import psutil
 from PIL import Image
 
 from octasplat.engine.config import resolve_config
-from octasplat.workers.records.sizes import Sizes
-from octasplat.workers.work.kinds.estimates import estimate_reconstruction
+from octasplat.engine.operations.costs import estimate_reconstruction
+from octasplat.engine.photograph_sizes import Sizes
 
 
 def main() -> None:

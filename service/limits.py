@@ -6,15 +6,15 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from octasplat.engine.operations.costs import Estimate
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.service.auth import Principal
 from octasplat.service.problems import Problem
 from octasplat.service.settings import ServiceSettings
 from octasplat.workers.records.rows import WorkerRow
-from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.settings import PREFIX
 from octasplat.workers.work.kinds import JobKind
 from octasplat.workers.work.kinds.demands import excesses
-from octasplat.workers.work.kinds.estimates import Estimate
 
 
 def check_ceilings(

@@ -9,6 +9,7 @@ from octasplat.engine.operations.base import Operation
 
 _MODULES = {
     "reconstruct": "reconstruct",
+    "estimate": "estimate",
     "evaluate": "evaluate",
     "info": "info",
     "surface": "surface",

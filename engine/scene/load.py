@@ -18,7 +18,7 @@ from octasplat.engine.scene.views_file import capped_size
 MIN_VIEWS = 3
 """Fewer photographs than this do not make a scene."""
 
-_IMAGE_SUFFIXES = frozenset(
+IMAGE_SUFFIXES = frozenset(
     {
         ".jpg",
         ".jpeg",
@@ -66,7 +66,7 @@ def load_scene(
     if not root.is_dir():
         raise DatasetError(f"{root} is not a folder; name the folder that holds images/ and sparse/.")
     if model_folder is None and not (root / "images").is_dir():
-        if any(path.suffix.lower() in _IMAGE_SUFFIXES for path in root.iterdir()):
+        if any(path.suffix.lower() in IMAGE_SUFFIXES for path in root.iterdir()):
             raise DatasetError(
                 f"{root} is a bare folder of photographs, without camera poses; have them found: octasplat "
                 "reconstruct with --poses auto, or octasplat submit."
@@ -147,7 +147,7 @@ def _image_paths(folder: Path, model: ColmapModel, warnings: list[str], *, tell_
             f"{len(missing)} of {len(model.images)} images of the model are not in {folder} "
             f"({_some(missing)}); put them there or run COLMAP without them."
         )
-    unposed = sorted(name for name, path in on_disk.items() if path.suffix.lower() in _IMAGE_SUFFIXES)
+    unposed = sorted(name for name, path in on_disk.items() if path.suffix.lower() in IMAGE_SUFFIXES)
     if unposed and tell_unposed:
         warnings.append(
             f"{len(unposed)} images in {folder} have no pose and are left out ({_some(unposed)})."

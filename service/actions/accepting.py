@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.operations.costs import Estimate
 from octasplat.engine.refusals import SettingsRefused
 from octasplat.service.actions.access import owned_job, refuse_while_draining
 from octasplat.service.actions.asked import accepted_kind, input_problem, resolved
@@ -27,7 +28,6 @@ from octasplat.workers.records.quotas import check_new_job
 from octasplat.workers.records.rows import Dataset, Job
 from octasplat.workers.upkeep.webhooks.rows import add_endpoint
 from octasplat.workers.work.kinds import JobKind, kind_named
-from octasplat.workers.work.kinds.estimates import Estimate
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """What a job would take, before it is asked for."""
 
+from octasplat.engine.operations.costs import Estimate
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.service.actions.asked import accepted_kind, input_problem, resolved
 from octasplat.service.auth import Principal
 from octasplat.service.limits import check_ceilings, estimate_job
@@ -9,8 +11,6 @@ from octasplat.service.state import Service
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.records.database import Connection
 from octasplat.workers.records.datasets import get_dataset, photograph_sizes
-from octasplat.workers.records.sizes import Sizes
-from octasplat.workers.work.kinds.estimates import Estimate
 
 
 async def estimate(service: Service, who: Principal, new: NewEstimate) -> Estimate | None:

@@ -5,8 +5,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from octasplat.engine.operations.costs import Estimate
 from octasplat.service.schemas.base import Strict
-from octasplat.workers.work.kinds.estimates import Estimate
 
 
 class PhotographSizes(Strict):

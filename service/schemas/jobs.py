@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from octasplat.engine.operations.costs import Estimate
 from octasplat.service.schemas.base import EXAMPLE_ID, EXAMPLE_TIME, Strict
 from octasplat.service.schemas.webhooks import JobWebhook
 from octasplat.workers.records.rows import Job, JobState
-from octasplat.workers.work.kinds.estimates import Estimate
 
 
 class NewJob(Strict):

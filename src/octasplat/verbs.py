@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from octasplat.engine.operations.crop import CropResult
     from octasplat.engine.operations.deform import DeformResult
     from octasplat.engine.operations.edit import EditResult
+    from octasplat.engine.operations.estimate import EstimateResult
     from octasplat.engine.operations.evaluate import EvaluateResult
     from octasplat.engine.operations.export import ExportResult
     from octasplat.engine.operations.import_ import ImportResult
@@ -116,8 +117,8 @@ def reconstruct(
             holds no model. Default: missing.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
-        evaluate_background: What lies behind renders and photographs with alpha when they are compared.
-            Default: black.
+        evaluate_background: What lies behind renders and photographs with alpha when they are compared;
+            by default that of the training: white where train.background is white, else black.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('mesh.ply',
@@ -181,6 +182,110 @@ def reconstruct(
             "resume": resume,
         },
         on_step,
+        progress,
+        should_stop,
+        threads,
+    )
+
+
+def estimate(
+    source: PathLike,
+    *,
+    preset: Literal["fast", "standard", "high", "paper"] | None = None,
+    max_side: int | None = None,
+    test_every: int | None = None,
+    held_out: Sequence[str] | None = None,
+    poses: Literal["given", "auto", "missing"] | None = None,
+    masks: Literal["ignore", "alpha"] | None = None,
+    evaluate_background: Literal["black", "white"] | None = None,
+    minutes: float | None = None,
+    exports: Sequence[str] | None = None,
+    materials: bool = False,
+    for_surface: bool = False,
+    iterations: int | None = None,
+    rays: int | None = None,
+    max_gaussians: int | None = None,
+    sh_degree: int | None = None,
+    seed: int | None = None,
+    train: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] | None = None,
+    cores: int | None = None,
+    progress: Listener | None = None,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> "EstimateResult":
+    """Estimate what a reconstruction takes, before it is begun.
+
+    Args:
+        source: The folder of the photographs.
+        preset: Where the settings of the training come from: fast is a first look, standard is better,
+            high is better yet and takes about three times as many iterations, paper has the published
+            settings. Default: standard.
+        max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
+            for a quick try, or where memory is short.
+        test_every: Every how-manieth view by name is held out to be measured; 0 holds out none, so that
+            all are trained on. Default: 8.
+        held_out: Names of the views to hold out instead of every how-manieth.
+        poses: Where the poses of the cameras come from: given takes the COLMAP model of the dataset
+            (photographs far from where matches put them are moved, see place_misfits); auto finds the
+            poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
+            holds no model. Default: missing.
+        masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
+            alpha, for objects that are cut out. Default: ignore.
+        evaluate_background: What lies behind renders and photographs with alpha when they are compared;
+            by default that of the training: white where train.background is white, else black.
+        minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
+            pace of the machine that begins it; by default the other settings do.
+        exports: Files to write besides scene.ply; their names say the format. Default: ('mesh.ply',
+            'mesh.obj', 'mesh.glb').
+        materials: Learn materials and the environment of shiny things; environment.hdr lies beside the
+            scene then.
+        for_surface: Hold normals and depths together, so that a surface made of the scene is smoother.
+        iterations: Iterations of the training; 0 asks the photographs' pixels.
+        rays: Rays of one iteration.
+        max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
+        sh_degree: Degree of the spherical harmonics of the colours, 0 to 3.
+        seed: Seed of everything random. [default: 0]
+        train: Settings of the training that are to be otherwise than the preset's.
+        assignments: Any other setting, e.g. rates.quat=0.02 or test_every=4, values as JSON; octasplat
+            config list shows them.
+        cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
+        progress: told each event; by default they are logged, or shown in a notebook.
+        should_stop: asked now and then; True ends the work with ``Cancelled``.
+        threads: number of threads; 0 takes all cores. The result does not depend on it.
+
+    Raises:
+        OctasplatError: something cannot be read, done or written; the text says what.
+
+    >>> import octasplat as osp
+    >>> found = osp.estimate("photos", preset="fast", cores=8)
+    >>> found.cores, found.seconds > 0
+    (8, True)
+    """
+    return run_operation(
+        "estimate",
+        {
+            "preset": preset,
+            "max_side": max_side,
+            "test_every": test_every,
+            "held_out": held_out,
+            "poses": poses,
+            "masks": masks,
+            "evaluate_background": evaluate_background,
+            "minutes": minutes,
+            "exports": exports,
+            "materials": materials,
+            "for_surface": for_surface,
+            "iterations": iterations,
+            "rays": rays,
+            "max_gaussians": max_gaussians,
+            "sh_degree": sh_degree,
+            "seed": seed,
+            "train": train,
+            "assignments": assignments,
+            "cores": cores,
+            "source": source,
+        },
         progress,
         should_stop,
         threads,
@@ -306,6 +411,7 @@ def surface(
     materials: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
+    photographs: PathLike | None = None,
     progress: Listener | None = None,
     should_stop: Callable[[], bool] = never,
     threads: int = 0,
@@ -351,6 +457,8 @@ def surface(
         up: With materials: the axis that points up. [default: the run's, of a file -y]
         dataset: Take the cameras of the photographs in this folder, and of a run the colours. [default:
             the cameras that a run keeps; else none]
+        photographs: A copy of the photographs that the run was made from, for colours alone; left out
+            if it has other poses.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``Cancelled``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
@@ -391,6 +499,7 @@ def surface(
             "source": source,
             "output": output,
             "dataset": dataset,
+            "photographs": photographs,
         },
         progress,
         should_stop,
@@ -526,7 +635,7 @@ def render(
         height_px: Turntable, single camera: height of the images in pixels. Default: 480.
         fov_y_degrees: Turntable, single camera: field of view from the top of the image to its bottom,
             in degrees. [default: that of the photographs, or 50]
-        up: The axis of the world that points up. [default: that of the run, of a file -y]
+        up: The axis of a file that points up; the photographs of a run say so themselves. [default: -y]
         max_side: Views of the photographs: longer side of the images in pixels. [default: that of the
             run]
         format: A video (mp4), or images: PNG, or EXR with linear values.
@@ -669,7 +778,8 @@ def relight(
         height_px: Turntable, single camera: height of the images in pixels. Default: 480.
         fov_y_degrees: Turntable, single camera: field of view from the top of the image to its bottom,
             in degrees. [default: that of the photographs, or 50]
-        up: The axis of the world that points up. [default: that of the run, of a file -y]
+        up: The axis of the world that points up, for the light and in a file for the cameras. [default:
+            that of the run, of a file -y]
         max_side: Views of the photographs: longer side of the images in pixels. [default: that of the
             run]
         format: A video (mp4), or images: PNG, or EXR with linear values.

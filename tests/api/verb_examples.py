@@ -1,6 +1,12 @@
 """The example of each verb's docstring; the tests run them in a folder with ``scene.ply`` and ``run``."""
 
 EXAMPLES = {
+    "estimate": """
+>>> import octasplat as osp
+>>> found = osp.estimate("photos", preset="fast", cores=8)
+>>> found.cores, found.seconds > 0
+(8, True)
+""",
     "evaluate": """
 >>> import octasplat as osp
 >>> found = osp.evaluate("run")

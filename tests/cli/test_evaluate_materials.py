@@ -9,9 +9,9 @@ import OpenImageIO as oiio
 import pytest
 from pydantic import ValidationError
 
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.render.images import read_image
-from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.programs import run_operation
 from octasplat.workers.work.task import Task

@@ -10,10 +10,10 @@ from pydantic import ValidationError
 
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import CheckpointWritten, Event, ImagesKept, StageProgress
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.render.images import read_image
 from octasplat.workers.client.submission import Derivation, with_camera_path
-from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.programs import run_operation
 from octasplat.workers.work.task import Task

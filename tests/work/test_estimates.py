@@ -3,8 +3,8 @@
 import pytest
 
 from octasplat.engine.config import resolve_config
-from octasplat.workers.records.sizes import Sizes
-from octasplat.workers.work.kinds.estimates import Estimate, estimate_reconstruction
+from octasplat.engine.operations.costs import Estimate, estimate_reconstruction
+from octasplat.engine.photograph_sizes import Sizes
 
 
 def estimated(preset: str, sizes: Sizes, *, materials: bool = False) -> Estimate:

@@ -26,6 +26,7 @@ EXIT_INTERRUPTED = 130
 
 _COMMANDS = {
     "reconstruct": ("reconstruct", "Photographs to a scene, its meshes, and measurements."),
+    "estimate": ("estimate", "Estimate what a reconstruction takes, before it is begun."),
     "evaluate": ("evaluate", "Measure a finished run again."),
     "info": ("info", "What is in a scene: counts, bounds, sizes, cost."),
     "config": ("config", "The settings of a reconstruction: list, explain, compare."),

@@ -7,11 +7,11 @@ from typing import Any
 from psycopg.rows import class_row, dict_row
 from psycopg.types.json import Jsonb
 
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.records.database import Connection, naming
 from octasplat.workers.records.errors import Conflict, Missing
 from octasplat.workers.records.ids import new_id
 from octasplat.workers.records.rows import Dataset, DatasetFile, DatasetHolds
-from octasplat.workers.records.sizes import Sizes
 
 CHECK_LOST_SECONDS = 60
 """A validation of which nothing was heard for so long counts no more; its process is gone."""

@@ -93,7 +93,7 @@ class Job:
         checkpoint: manifest of the newest one that is stored.
         preview: newest preview picture: ``sha256``, ``step`` and ``view``, the photograph it answers to.
         estimate: what it was reckoned to take when it was accepted, see
-            :class:`octasplat.workers.work.kinds.estimates.Estimate`.
+            :class:`octasplat.engine.operations.costs.Estimate`.
         files_id: dataset of the files that its options name.
         traceparent: W3C trace context of the request.
         pinned: never removed by retention.

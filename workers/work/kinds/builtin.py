@@ -6,6 +6,12 @@ from typing import Any
 from octasplat.engine.config import ReconstructionConfig
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.clean import OPERATION as CLEAN
+from octasplat.engine.operations.costs import (
+    Estimate,
+    estimate_reconstruction,
+    reconstruction_bytes,
+    training_pixels,
+)
 from octasplat.engine.operations.crop import OPERATION as CROP
 from octasplat.engine.operations.deform import OPERATION as DEFORM
 from octasplat.engine.operations.edit import OPERATION as EDIT
@@ -19,15 +25,9 @@ from octasplat.engine.operations.relight import OPERATION as RELIGHT
 from octasplat.engine.operations.render import OPERATION as RENDER
 from octasplat.engine.operations.stage_init import OPERATION as STAGE_INIT
 from octasplat.engine.operations.transform import OPERATION as TRANSFORM
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.engine.train.config import MOST_PLANNED_ITERATIONS, iteration_count, most_gaussians
-from octasplat.workers.records.sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
-from octasplat.workers.work.kinds.estimates import (
-    Estimate,
-    estimate_reconstruction,
-    reconstruction_bytes,
-    training_pixels,
-)
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.kinds.pictures import Relight, Render
 from octasplat.workers.work.kinds.scene_kinds import (

@@ -9,20 +9,20 @@ from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import Listener
 from octasplat.engine.light.stage_file import named_files
 from octasplat.engine.operations.base import Operation
-from octasplat.engine.operations.relight import RelightOptions
-from octasplat.engine.operations.render import RenderOptions
-from octasplat.engine.stages import stopping
-from octasplat.workers.records.sizes import Sizes
-from octasplat.workers.store.names import check_name
-from octasplat.workers.work.kept_frames import KeptFrames
-from octasplat.workers.work.kinds.demands import Demand
-from octasplat.workers.work.kinds.estimates import (
+from octasplat.engine.operations.costs import (
     Estimate,
     estimate_relight,
     estimate_render,
     image_bytes,
     rendered_pixels,
 )
+from octasplat.engine.operations.relight import RelightOptions
+from octasplat.engine.operations.render import RenderOptions
+from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.stages import stopping
+from octasplat.workers.store.names import check_name
+from octasplat.workers.work.kept_frames import KeptFrames
+from octasplat.workers.work.kinds.demands import Demand
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.task import FRAMES, Task
 

@@ -7,7 +7,7 @@ from octasplat.engine.operations.base import Operation, Options
 from octasplat.engine.operations.export import OPERATION as EXPORT
 from octasplat.engine.operations.export import ExportJobOptions
 from octasplat.engine.operations.import_ import OPERATION as IMPORT
-from octasplat.workers.records.sizes import Sizes
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.task import CONFIG_FILE, SCENE_FILE, Task

@@ -7,9 +7,9 @@ from pydantic import BaseModel, ValidationError
 from typing_extensions import TypeVar
 
 from octasplat.engine.errors import ConfigError
-from octasplat.workers.records.sizes import Sizes
+from octasplat.engine.operations.costs import Estimate
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.work.kinds.demands import Demand
-from octasplat.workers.work.kinds.estimates import Estimate
 
 OptionsT = TypeVar("OptionsT", bound=BaseModel, default=Any)
 

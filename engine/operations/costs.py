@@ -14,8 +14,8 @@ from octasplat.engine.durations import duration
 from octasplat.engine.operations.pictures import PictureOptions
 from octasplat.engine.operations.relight import RelightOptions
 from octasplat.engine.operations.render import RenderOptions
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.engine.train.config import TrainConfig, in_one_order, iteration_count, most_gaussians
-from octasplat.workers.records.sizes import Sizes
 
 _START_CPU_SECONDS = 16.0
 _LOAD_CPU_SECONDS_PER_PIXEL = 1.0e-7

@@ -1,0 +1,121 @@
+"""``estimate``: what a reconstruction will take, before it is begun."""
+
+import os
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from octasplat.engine.events import Listener, ignore
+from octasplat.engine.fields import Positional, Spelling, Unit
+from octasplat.engine.operations.base import Operation, Request, Result, never
+from octasplat.engine.operations.reconstruct import ReconstructOptions
+from octasplat.engine.photograph_sizes import Sizes
+
+
+class EstimateOptions(ReconstructOptions):
+    """How photographs are to become a scene, and on how many cores."""
+
+    cores: Annotated[int, Unit("cores"), Spelling(metavar="N")] = Field(
+        0, ge=0, description="Cores of the machine to reckon with; 0 takes those of this one."
+    )
+
+
+class EstimateRequest(EstimateOptions, Request):
+    """Estimate the time, memory and disk that the reconstruction of SCENE takes, within a factor of two.
+
+    The options are those of reconstruct. Photographs are not decoded: their sizes are enough.
+    """
+
+    source: Annotated[Path, Positional("SCENE")] = Field(description="The folder of the photographs.")
+
+
+class EstimateResult(Result):
+    """What a reconstruction will take, within a factor of two.
+
+    Attributes:
+        photographs: number of photographs of each size.
+        cpu_seconds: time of all cores together, without finding poses.
+        seconds: time by the clock, with nothing else to do.
+        cores: number of cores that is reckoned with.
+        memory_bytes: largest private memory of the process.
+        disk_bytes: least size of the folder of the run.
+        finds_poses: whether poses are found first, which takes time that is not in it.
+        text: the same in words.
+    """
+
+    photographs: tuple[Sizes, ...]
+    cpu_seconds: float
+    seconds: float
+    cores: int
+    memory_bytes: int
+    disk_bytes: int
+    finds_poses: bool
+    text: str
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the estimate in a sentence."""
+        count = sum(sizes.count for sizes in self.photographs)
+        disk = f"{self.disk_bytes / 1e6:,.0f} MB of disk"
+        return (f"{count} photographs: {self.text}, and at least {disk}; within a factor of two.",)
+
+
+def run(
+    request: EstimateRequest,
+    *,
+    progress: Listener = ignore,
+    should_stop: Callable[[], bool] = never,
+    threads: int = 0,
+) -> EstimateResult:
+    """Estimate a reconstruction; see :class:`octasplat.engine.operations.base.Run`.
+
+    Raises:
+        DatasetError: there are no photographs, or one cannot be read.
+        ConfigError: a setting cannot be used.
+    """
+    from octasplat.engine.operations.costs import estimate_reconstruction
+    from octasplat.engine.scene.colmap import has_model
+
+    config = request.config().with_poses_decided(has_model(request.source))
+    sizes = photograph_sizes(request.source)
+    cores = request.cores or threads or len(os.sched_getaffinity(0))
+    found = estimate_reconstruction(config, sizes, cores)
+    return EstimateResult(photographs=tuple(sizes), **found.model_dump())
+
+
+def photograph_sizes(scene: Path) -> list[Sizes]:
+    """Return the sizes of the photographs in a folder, read from their headers.
+
+    Raises:
+        DatasetError: there are none, or one cannot be read.
+    """
+    from PIL import Image
+
+    from octasplat.engine.errors import DatasetError
+    from octasplat.engine.scene.load import IMAGE_SUFFIXES, photograph_folder
+
+    if not scene.is_dir():
+        raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
+    folder = photograph_folder(scene)
+    counts: Counter[tuple[int, int]] = Counter()
+    found = (path for path in sorted(folder.rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES)
+    for path in found:
+        try:
+            with Image.open(path) as image:
+                counts[image.size] += 1
+        except OSError as error:
+            raise DatasetError(f"{path} cannot be read ({error}); replace or remove it.") from None
+    if not counts:
+        raise DatasetError(f"{folder} holds no photographs; name the folder that does.")
+    return [Sizes(width, height, count) for (width, height), count in counts.items()]
+
+
+OPERATION = Operation(
+    "estimate",
+    "Estimate what a reconstruction takes, before it is begun.",
+    EstimateRequest,
+    EstimateOptions,
+    run,
+)

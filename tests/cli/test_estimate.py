@@ -1,0 +1,44 @@
+"""``octasplat estimate``: what a reconstruction takes, by the sizes of the photographs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octasplat.engine.errors import DatasetError
+from octasplat.engine.operations.estimate import EstimateRequest, run
+from octasplat.engine.photograph_sizes import Sizes
+from octasplat.engine.render.images import write_png
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> Path:
+    folder = tmp_path / "scene" / "images"
+    folder.mkdir(parents=True)
+    for number in range(10):
+        write_png(folder / f"{number}.png", np.zeros((30, 40, 3), np.float32))
+    return folder.parent
+
+
+def test_estimate_counts_photographs_and_follows_the_options(photographs: Path) -> None:
+    fast, standard = (
+        run(EstimateRequest(source=photographs, preset=name, cores=2)) for name in ("fast", "standard")
+    )
+    assert fast.photographs == (Sizes(40, 30, 10),)
+    assert fast.cores == 2 and fast.finds_poses and "find the poses" in fast.text
+    assert fast.cpu_seconds < standard.cpu_seconds
+    longer = run(
+        EstimateRequest(source=photographs, preset="fast", cores=2, assignments=("iterations=5000",))
+    )
+    assert longer.cpu_seconds > fast.cpu_seconds
+
+
+def test_command_tells_the_estimate_in_a_sentence(octasplat, photographs: Path) -> None:
+    done = octasplat("estimate", photographs, "--preset", "fast", "--cores", 4)
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout.startswith("10 photographs: about ") and "on 4 cores" in done.stdout
+
+
+def test_folder_without_photographs_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="holds no photographs"):
+        run(EstimateRequest(source=tmp_path))
