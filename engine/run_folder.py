@@ -23,7 +23,9 @@ CONFIG, EVENTS, HELD_OUT, SCENE, TRAINING, VIEWS = (
 METRICS, REPORT = "metrics.json", "report.html"
 CHECKPOINTS, CACHE, POSES = "checkpoints", "cache", "poses"
 PLAN = "plan.json"
-ENVIRONMENT = "environment.hdr"
+ENVIRONMENT, EXACT_ENVIRONMENT = "environment.hdr", "environment.exr"
+"""The learnt light, for programs that show it and as it was learnt: an HDR has one exponent for all channels
+of a pixel, so that a dark channel beside a bright one is coarse."""
 BACKGROUND = "background.exr"
 ON = "on"
 """Below it are the measures on photographs of other folders, a folder each."""
@@ -128,6 +130,12 @@ def run_exposures(output: Path) -> ExposuresByName | None:
     except (OSError, ValueError, AttributeError):
         return None
     return known
+
+
+def run_environment(output: Path) -> Path:
+    """Return the file of the light that a run has learnt; runs of old have the HDR only, others none."""
+    exact = output / EXACT_ENVIRONMENT
+    return exact if exact.exists() else output / ENVIRONMENT
 
 
 def run_background(output: Path) -> LearntBackground | None:

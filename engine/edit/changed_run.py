@@ -20,6 +20,7 @@ from octasplat.engine.run_folder import (
     CONFIG,
     ENVIRONMENT,
     EVENTS,
+    EXACT_ENVIRONMENT,
     HELD_OUT,
     POSES,
     SCENE,
@@ -30,7 +31,7 @@ from octasplat.engine.writing import telling_of_room, write_json
 
 EDITS = "edits.json"
 """What was changed since the training, first to last."""
-_KEPT = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT, BACKGROUND)
+_KEPT = (CONFIG, EVENTS, HELD_OUT, TRAINING, VIEWS, ENVIRONMENT, EXACT_ENVIRONMENT, BACKGROUND)
 """What is as true of the scene after it was changed where it stands."""
 
 

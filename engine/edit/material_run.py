@@ -12,7 +12,7 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.materials import require_materials
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_map import read_environment
-from octasplat.engine.run_folder import CONFIG, ENVIRONMENT, SCENE, is_run
+from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_environment
 from octasplat.engine.shading.environment_frame import environment_frame
 from octasplat.engine.shading.learnt_light import LearntLight
 
@@ -43,14 +43,14 @@ def change_materials(
         return changed
     settings = read_config(source / CONFIG).train.materials
     light = LearntLight(settings.environment_height)
-    light.put(read_environment(source / ENVIRONMENT))
+    light.put(read_environment(run_environment(source)))
     frame = environment_frame(np.array(settings.up_world, np.float64))
     return with_harmonics_following(gaussians, changed, chosen, light.levels, frame)
 
 
 def follows(source: Path) -> bool:
     """Whether the harmonics of a scene show its materials in a light that is known."""
-    if not is_run(source) or not (source / ENVIRONMENT).exists():
+    if not is_run(source) or not run_environment(source).exists():
         return False
     return read_config(source / CONFIG).train.materials.recipe != "seed"  # there they are the matt part
 

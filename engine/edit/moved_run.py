@@ -19,6 +19,7 @@ from octasplat.engine.run_folder import (
     CONFIG,
     ENVIRONMENT,
     EVENTS,
+    EXACT_ENVIRONMENT,
     HELD_OUT,
     TRAINING,
     VIEWS,
@@ -88,6 +89,7 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
     told = []
     below = environment_frame(np.array(UP_WORLD))
     for name, old_frame, new_frame in (
+        (EXACT_ENVIRONMENT, environment_frame(up), environment_frame(new_up)),
         (ENVIRONMENT, environment_frame(up), environment_frame(new_up)),
         (BACKGROUND, below, below),
     ):
@@ -97,7 +99,7 @@ def _write_light(source: Path, target: Path, turn: Float64[np.ndarray, "3 3"]) -
             shutil.copyfile(source / name, target / name)
             continue
         told.append(f"{name} was turned with the scene, which makes it a little softer.")
-        if name == ENVIRONMENT:
+        if name in (ENVIRONMENT, EXACT_ENVIRONMENT):
             radiance = read_environment(source / name)
             write_environment(target / name, turned_map(radiance, old_frame, new_frame, turn))
         else:

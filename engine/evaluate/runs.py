@@ -25,7 +25,6 @@ from octasplat.engine.run_folder import (
     BACKGROUND,
     CACHE,
     CONFIG,
-    ENVIRONMENT,
     ON,
     POSES,
     SCENE,
@@ -34,6 +33,7 @@ from octasplat.engine.run_folder import (
     found_model,
     open_photographs,
     photographs_folder,
+    run_environment,
     run_exposures,
 )
 from octasplat.engine.scene import Dataset
@@ -255,7 +255,7 @@ def finished_shading(
     decided = config.model_copy(update={"exposure": known is not None})
     shading = make_shading(decided, len(dataset.views), extent_world)
     if (deferred := deferred_of(shading)) is not None:
-        deferred.light.put(read_environment(output / ENVIRONMENT))
+        deferred.light.put(read_environment(run_environment(output)))
     if (background := background_of(shading)) is not None:
         background.put(read_background(output / BACKGROUND))
     if exposed and known is not None and (exposures := exposures_of(shading)) is not None:
@@ -265,10 +265,10 @@ def finished_shading(
 
 def _environment(output: Path, config: TrainConfig) -> EnvironmentMap | None:
     """The map that a run with materials has learnt."""
-    if not (output / ENVIRONMENT).exists():
+    if not run_environment(output).exists():
         return None
     up = np.array(config.materials.up_world, np.float64)
-    return EnvironmentMap(read_environment(output / ENVIRONMENT), environment_frame(up))
+    return EnvironmentMap(read_environment(run_environment(output)), environment_frame(up))
 
 
 def _evaluate_on(

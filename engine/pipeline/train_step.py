@@ -15,7 +15,7 @@ from octasplat.engine.gaussians.scene_facts import SceneFacts
 from octasplat.engine.pipeline.run import Run
 from octasplat.engine.render.environment_map import write_background, write_environment
 from octasplat.engine.render.jobs import trained_pixel_rad
-from octasplat.engine.run_folder import BACKGROUND, CHECKPOINTS, ENVIRONMENT, PLAN, SCENE, TRAINING
+from octasplat.engine.run_folder import BACKGROUND, CHECKPOINTS, ENVIRONMENT, EXACT_ENVIRONMENT, PLAN, SCENE, TRAINING
 from octasplat.engine.scene import Dataset
 from octasplat.engine.scene.near import NearZones, nearest_distances
 from octasplat.engine.scene.seen import SeenSpace
@@ -116,7 +116,8 @@ def _write_surroundings(
 ) -> None:
     """Write the environment and the background that were learnt, if they were."""
     if (deferred := deferred_of(shading)) is not None:
-        write_environment(output / ENVIRONMENT, deferred.light.radiance_linear)
+        for name in (EXACT_ENVIRONMENT, ENVIRONMENT):
+            write_environment(output / name, deferred.light.radiance_linear)
         if reflective_share(gaussians) < LEAST_REFLECTIVE:
             progress(
                 Warned(

@@ -36,7 +36,7 @@ def read_environment(path: Path) -> Float32[np.ndarray, "h w 3"]:
 
 
 def write_environment(path: Path, radiance_linear: Float32[np.ndarray, "h w 3"]) -> None:
-    """Write a map as RGBE (``.hdr``, values to within 1 %) or as EXR (``.exr``, exactly), atomically.
+    """Write a map as RGBE (``.hdr``, to within 1/256 of the brightest channel) or EXR (exactly), atomically.
 
     Raises:
         ConfigError: the name ends otherwise.

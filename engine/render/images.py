@@ -126,7 +126,12 @@ def write_rgbe(path: Path, rgb_linear: Float32[np.ndarray, "h w 3"]) -> None:
         OutputError: The file cannot be written.
     """
     height, width, channels = rgb_linear.shape
-    _write(path, oiio.ImageSpec(width, height, channels, oiio.FLOAT), rgb_linear.astype(np.float32))
+    # The format has 256 steps up to the power of two above the brightest channel; OpenImageIO cuts to them.
+    brightest = rgb_linear.max(axis=2, keepdims=True)
+    _, exponent = np.frexp(brightest + np.ldexp(np.float32(0.5), np.frexp(brightest)[1] - 8))
+    half_step = np.ldexp(np.float32(0.5), exponent - 8)
+    rounded = np.where(rgb_linear > 0, rgb_linear + half_step, 0).astype(np.float32)
+    _write(path, oiio.ImageSpec(width, height, channels, oiio.FLOAT), rounded)
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "h w c"]:

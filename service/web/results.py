@@ -221,6 +221,7 @@ _NAMED = {
     CONFIG: (_RECORDS, "a text editor: every setting of the run"),
     HELD_OUT: (_RECORDS, "a text editor: the photographs that training never saw"),
     "environment.hdr": (_SCENE, "Blender and whatever takes HDR light: what lit the photographs, all around"),
+    "environment.exr": (_SCENE, "the same light as it was learnt, to the last digit; octasplat itself"),
     "background.exr": (_SCENE, "Blender and whatever takes EXR maps: the sky, and what else is far away"),
     "edits.json": (_RECORDS, "a text editor: what was changed since the training"),
     "views.json": (_RECORDS, "octasplat render and surface, which need no photographs then"),

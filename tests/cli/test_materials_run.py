@@ -33,6 +33,8 @@ def test_it_leaves_materials_and_an_environment(materials_run):
     assert np.ptp(gaussians.channels["albedo"]) > 0.02
     environment = read_environment(materials_run / "environment.hdr")
     assert environment.shape == (16, 32, 3) and np.ptp(environment) > 0
+    exact = read_environment(materials_run / "environment.exr")
+    assert (np.abs(environment - exact) <= exact.max(axis=2, keepdims=True) / 255).all()
     train = json.loads((materials_run / "config.json").read_text())["reconstruction"]["train"]
     assert train["materials"]["learn"] is True and train["rates"]["quat"] < 0.01
 
@@ -42,9 +44,11 @@ def test_it_is_measured_as_it_is_shaded(materials_run, octasplat):
     result = octasplat("evaluate", materials_run)
     assert result.exit_code == 0, result.output
     assert json.loads((materials_run / "metrics.json").read_text())["mean"] == before["mean"]
-    (materials_run / "environment.hdr").rename(materials_run / "away.hdr")
+    for suffix in (".hdr", ".exr"):
+        (materials_run / f"environment{suffix}").rename(materials_run / f"away{suffix}")
     result = octasplat("evaluate", materials_run)
-    (materials_run / "away.hdr").rename(materials_run / "environment.hdr")
+    for suffix in (".hdr", ".exr"):
+        (materials_run / f"away{suffix}").rename(materials_run / f"environment{suffix}")
     assert result.exit_code != 0 and "environment.hdr" in result.output
     assert "Traceback" not in result.output
 
@@ -65,5 +69,5 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(
     running.communicate(timeout=120)
     result = octasplat(*command, "--resume")
     assert result.exit_code == 0, result.output
-    for name in ("scene.ply", "environment.hdr"):
+    for name in ("scene.ply", "environment.hdr", "environment.exr"):
         assert (output / name).read_bytes() == (materials_run / name).read_bytes(), name

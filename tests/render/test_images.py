@@ -99,3 +99,16 @@ def test_a_transparent_exr_holds_linear_colours_times_alpha():
     np.testing.assert_array_equal(layers["A"], alpha)
     opaque = images.exr_layers(display, alpha=alpha)  # over a black background that is part of the picture
     np.testing.assert_array_equal(opaque["R"], srgb_to_linear(display)[..., 0])
+
+
+def test_a_radiance_picture_is_rounded_to_its_steps(tmp_path):
+    random = np.random.default_rng(1)
+    linear = np.exp(random.uniform(-6, 6, (32, 64, 3))).astype(np.float32)
+    linear[0, 0] = 0
+    images.write_rgbe(tmp_path / "a.hdr", linear)
+    back = images.read_image(tmp_path / "a.hdr")[..., :3]
+    step = np.ldexp(1.0, np.frexp(linear.max(axis=2, keepdims=True))[1] - 8)
+    assert (np.abs(back - linear) <= 0.5 * step * 1.02).mean() > 0.99
+    assert (np.abs(back - linear) <= step).all()
+    assert abs(float(((back - linear) / step)[linear > step].mean())) < 0.02
+    np.testing.assert_array_equal(back[0, 0], 0)

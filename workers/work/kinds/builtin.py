@@ -33,6 +33,7 @@ from octasplat.workers.work.kinds.pictures import Relight, Render
 from octasplat.workers.work.kinds.scene_kinds import (
     BACKGROUND,
     EDITS,
+    EXACT_LIGHT,
     LIGHT,
     RUN_FILES,
     Export,
@@ -145,7 +146,7 @@ def register_all() -> None:
             EVALUATE,
             title="Measure views of a reconstruction: those held out again, or other photographs",
             stages=("evaluate",),
-            source_files=(*RUN_FILES, LIGHT, BACKGROUND, EDITS),
+            source_files=(*RUN_FILES, LIGHT, EXACT_LIGHT, BACKGROUND, EDITS),
             tells_stages=True,
         )
     )

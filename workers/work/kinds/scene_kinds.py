@@ -13,7 +13,7 @@ from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.task import CONFIG_FILE, SCENE_FILE, Task
 
 RUN_FILES = (SCENE_FILE, CONFIG_FILE, "held_out.json", "views.json", "training.json", "events.jsonl")
-LIGHT = "environment.hdr"
+LIGHT, EXACT_LIGHT = "environment.hdr", "environment.exr"
 """What results with materials have, and no others."""
 BACKGROUND = "background.exr"
 """What results with a learnt background have, and no others."""
@@ -83,7 +83,7 @@ class SceneChange(OperationKind):
         sequence: str | None = None,
         keeps_world: bool = True,
     ) -> None:
-        files = dict.fromkeys((first, *RUN_FILES, LIGHT, BACKGROUND, EDITS))
+        files = dict.fromkeys((first, *RUN_FILES, LIGHT, EXACT_LIGHT, BACKGROUND, EDITS))
         super().__init__(operation, title=title, stages=("edit",), source_files=tuple(files))
         self.keeps_world = keeps_world
         self._sequence = sequence
