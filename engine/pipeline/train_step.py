@@ -15,7 +15,15 @@ from octasplat.engine.gaussians.scene_facts import SceneFacts
 from octasplat.engine.pipeline.run import Run
 from octasplat.engine.render.environment_map import write_background, write_environment
 from octasplat.engine.render.jobs import trained_pixel_rad
-from octasplat.engine.run_folder import BACKGROUND, CHECKPOINTS, ENVIRONMENT, EXACT_ENVIRONMENT, PLAN, SCENE, TRAINING
+from octasplat.engine.run_folder import (
+    BACKGROUND,
+    CHECKPOINTS,
+    ENVIRONMENT,
+    EXACT_ENVIRONMENT,
+    PLAN,
+    SCENE,
+    TRAINING,
+)
 from octasplat.engine.scene import Dataset
 from octasplat.engine.scene.near import NearZones, nearest_distances
 from octasplat.engine.scene.seen import SeenSpace
