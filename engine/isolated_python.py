@@ -1,6 +1,6 @@
 """Programs of ours in processes that import nothing from the current folder or ``PYTHONPATH``.
 
-``python -m package`` looks in the current folder first, where many projects have folders named as ours are.
+``python -m module`` looks in the current folder first, where anything may lie that is called as what we use.
 What is started here runs with ``-E -P`` instead, finds the very packages that the starting process runs, and
 where somebody asked for modules by name, those. This file is also what is run; it imports nothing of ours.
 """

@@ -36,11 +36,11 @@ class Client:
 
     >>> import octasplat as osp
     >>> with osp.Client(url, token) as client:
-    ...     job = client.submit("photos/", preset="fast", label="a trial")
-    ...     job.wait().state
+    ...     job = client.submit("photos/", preset="fast", train={"iterations": 50}, label="a trial")
+    ...     files = job.wait().download("downloaded/")
+    >>> job.state
     'succeeded'
-    >>> files = job.download("out/")
-    >>> osp.Run("out/").psnr > 20
+    >>> osp.Run("downloaded/").psnr > 10
     True
     """
 

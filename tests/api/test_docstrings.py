@@ -29,6 +29,13 @@ def test_examples_of_a_module_run(module: str) -> None:
     assert failed == 0
 
 
+@pytest.mark.usefixtures("in_folder")
+def test_examples_of_the_page_run() -> None:
+    page = Path(__file__).parents[2] / "docs" / "python.md"
+    failed, count = doctest.testfile(str(page), module_relative=False, optionflags=doctest.ELLIPSIS)
+    assert failed == 0 and count > 20
+
+
 def test_public_names_are_those_that_can_be_imported() -> None:
     assert sorted(octasplat.__all__) == octasplat.__all__ == sorted({"__version__", *octasplat._SOURCES})
     for name in PUBLIC:

@@ -1,0 +1,35 @@
+"""A user's program is checked as strictly as they like."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+PROGRAM = Path(__file__).with_name("user_program.py")
+WRONG = """
+import octasplat as osp
+
+osp.crop("a.ply", "b.ply", wher="z < 0")
+osp.render(osp.load("a.ply"), "b.png")
+osp.reconstruct("photos", "out", preset="fastest")
+osp.load("a.ply").means.nothing
+"""
+CONFIG = "[mypy]\nstrict = True\nplugins = pydantic.mypy\n[mypy-numba.*,pycolmap.*,embreex.*]\nignore_missing_imports = True\n"
+
+
+def check(program: Path, folder: Path) -> tuple[int, str]:
+    (folder / "mypy.ini").write_text(CONFIG)
+    command = [
+        sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--config-file", "mypy.ini",
+        "--cache-dir", str(folder / "cache"), str(program),
+    ]  # fmt: skip
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout
+
+
+def test_program_of_a_user_passes_mypy_strict_and_wrong_ones_do_not(tmp_path: Path) -> None:
+    assert check(PROGRAM, tmp_path) == (0, "Success: no issues found in 1 source file\n")
+    wrong = tmp_path / "wrong.py"
+    wrong.write_text(WRONG)
+    code, told = check(wrong, tmp_path)
+    assert code == 1
+    assert {int(line.split(":")[1]) for line in told.splitlines() if ": error:" in line} == {4, 5, 6, 7}
