@@ -13,7 +13,12 @@ osp.render(osp.load("a.ply"), "b.png")
 osp.reconstruct("photos", "out", preset="fastest")
 osp.load("a.ply").means.nothing
 """
-CONFIG = "[mypy]\nstrict = True\nplugins = pydantic.mypy\n[mypy-numba.*,pycolmap.*,embreex.*]\nignore_missing_imports = True\n"
+CONFIG = """[mypy]
+strict = True
+plugins = pydantic.mypy
+[mypy-numba.*,pycolmap.*,embreex.*]
+ignore_missing_imports = True
+"""
 
 
 def check(program: Path, folder: Path) -> tuple[int, str]:
