@@ -218,6 +218,8 @@ def test_stop_and_start_go_on_and_other_kinds_use_the_result(
             for kind, options, expected in (
                 ("export", {"files": ["again.glb", "cloud.ply"]}, {"again.glb", "cloud.ply"}),
                 ("evaluate", {}, {"metrics.json", "report.html", "renders/view_000.png"}),
+                ("info", {}, {"info.json", "picture.png"}),
+                ("surface", {"resolution": 32, "depth_side": 32}, {"surface.glb"}),
                 ("render", {"frames": 3, "width_px": 32, "height_px": 32}, {"turntable.mp4"}),
             ):
                 body = {"kind": kind, "source_id": job["id"], "options": options}
