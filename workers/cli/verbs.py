@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from importlib import import_module
+from keyword import iskeyword
 from typing import Any
 
 from octasplat.engine.operations.base import Operation
@@ -78,8 +79,9 @@ def _command(name: str) -> str:
 
 def _python_call(entry: Operation[Any, Any]) -> str:
     # The public names alone are read: what they stand for lies above the commands.
-    if entry.name in import_module("octasplat").__all__:
-        return f"osp.{entry.name}(...)"
+    name = entry.name.replace("-", "_") + ("_" if iskeyword(entry.name) else "")
+    if name in import_module("octasplat").__all__:
+        return f"osp.{name}(...)"
     module = entry.request.__module__.rpartition(".")[2]
     return f"{module}.run({module}.{entry.request.__name__}(...))"
 
