@@ -1,3 +1,0 @@
-"""Axes of the world, as options name them."""
-
-AXES = ("x", "-x", "y", "-y", "z", "-z")
