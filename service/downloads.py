@@ -29,8 +29,10 @@ def send_blob(
 ) -> Response:
     """An answer with stored content.
 
-    Content never changes under its digest, which makes the ETag. What came from users or out of a job is
-    never shown as a page of this site: anything but pictures and data is a download, pages are sandboxed.
+    Content never changes under its digest, which makes the ETag. What an address leads to may change, as
+    results do by a retry, so that a browser asks each time whether it is still that. What came from users or
+    out of a job is never shown as a page of this site: anything but pictures and data is a download, pages
+    are sandboxed.
 
     Args:
         service: the service.
@@ -50,7 +52,7 @@ def send_blob(
     headers = {
         "ETag": etag,
         "Repr-Digest": format_digest(sha256),
-        "Cache-Control": "private, max-age=31536000, immutable",
+        "Cache-Control": "private, no-cache",
         "Accept-Ranges": "bytes",
         "Content-Disposition": _disposition(name, shown),
     }

@@ -1,6 +1,7 @@
 """Settings of the front end, in one place; those of the workers come first."""
 
 import ipaddress
+from typing import Annotated
 
 from pydantic import Field, IPvAnyNetwork, SecretStr
 
@@ -11,7 +12,7 @@ from octasplat.service.intake.model_check import ModelLimits
 from octasplat.service.intake.receive import UploadLimits
 from octasplat.service.intake.spool import Spool
 from octasplat.workers.records.quotas import Quota
-from octasplat.workers.settings import PREFIX, WorkerSettings
+from octasplat.workers.settings import LISTED, PREFIX, WorkerSettings
 from octasplat.workers.work.kinds.demands import CEILINGS
 
 DEFAULT_PORT = 8642
@@ -61,9 +62,9 @@ class ServiceSettings(WorkerSettings):
     token_hours: float = Field(0.0, ge=0)
     session_hours: float = Field(168.0, gt=0)
     wrong_token_seconds: float = Field(0.25, ge=0)
-    proxies: tuple[IPvAnyNetwork, ...] = ()
+    proxies: Annotated[tuple[IPvAnyNetwork, ...], *LISTED] = ()
     proxy_headers: Dialect = "x-forwarded"
-    allowed_hosts: tuple[str, ...] = ()
+    allowed_hosts: Annotated[tuple[str, ...], *LISTED] = ()
     max_upload_bytes: int = Field(4 << 30, gt=0)
     max_archive_bytes: int = Field(64 << 30, gt=0)
     max_spool_bytes: int = Field(64 << 30, gt=0)

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import psycopg
 import pytest
+from psycopg import sql
 from psycopg.conninfo import make_conninfo
 
+import lock_order_for_tests
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 from octasplat.workers.records.migrate import migrate
 
@@ -64,7 +66,21 @@ def copied_database(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
 def conninfo(postgres: EmbeddedPostgres, template: str) -> Iterator[str]:
     """A database of the test's own, with all tables."""
     with copied_database(postgres, template) as copied:
+        lock_order_for_tests.install(copied)
         yield copied
+
+
+def add_columns(conninfo: str) -> None:
+    """Give every table of ours a further column, as the next version may while this one still runs."""
+    with psycopg.connect(conninfo) as connection:
+        tables = connection.execute(
+            "SELECT tablename FROM pg_tables WHERE schemaname = 'public' "
+            "AND tablename NOT LIKE 'procrastinate%'"
+        ).fetchall()
+        assert len(tables) > 15
+        for (table,) in tables:
+            query = sql.SQL("ALTER TABLE {} ADD COLUMN of_a_later_version text NOT NULL DEFAULT 'x'")
+            connection.execute(query.format(sql.Identifier(table)))
 
 
 os.environ.pop("DATABASE_URL", None)

@@ -1,19 +1,33 @@
 """Settings of everything that talks to the database, from the environment; the service adds its own."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, TypeVar
 from urllib.parse import urlsplit
 
-from pydantic import AliasChoices, Field, SecretStr, ValidationError
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import AliasChoices, BeforeValidator, Field, SecretStr, ValidationError
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from octasplat.engine.errors import ConfigError
 from octasplat.workers.data_folder import default_data_folder
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 
 PREFIX = "OCTASPLAT_"
+
+
+def _listed(value: object) -> object:
+    """The parts of a text such as ``a,b`` or ``["a", "b"]``; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    if value.lstrip().startswith("["):
+        return json.loads(value)
+    return [part.strip() for part in value.split(",") if part.strip()]
+
+
+LISTED = (NoDecode, BeforeValidator(_listed))
+"""Marks of a setting with several values, which the environment gives with commas or as JSON."""
 S = TypeVar("S", bound="WorkerSettings")
 
 
@@ -100,8 +114,8 @@ class WorkerSettings(BaseSettings):
     threads: int = Field(0, ge=0)
     pool_size: int = Field(12, gt=1)
     listen: bool = True
-    kind_modules: tuple[str, ...] = ()
-    webhook_hosts: tuple[str, ...] = ()
+    kind_modules: Annotated[tuple[str, ...], *LISTED] = ()
+    webhook_hosts: Annotated[tuple[str, ...], *LISTED] = ()
     keep_jobs_hours: float = Field(0.0, ge=0)
     keep_jobs_hours_by_kind: dict[str, Annotated[float, Field(ge=0)]] = {}
     keep_datasets_hours: float = Field(0.0, ge=0)
@@ -183,6 +197,10 @@ def load_settings(model: type[S], *, data: Path | None = None, **changes: object
         settings = model()
         # Validated again, as a copy alone would not be.
         return model.model_validate({**settings.model_dump(), **given}) if given else settings
+    except SettingsError as error:  # JSON that is none
+        raise ConfigError(
+            f"A setting of the environment cannot be read ({error}); write it as JSON."
+        ) from None
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])

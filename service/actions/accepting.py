@@ -22,8 +22,9 @@ from octasplat.service.schemas.jobs import JobView, NewJob, RetryRequest
 from octasplat.service.state import Service
 from octasplat.service.webhook_addresses import check_address
 from octasplat.workers.queue import jobs as rows
-from octasplat.workers.records.database import Connection
+from octasplat.workers.records.database import Connection, tried_again
 from octasplat.workers.records.datasets import get_dataset, photograph_sizes
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.records.quotas import check_new_job
 from octasplat.workers.records.rows import Dataset, Job
 from octasplat.workers.upkeep.webhooks.rows import add_endpoint
@@ -50,6 +51,7 @@ class _Inputs:
     files_id: uuid.UUID | None = None
 
 
+@tried_again
 async def accept_job(
     service: Service, who: Principal, new: NewJob, *, key: str | None = None, traceparent: str | None = None
 ) -> JobView:
@@ -82,6 +84,7 @@ async def accept_job(
         return await job_view(connection, service, await owned_job(connection, who, job_id))
 
 
+@tried_again
 async def retry_job(
     service: Service, who: Principal, job_id: uuid.UUID, asked: RetryRequest, *, key: str | None = None
 ) -> JobView:
@@ -103,6 +106,7 @@ async def retry_job(
         owner = (await owned_job(connection, who, job_id)).owner
 
         async def make() -> uuid.UUID:
+            await lock_owner(connection, owner)
             job = await owned_job(connection, who, job_id, lock=True)
             await check_new_job(connection, owner, service.settings.quota)
             options, estimate = await _revised(connection, service, who, job, asked)
@@ -123,6 +127,7 @@ async def retry_job(
 
 async def _make_job(connection: Connection, service: Service, who: Principal, asked: _Asked) -> uuid.UUID:
     new, kind = asked.new, asked.kind
+    await lock_owner(connection, who.owner)
     inputs = await _inputs(connection, who, asked)
     await check_new_job(connection, who.owner, service.settings.quota)
     workers = await workers_of(connection, new.queue, service.settings.stale_seconds)
@@ -240,6 +245,8 @@ async def _revised(
             return None, None
         detail = "The job is of another version, so its options cannot be changed; make a new one."
         raise Problem(409, "version", detail) from None
+    if kind.needs == "result" and job.source_id is None:
+        raise Problem(409, "source", "The job whose results it works on was deleted; make a new job.")
     try:
         options = kind.revised(job.options, asked.options) if asked.options else before
     except (ValidationError, SettingsRefused) as error:

@@ -1,6 +1,7 @@
 """Datasets: made, listed, changed, checked, deleted; their files are in ``uploads``."""
 
 import asyncio
+import time
 import uuid
 from collections.abc import Sequence
 from contextlib import suppress
@@ -21,10 +22,16 @@ from octasplat.service.schemas.datasets import DatasetChange, NewDataset
 from octasplat.service.state import Service
 from octasplat.service.threads import Threads, in_thread
 from octasplat.workers.records import datasets as rows
+from octasplat.workers.records.database import tried_again
+from octasplat.workers.records.errors import Conflict
 from octasplat.workers.records.quotas import check_new_dataset
 from octasplat.workers.records.rows import Dataset, DatasetFile
 
+END_CHECK_SECONDS = 60.0
+"""For so long it is tried to say what a check found."""
 
+
+@tried_again
 async def create_dataset(
     service: Service, who: Principal, new: NewDataset, *, key: str | None = None
 ) -> Dataset:
@@ -72,6 +79,7 @@ async def get_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -
         return await owned_dataset(connection, who, dataset_id)
 
 
+@tried_again
 async def change_dataset(
     service: Service, who: Principal, dataset_id: uuid.UUID, change: DatasetChange
 ) -> Dataset:
@@ -90,6 +98,7 @@ async def change_dataset(
         )
 
 
+@tried_again
 async def delete_dataset(service: Service, who: Principal, dataset_id: uuid.UUID) -> None:
     """Delete a dataset.
 
@@ -136,6 +145,8 @@ async def _check(service: Service, dataset_id: uuid.UUID) -> Dataset:
         renewing.cancel()
         # Whatever happens, the dataset must not stay closed.
         dataset = await asyncio.shield(_end_check(service, dataset_id, summary))
+    if dataset.state != "committed":
+        raise Conflict("The dataset was opened while it was checked; commit it again.")
     return dataset
 
 
@@ -149,6 +160,21 @@ async def _renew_check(service: Service, dataset_id: uuid.UUID) -> None:
 
 
 async def _end_check(
+    service: Service, dataset_id: uuid.UUID, summary: DatasetSummary | dict[str, Any] | None
+) -> Dataset:
+    """Say what the check found, again and again while the database is away."""
+    wait, deadline = 0.2, time.monotonic() + END_CHECK_SECONDS
+    while True:
+        try:
+            return await _say_check(service, dataset_id, summary)
+        except (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout):
+            if time.monotonic() > deadline:
+                raise  # whoever looks after lost checks opens it
+        await asyncio.sleep(wait)
+        wait = min(2 * wait, 5.0)
+
+
+async def _say_check(
     service: Service, dataset_id: uuid.UUID, summary: DatasetSummary | dict[str, Any] | None
 ) -> Dataset:
     async with service.pool.connection() as connection:

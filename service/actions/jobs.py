@@ -17,7 +17,7 @@ from octasplat.service.queue_facts import waiting_notes, workers_of
 from octasplat.service.schemas.jobs import JobChange, JobView
 from octasplat.service.state import Service
 from octasplat.workers.queue import jobs as rows
-from octasplat.workers.records.database import Connection
+from octasplat.workers.records.database import Connection, tried_again
 from octasplat.workers.records.rows import Job, JobState
 from octasplat.workers.work.kinds import kind_named
 
@@ -87,6 +87,7 @@ async def get_job(service: Service, who: Principal, job_id: uuid.UUID) -> ShownJ
         return ShownJob(job, await job_view(connection, service, job))
 
 
+@tried_again
 async def change_job(
     service: Service,
     who: Principal,
@@ -119,6 +120,7 @@ async def change_job(
         return await job_view(connection, service, job)
 
 
+@tried_again
 async def cancel_job(service: Service, who: Principal, job_id: uuid.UUID) -> JobView:
     """Ask a job to stop.
 
@@ -132,6 +134,7 @@ async def cancel_job(service: Service, who: Principal, job_id: uuid.UUID) -> Job
         return await job_view(connection, service, job)
 
 
+@tried_again
 async def delete_job(service: Service, who: Principal, job_id: uuid.UUID, *, cancel: bool = False) -> None:
     """Delete a finished job with its results.
 
@@ -149,9 +152,10 @@ async def delete_job(service: Service, who: Principal, job_id: uuid.UUID, *, can
         job = await owned_job(connection, who, job_id)
         if cancel and not job.is_over:
             job = await rows.cancel_job(connection, service.slips, job_id)
-            if not job.is_over:
-                detail = "The job is being stopped; repeat the request in a moment."
-                raise Problem(409, "stopping", detail, retry_seconds=BUSY_SECONDS)
+    if cancel and not job.is_over:
+        detail = "The job is being stopped; repeat the request in a moment."
+        raise Problem(409, "stopping", detail, retry_seconds=BUSY_SECONDS)
+    async with service.pool.connection() as connection:
         await rows.delete_job(connection, job_id)
     service.room.after_deletion()
 

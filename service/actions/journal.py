@@ -4,10 +4,11 @@ import asyncio
 import uuid
 from collections.abc import AsyncGenerator
 
-from octasplat.service.actions.access import owned_job, read_job
+from octasplat.service.actions.access import read_job
 from octasplat.service.auth import Principal
 from octasplat.service.problems import Problem
 from octasplat.service.state import Service
+from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.records.journal import events_after, log_after
 from octasplat.workers.records.rows import JobEvent, LogLine
 
@@ -73,7 +74,10 @@ async def _events(
         while not service.hub.is_closing:
             news.clear()
             async with service.pool.connection() as connection:
-                over = (await owned_job(connection, who, job_id)).is_over
+                job = await get_job(connection, job_id)
+                if job is None or not who.owns(job.owner):
+                    return  # it was deleted, which ends the stream
+                over = job.is_over
                 events = await events_after(connection, job_id, after, _PAGE)
             for event in events:
                 after = event.id

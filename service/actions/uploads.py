@@ -1,5 +1,6 @@
 """Files of datasets: taken in one by one or as an archive, listed, found, taken out."""
 
+import logging
 import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
@@ -20,12 +21,16 @@ from octasplat.service.intake.receive import (
 )
 from octasplat.service.problems import Problem, not_found
 from octasplat.service.state import Service
+from octasplat.service.threads import Threads, in_thread
 from octasplat.workers.queue.storing import Note
 from octasplat.workers.records import datasets as rows
-from octasplat.workers.records.quotas import QuotaExceeded, bytes_left, check_bytes
+from octasplat.workers.records.database import tried_again
+from octasplat.workers.records.quotas import QuotaExceeded, bytes_left, check_bytes, owned_bytes
 from octasplat.workers.records.rows import Dataset, DatasetFile
-from octasplat.workers.store.errors import TooLarge
+from octasplat.workers.store.errors import BlobMissing, TooLarge
+from octasplat.workers.store.protocol import Storage
 
+logger = logging.getLogger(__name__)
 Received = TypeVar("Received")
 
 
@@ -88,6 +93,7 @@ async def get_file(service: Service, who: Principal, dataset_id: uuid.UUID, path
     return row
 
 
+@tried_again
 async def remove_file(service: Service, who: Principal, dataset_id: uuid.UUID, path: str) -> None:
     """Take a file out of an open dataset.
 
@@ -120,10 +126,14 @@ async def put_file(
         check = _name_checked(dataset, path)
         known = await rows.get_file(connection, dataset_id, path)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
+        had = await owned_bytes(connection, dataset.owner, upload.sha256) if upload.sha256 is not None else 0
     if known is not None and upload.sha256 == known.sha256:
-        return PutFile(known, was_there=True)
-    if left is not None and known is not None:
-        left += known.size_bytes  # it will be replaced
+        if await in_thread(Threads.UPLOADS, _is_held, service.storage, known):
+            return PutFile(known, was_there=True)
+        logger.warning("the store lost %s of dataset %s, which is sent again", path, dataset_id)
+    if left is not None:
+        # What it replaces goes, and content that its owner has already counts once.
+        left += had + (known.size_bytes if known is not None else 0)
 
     def receive() -> Awaitable[ReceivedFile]:
         return receive_file(
@@ -177,6 +187,14 @@ async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, u
     return PutArchive(files, received.left_out)
 
 
+def _is_held(storage: Storage, file: DatasetFile) -> bool:
+    """Whether the store holds the content of a file, as far as can be seen without reading it."""
+    try:
+        return storage.stat(file.sha256).size_bytes == file.size_bytes
+    except BlobMissing:
+        return False
+
+
 def _name_checked(dataset: Dataset, path: str) -> ContentCheck:
     """What looks at the content of a file whose name is taken; raises IntakeRefused where it is not."""
     if dataset.holds == "files":
@@ -198,16 +216,14 @@ async def _within_quota(receive: Callable[[], Awaitable[Received]], left: int | 
         ) from None
 
 
+@tried_again
 async def _enter(
     service: Service, dataset: Dataset, note: Note, received: Sequence[ReceivedFile]
 ) -> list[DatasetFile]:
     """Enter what is stored into the dataset, or none of it."""
     service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received))
-    async with service.pool.connection() as connection, connection.transaction():
-        await note.confirm(connection, {file.blob.sha256 for file in received})
-        files = [
-            await rows.put_file(connection, dataset.id, f.path, f.blob.sha256, f.blob.size_bytes, f.facts)
-            for f in received
-        ]
+    new = [rows.NewFile(f.path, f.blob.sha256, f.blob.size_bytes, f.facts) for f in received]
+    async with note.naming({file.sha256 for file in new}) as connection:
+        files = await rows.put_files(connection, dataset.id, new)
         await check_bytes(connection, dataset.owner, service.settings.quota)
     return files

@@ -10,6 +10,8 @@ from octasplat.service.problems import Problem, not_found
 from octasplat.service.schemas.webhooks import NewWebhook, WebhookChange
 from octasplat.service.state import Service
 from octasplat.service.webhook_addresses import check_address
+from octasplat.workers.records.database import tried_again
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.upkeep.webhooks import rows
 from octasplat.workers.upkeep.webhooks.rows import Delivery, Endpoint
 from octasplat.workers.upkeep.webhooks.signing import new_secret
@@ -23,6 +25,7 @@ class NewEndpoint:
     secret: str
 
 
+@tried_again
 async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> NewEndpoint:
     """Be told of the asker's jobs, or of one job.
 
@@ -34,7 +37,10 @@ async def create_webhook(service: Service, who: Principal, new: NewWebhook) -> N
     async with service.pool.connection() as connection, connection.transaction():
         owner = who.owner
         if new.job_id is not None:
-            owner = (await owned_job(connection, who, new.job_id, lock=True)).owner
+            owner = (await owned_job(connection, who, new.job_id)).owner
+        await lock_owner(connection, owner)
+        if new.job_id is not None:
+            await owned_job(connection, who, new.job_id, lock=True)
         made = await rows.add_endpoint(
             connection, owner=owner, url=new.url, secret=secret, events=new.events, job_id=new.job_id
         )
@@ -60,6 +66,7 @@ async def get_webhook(service: Service, who: Principal, webhook_id: uuid.UUID) -
         return await owned_webhook(connection, who, webhook_id)
 
 
+@tried_again
 async def change_webhook(
     service: Service, who: Principal, webhook_id: uuid.UUID, change: WebhookChange
 ) -> Endpoint:
@@ -75,6 +82,7 @@ async def change_webhook(
         return await rows.change_endpoint(connection, webhook_id, **change.model_dump(exclude_unset=True))
 
 
+@tried_again
 async def delete_webhook(service: Service, who: Principal, webhook_id: uuid.UUID) -> None:
     """Delete a webhook with its messages.
 
@@ -111,6 +119,7 @@ async def list_deliveries(
         return await rows.list_deliveries(connection, webhook_id, limit)
 
 
+@tried_again
 async def send_again(
     service: Service, who: Principal, webhook_id: uuid.UUID, delivery_id: uuid.UUID
 ) -> Delivery:

@@ -35,7 +35,8 @@ def serving(address: tuple[str, int]) -> ThreadingHTTPServer:
 
 
 def test_a_service_may_be_away_for_longer_than_one_request_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(api, "TRIES", 2)
+    monkeypatch.setattr(api, "STRANGER_SECONDS", 0.5)
+    monkeypatch.setattr(api, "AWAY_SECONDS", 0.5)
     server = serving(("127.0.0.1", 0))
     host, port = server.server_address[0], server.server_address[1]
     found: list[str] = []

@@ -229,3 +229,44 @@ def test_connections_grow_with_the_jobs_at_once(short_root: Path) -> None:
         assert answer(server.start(), "SHOW max_connections") == str(needed)
     finally:
         server.stop()
+
+
+@pytest.mark.parametrize("name", ["a,b", "it's", 'say "$HOME" `x`', "with space"])
+def test_the_data_folder_may_have_any_name(short_root: Path, name: str) -> None:
+    server = EmbeddedPostgres(short_root / f"{name} {os.getpid()}")
+    try:
+        assert answer(server.start(), "SELECT 42") == "42"
+        assert (server.home / "log").stat().st_size > 0
+    finally:
+        server.stop()
+    assert not server.is_running()
+
+
+def test_the_socket_is_found_whatever_the_environment_says(
+    short_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = EmbeddedPostgres(short_root / ("l" * 90))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    conninfo = server.start()
+    try:
+        monkeypatch.delenv("XDG_RUNTIME_DIR")
+        assert server.conninfo() == conninfo and server.is_running()
+        assert server.start() == conninfo
+    finally:
+        server.stop()
+
+
+def test_a_server_that_an_earlier_version_started_is_found(
+    short_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It put its socket where the environment said."""
+    elsewhere = short_root / "runtime"
+    elsewhere.mkdir(mode=0o711)
+    server = EmbeddedPostgres(short_root / "earlier")
+    with monkeypatch.context() as patched:
+        patched.setattr(EmbeddedPostgres, "_socket_folder", lambda _self: elsewhere / "octasplat-x")
+        server.start()
+    try:
+        assert server.is_running() and str(elsewhere) in server.conninfo()
+    finally:
+        server.stop()

@@ -6,7 +6,7 @@ import uuid
 from octasplat.workers.queue.attempts import claim
 from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job, get_job, queue_position, retry_job
 from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips, returned_number
-from octasplat.workers.queue.rescue import rescue_lost_jobs
+from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
 from octasplat.workers.records.database import Pool, open_pool
 from octasplat.workers.records.rows import Job
 
@@ -56,12 +56,13 @@ def test_interrupted_jobs_go_before_what_was_queued_after_them(conninfo: str) ->
                 await connection.execute(
                     "UPDATE jobs SET heartbeat_at = now() - interval '1 minute' WHERE id = %s", [first.id]
                 )
-            assert await rescue_lost_jobs(pool, SLIPS, 5) == 1
+            assert await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0)) == 1
             async with pool.connection() as connection:
                 again = await get_job(connection, second.id)
                 assert again is not None and await queue_position(connection, again) == 2
                 # What was cancelled and is asked for again is a new wish, and goes last.
                 await cancel_job(connection, SLIPS, tiny[0].id)
+            async with pool.connection() as connection:
                 await retry_job(connection, SLIPS, tiny[0].id, fresh=False)
             expected = [urgent, first, second, third, *tiny[1:], tiny[0]]
             assert await delivered(pool, len(expected)) == [job.id for job in expected]

@@ -22,7 +22,7 @@ from octasplat.workers.queue.jobs import (
 )
 from octasplat.workers.queue.port import Slips
 from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
-from octasplat.workers.queue.rescue import rescue_lost_jobs
+from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
 from octasplat.workers.records.database import Connection, Pool, open_pool
 from octasplat.workers.records.errors import Conflict, Missing
 from octasplat.workers.records.ids import new_id
@@ -140,14 +140,14 @@ def test_lost_jobs_are_rescued_three_times_then_failed(conninfo: str) -> None:
         attempt = await claimed(pool)
         job_id = attempt.job.id
         for rescues in (1, 2, 3):
-            assert await rescue_lost_jobs(pool, SLIPS, 5) == 0  # still fresh
+            assert await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0)) == 0  # still fresh
             await make_old(pool, job_id)
-            assert await rescue_lost_jobs(pool, SLIPS, 5) == 1
+            assert await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0)) == 1
             job = await fetched(pool, job_id)
             assert (job.state, job.rescues) == ("queued", rescues) and job.slip is not None
             assert await claim(pool, job_id, job.slip, "w") is not None
         await make_old(pool, job_id)
-        await rescue_lost_jobs(pool, SLIPS, 5)
+        await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0))
         job = await fetched(pool, job_id)
         assert job.state == "failed" and job.error is not None and "4 times" in job.error["message"]
         assert job.slip is None
@@ -160,7 +160,7 @@ def test_new_checkpoint_forgives_lost_workers(conninfo: str) -> None:
     async def what(pool: Pool) -> None:
         attempt = await claimed(pool)
         await make_old(pool, attempt.job.id)
-        await rescue_lost_jobs(pool, SLIPS, 5)
+        await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0))
         job = await fetched(pool, attempt.job.id)
         assert job.rescues == 1 and job.slip is not None
         second = await claim(pool, job.id, job.slip, "w")
@@ -179,7 +179,7 @@ def test_lost_job_that_was_to_be_cancelled_is_cancelled(conninfo: str) -> None:
         async with pool.connection() as connection:
             await cancel_job(connection, SLIPS, attempt.job.id)
         await make_old(pool, attempt.job.id)
-        await rescue_lost_jobs(pool, SLIPS, 5)
+        await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0))
         assert (await fetched(pool, attempt.job.id)).state == "canceled"
 
     run(conninfo, what)
@@ -195,7 +195,7 @@ def test_queued_job_without_a_living_slip_gets_one(conninfo: str) -> None:
             await connection.execute(
                 "UPDATE procrastinate_jobs SET status = 'doing' WHERE id = %s", [stuck.slip]
             )
-        await rescue_lost_jobs(pool, SLIPS, 5)
+        await rescue_lost_jobs(pool, SLIPS, 5, Suspects(0.0))
         after = [await fetched(pool, job.id) for job in (gone, stuck, fine)]
         assert [job.state for job in after] == ["queued"] * 3
         assert after[0].slip != gone.slip and after[1].slip != stuck.slip and after[2].slip == fine.slip

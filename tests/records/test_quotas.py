@@ -13,6 +13,7 @@ from psycopg.types.json import Jsonb
 from octasplat.workers.cli.commands.quota import quota as quota_command
 from octasplat.workers.records.database import Connection, open_pool
 from octasplat.workers.records.datasets import create_dataset, put_file
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.records.quotas import (
     Quota,
     QuotaExceeded,
@@ -51,11 +52,13 @@ def test_usage_counts_what_an_owner_has(conninfo: str) -> None:
         await put_file(connection, other.id, "images/c.jpg", "c" * 64, 1000)
         done = await new_job(connection, "me", "succeeded")
         await new_job(connection, "me", "running")
-        await connection.execute(
-            "INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type) "
-            "VALUES (%s, 'x', %s, 7, '')",
-            [done, "d" * 64],
-        )
+        async with connection.transaction():
+            await lock_owner(connection, "me")
+            await connection.execute(
+                "INSERT INTO artifacts (job_id, name, sha256, size_bytes, media_type) "
+                "VALUES (%s, 'x', %s, 7, '')",
+                [done, "d" * 64],
+            )
         assert await usage_of(connection, "me") == Usage(bytes=117, datasets=1, jobs=1)
         assert await usage_of(connection, "nobody") == Usage(0, 0, 0)
         assert await bytes_left(connection, "me") is None
@@ -171,29 +174,31 @@ def test_what_is_counted_is_what_there_is(conninfo: str) -> None:
         seen = set()
         for _ in range(150):
             sha256, size_bytes = content()
-            match random.randrange(6):
-                case 0 | 1:
-                    path = f"images/{random.randrange(4)}.jpg"
-                    await put_file(connection, random.choice(datasets), path, sha256, size_bytes)
-                case 2:
-                    await connection.execute(
-                        "INSERT INTO artifacts VALUES (%s, %s, %s, %s, '') ON CONFLICT DO NOTHING",
-                        [random.choice(jobs), str(random.randrange(3)), sha256, size_bytes],
-                    )
-                case 3:
-                    files = [{"path": str(n), "sha256": s, "size_bytes": b} for n, (s, b) in
-                             enumerate(content() for _ in range(3))]  # fmt: skip
-                    kept = Jsonb({"files": files}) if random.random() < 0.7 else None
-                    query = "UPDATE jobs SET checkpoint = %s WHERE id = %s"
-                    await connection.execute(query, [kept, random.choice(jobs)])
-                case 4:
-                    gone = datasets.pop(random.randrange(3))
-                    await connection.execute("DELETE FROM datasets WHERE id = %s", [gone])
-                    datasets.append((await create_dataset(connection, "me", "again")).id)
-                case 5:
-                    gone = jobs.pop(random.randrange(3))
-                    await connection.execute("DELETE FROM jobs WHERE id = %s", [gone])
-                    jobs.append(await new_job(connection, "me", "succeeded"))
+            async with connection.transaction():
+                await lock_owner(connection, "me")
+                match random.randrange(6):
+                    case 0 | 1:
+                        path = f"images/{random.randrange(4)}.jpg"
+                        await put_file(connection, random.choice(datasets), path, sha256, size_bytes)
+                    case 2:
+                        await connection.execute(
+                            "INSERT INTO artifacts VALUES (%s, %s, %s, %s, '') ON CONFLICT DO NOTHING",
+                            [random.choice(jobs), str(random.randrange(3)), sha256, size_bytes],
+                        )
+                    case 3:
+                        files = [{"path": str(n), "sha256": s, "size_bytes": b} for n, (s, b) in
+                                 enumerate(content() for _ in range(3))]  # fmt: skip
+                        kept = Jsonb({"files": files}) if random.random() < 0.7 else None
+                        query = "UPDATE jobs SET checkpoint = %s WHERE id = %s"
+                        await connection.execute(query, [kept, random.choice(jobs)])
+                    case 4:
+                        gone = datasets.pop(random.randrange(3))
+                        await connection.execute("DELETE FROM datasets WHERE id = %s", [gone])
+                        datasets.append((await create_dataset(connection, "me", "again")).id)
+                    case 5:
+                        gone = jobs.pop(random.randrange(3))
+                        await connection.execute("DELETE FROM jobs WHERE id = %s", [gone])
+                        jobs.append(await new_job(connection, "me", "succeeded"))
             row = await (await connection.execute(truth)).fetchone()
             assert row is not None and (await usage_of(connection, "me")).bytes == row["n"]
             seen.add(row["n"])

@@ -160,15 +160,14 @@ def test_what_is_stored_under_a_note_stays_and_a_note_given_up_names_nothing(
                 async with pool.connection() as connection:
                     await connection.execute("UPDATE storing SET seen_at = now() - interval '1 hour'")
                 # A note that is being confirmed is not given up, however old.
-                async with pool.connection() as connection:
-                    await note.confirm(connection, [young])
+                async with note.naming([young]):
                     await collect_at_once(pool, storage, every_seconds=0.0)
                     assert held(service) == {young}
                 await collect_at_once(pool, storage, every_seconds=0.0)
                 assert not held(service)
-                async with pool.connection() as connection:
-                    with pytest.raises(StorageUnavailable, match="silent for too long"):
-                        await note.confirm(connection, [young])
+                with pytest.raises(StorageUnavailable, match="silent for too long"):
+                    async with note.naming([young]):
+                        pass
 
     asyncio.run(story())
 

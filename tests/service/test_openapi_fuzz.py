@@ -18,6 +18,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from octasplat.workers.records.locks import OWNER
 from octasplat.workers.store.local import LocalStorage
 
 pytestmark = pytest.mark.heavy
@@ -80,6 +81,7 @@ def furnish(conninfo: str, tmp_path: Path) -> Path:
     storage.close()
     ids: dict[str, list[str]] = {"dataset_id": [], "job_id": []}
     with psycopg.connect(conninfo) as connection:
+        connection.execute("SELECT pg_advisory_xact_lock(%s, hashtext('me'))", [OWNER])
         for number in range(COPIES):
             dataset, job = uuid.uuid4(), uuid.uuid4()
             connection.execute(

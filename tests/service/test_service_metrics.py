@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from service_bench import claimed, committed_dataset, running, with_token
 
 from octasplat.service.state import Service
-from octasplat.workers.queue.rescue import rescue_lost_jobs
+from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
 from octasplat.workers.records.ids import new_id
 from octasplat.workers.records.workers import see_worker
 
@@ -97,7 +97,7 @@ def test_rescues_and_poison_are_counted_and_outlive_the_job(talk: Callable[..., 
             await claimed(service, job)
             async with service.pool.connection() as connection:
                 await connection.execute("UPDATE jobs SET heartbeat_at = now() - interval '1 hour'")
-            assert await rescue_lost_jobs(service.pool, service.slips, 20) == 1
+            assert await rescue_lost_jobs(service.pool, service.slips, 20, Suspects(0.0)) == 1
         assert (await http.get(f"/v1/jobs/{job['id']}")).json()["state"] == "failed"
         assert (await http.delete(f"/v1/jobs/{job['id']}")).status_code == 204
         seen = await read(http)

@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import socket
+import threading
 import uuid
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,7 +20,8 @@ from octasplat.service.state import Service
 from octasplat.workers.records.database import open_pool
 from octasplat.workers.upkeep.webhooks import addresses
 from octasplat.workers.upkeep.webhooks.addresses import AddressRefused, check_url
-from octasplat.workers.upkeep.webhooks.outbox import WAITS_SECONDS, take_due
+from octasplat.workers.upkeep.webhooks.guarding import OWNER
+from octasplat.workers.upkeep.webhooks.outbox import WAITS_SECONDS, forget_old, take_due
 from octasplat.workers.upkeep.webhooks.sending import OF_ONE_OWNER, Sender, guarded_client, send_due
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
@@ -448,5 +450,53 @@ def test_slow_answers_to_one_owner_delay_nobody_else(talk: Callable[..., None]) 
                         await asyncio.sleep(0.02)
             finally:
                 await sender.close()
+
+    talk(conversation)
+
+
+def test_a_name_server_that_is_silent_holds_up_its_owner_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+    ask = socket.getaddrinfo
+
+    def look_up(host: Any, *arguments: Any, **more: Any) -> Any:
+        if str(host).startswith("slow"):
+            go_on.wait(60)
+        return ask("127.0.0.1", *arguments, **more)
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+
+    async def ask_for(client: httpx.AsyncClient, owner: str, host: str) -> type[BaseException]:
+        try:
+            await client.post(f"https://{host}/", content=b"x", extensions={OWNER: owner})
+        except Exception as error:
+            return type(error)
+        raise AssertionError
+
+    async def talk() -> None:
+        async with guarded_client() as client:
+            slow = [asyncio.create_task(ask_for(client, "me", f"slow{n}.example.org")) for n in range(5)]
+            await asyncio.sleep(0.2)
+            async with asyncio.timeout(20):
+                assert await ask_for(client, "me", "slow9.example.org") is httpx.ConnectError
+                assert await ask_for(client, "you", "fast.example.org") is AddressRefused
+            go_on.set()
+            assert set(await asyncio.gather(*slow)) == {AddressRefused}
+
+    asyncio.run(talk())
+
+
+def test_messages_of_a_webhook_that_is_paused_for_long_are_given_up(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        with receiving() as receiver:
+            hooks = [await make(http, receiver) for _ in range(2)]
+            for hook in hooks:
+                await http.post(f"/v1/webhooks/{hook['id']}/test")
+            await http.patch(f"/v1/webhooks/{hooks[0]['id']}", json={"enabled": False})
+            async with service.pool.connection() as connection:
+                await connection.execute("UPDATE webhook_deliveries SET due_at = now() - interval '4 days'")
+                await forget_old(connection)
+            paused, active = [(await deliveries(http, hook))[0] for hook in hooks]
+            assert paused["state"] == "failed" and "paused" in paused["error"]
+            assert active["state"] == "pending"
 
     talk(conversation)

@@ -14,6 +14,7 @@ from psycopg.types.json import Jsonb
 from octasplat.workers.cli.commands.fsck import fsck
 from octasplat.workers.records.database import open_pool
 from octasplat.workers.records.datasets import create_dataset, put_file
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.store.local import LocalStorage
 
 
@@ -38,8 +39,11 @@ def store(tmp_path: Path, conninfo: str, monkeypatch: pytest.MonkeyPatch) -> Loc
     async def fill() -> None:
         async with open_pool(conninfo) as pool, pool.connection() as connection:
             dataset = await create_dataset(connection, "me", "a")
+            await connection.commit()
             await put_file(connection, dataset.id, "images/a.jpg", contents["photo"], 5)
             checkpoint = {"files": [{"path": "run/x", "sha256": contents["state"], "size_bytes": 5}]}
+            await connection.commit()
+            await lock_owner(connection, "me")
             job_id = uuid.uuid4()
             await connection.execute(
                 "INSERT INTO jobs (id, owner, kind, options, queue, checkpoint, preview) "

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from worker_bench import PATIENCE_SECONDS, ROOT, Bench
 
+import lock_order_for_tests
 from octasplat.workers.postgres.embedded import EmbeddedPostgres
 from octasplat.workers.queue.jobs import NewJob, cancel_job, create_job
 from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
@@ -29,6 +30,7 @@ STALE_SECONDS = 6.0
 
 @pytest.fixture
 def bench(conninfo: str, tmp_path: Path) -> Iterator[Bench]:
+    lock_order_for_tests.uninstall(conninfo)  # the version before keeps to no order
     bench = Bench(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
     yield bench
     bench.close()

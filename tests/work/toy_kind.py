@@ -24,6 +24,8 @@ class ToyOptions(BaseModel):
     checkpoint_every: int = 5
     crash_at: int | None = None
     refuse: bool = False
+    say_nul: bool = False
+    """Refuses with what a database cannot hold."""
     fault: bool = False
     silent_at: int | None = None
     hog_bytes: int = 0
@@ -61,6 +63,9 @@ def run(task: Task) -> None:
     options = ToyOptions.model_validate(task.options)
     if options.refuse:
         raise DatasetError("The toy refuses this scene; send another.")
+    if options.say_nul:
+        task.listener(Warned("a header with \0 and \ud800"))
+        raise DatasetError("The header \0 \udfff is odd.")
     if options.tell_paths:
         inner, sheet = task.run / "cache" / "pixels.bin", task.run / "images" / "a b.jpg"
         print(f"[x.cc:12] Cannot open:{inner}, file://{inner}; see https://example.org/home/x")  # noqa: T201

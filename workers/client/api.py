@@ -1,7 +1,6 @@
 """Requests to a service, tried again where that is safe, with its errors as ours."""
 
 import json
-import time
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,12 +10,15 @@ from typing import Any, Self
 import httpx
 
 from octasplat.engine.errors import OctasplatError
+from octasplat.workers.client.patience import AWAY_SECONDS, STRANGER_SECONDS, Patience
 from octasplat.workers.data_folder import ADDRESS_FILE, TOKEN_FILE, default_data_folder
 
 DEFAULT_ADDRESS = "http://127.0.0.1:8642"
 SERVER, TOKEN, DATA = "OCTASPLAT_SERVER", "OCTASPLAT_TOKEN", "OCTASPLAT_DATA"
-TRIES = 6
-_AGAIN = frozenset({408, 429, 502, 503, 504})
+BUSY = frozenset({408, 429})
+AWAY = frozenset({502, 503, 504})
+"""A proxy answers so for a service that is away, and the service itself while it stops."""
+PROBLEM = "application/problem+json"
 _TIMEOUT = httpx.Timeout(60.0, connect=10.0)
 
 
@@ -30,7 +32,7 @@ class ServiceError(OctasplatError):
 
 
 class Unreachable(OctasplatError):
-    """The service does not answer."""
+    """The service does not answer, or a proxy in front of it says so."""
 
 
 def find_address(environment: Mapping[str, str], data: Path | None = None) -> str:
@@ -82,6 +84,7 @@ class Api:
         if token:
             headers["Authorization"] = f"Bearer {token}"
         self.address = address
+        self._has_answered = False
         # Proxies of the environment are not for the own machine.
         local = httpx.URL(address).host in ("127.0.0.1", "localhost", "::1")
         self._http = httpx.Client(
@@ -112,13 +115,12 @@ class Api:
 
     def get(self, path: str, **query: Any) -> Any:
         """The JSON of a GET."""
-        return self.request("GET", path, params=query or None).json()
+        return _json(self.request("GET", path, params=query or None))
 
     def post(self, path: str, body: Any = None, *, key: str | None = None) -> Any:
         """The JSON of a POST; with a key, which is made if not given, it is safe to try again."""
-        return self.request(
-            "POST", path, json=body, headers={"Idempotency-Key": key or uuid.uuid4().hex}
-        ).json()
+        headers = {"Idempotency-Key": key or uuid.uuid4().hex}
+        return _json(self.request("POST", path, json=body, headers=headers))
 
     def request(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         """A request, tried again while the service is away or busy; bodies must be given as content or JSON.
@@ -127,23 +129,28 @@ class Api:
             ServiceError: it was refused.
             Unreachable: nobody answers.
         """
-        wait = 0.3
-        for left in reversed(range(TRIES)):
+        patience = self.patience()
+        while True:
             try:
                 response = self._http.request(method, path, **arguments)
-            except (httpx.TransportError, httpx.RemoteProtocolError) as error:
-                if left == 0:
+            except httpx.TransportError as error:
+                if not patience.wait():
                     raise self.unreachable(error) from None
-            else:
-                if response.status_code not in _AGAIN or left == 0:
-                    return _checked(response)
-                wait = max(wait, _retry_after(response))
-            time.sleep(min(wait, 10.0))
-            wait *= 2
-        raise AssertionError
+                continue
+            if response.status_code not in BUSY | AWAY:
+                self._has_answered = True
+                return self._checked(response)
+            self._has_answered = self._has_answered or _is_ours(response)
+            patience.seconds = self.patience().seconds
+            if not patience.wait(_retry_after(response)):
+                return self._checked(response)
+
+    def patience(self) -> Patience:
+        """For how long the service may be away now."""
+        return Patience(AWAY_SECONDS if self._has_answered else STRANGER_SECONDS)
 
     def stream(self, method: str, path: str, **arguments: Any) -> Any:
-        """A streamed answer, as a context; the caller checks it with :func:`check_stream`."""
+        """A streamed answer, as a context; the caller checks it with :meth:`check_stream`."""
         return self._http.stream(method, path, **arguments)
 
     def pages(self, path: str, name: str, **query: Any) -> Iterator[dict[str, Any]]:
@@ -156,7 +163,19 @@ class Api:
             if cursor is None:
                 return
 
-    def unreachable(self, error: Exception) -> Unreachable:
+    def check_stream(self, response: httpx.Response) -> None:
+        """Raise unless a streamed answer is good.
+
+        Raises:
+            ServiceError: it is not.
+            Unreachable: a proxy says that the service is away.
+        """
+        if not response.is_success:
+            response.read()
+            self._checked(response)
+        self._has_answered = True
+
+    def unreachable(self, error: Exception | str) -> Unreachable:
         """What to tell when nobody answers."""
         reason = str(error) or type(error).__name__
         return Unreachable(
@@ -164,21 +183,40 @@ class Api:
             f"set {SERVER}."
         )
 
-
-def check_stream(response: httpx.Response) -> None:
-    """Raise unless a streamed answer is good.
-
-    Raises:
-        ServiceError: it is not.
-    """
-    if response.is_error:
-        response.read()
-        _checked(response)
+    def _checked(self, response: httpx.Response) -> httpx.Response:
+        """The answer itself, if it is good."""
+        if response.is_success:
+            return response
+        if response.status_code in AWAY and not _is_ours(response):
+            raise self.unreachable(f"a proxy answers {response.status_code}")
+        raise _refusal(response)
 
 
-def _checked(response: httpx.Response) -> httpx.Response:
-    if not response.is_error:
-        return response
+def _is_ours(response: httpx.Response) -> bool:
+    """Whether an answer comes from the service itself, and not from a proxy in front of it."""
+    return response.is_success or response.headers.get("content-type", "").startswith(PROBLEM)
+
+
+def _json(response: httpx.Response) -> Any:
+    try:
+        return response.json()
+    except ValueError:
+        kind = response.headers.get("content-type", "nothing known")
+        raise ServiceError(
+            f"{response.request.url} answered with {kind} in the place of JSON, so it is no octasplat "
+            f"service; check {SERVER} and the proxies on the way.",
+            response.status_code,
+        ) from None
+
+
+def _refusal(response: httpx.Response) -> ServiceError:
+    """What the service, or whoever answered for it, refuses."""
+    if response.is_redirect:
+        return ServiceError(
+            f"{response.request.url} is redirected to {response.headers['location']}; set {SERVER} to the "
+            "address of the service itself.",
+            response.status_code,
+        )
     try:
         problem = response.json()
         detail, errors = str(problem["detail"]), tuple(problem.get("errors") or ())
@@ -190,7 +228,7 @@ def _checked(response: httpx.Response) -> httpx.Response:
         detail = f"{detail} {' '.join(further[:5])}{more}"
     if response.status_code == 401:
         detail = f"{detail.split(':')[0]}: set {TOKEN}."
-    raise ServiceError(detail, response.status_code, errors)
+    return ServiceError(detail, response.status_code, errors)
 
 
 def _named(error: Mapping[str, Any]) -> str:

@@ -9,8 +9,11 @@ from typing import Any
 import httpx
 
 from octasplat.engine.errors import OutputError
-from octasplat.workers.client.api import TRIES, Api, ServiceError, check_stream
+from octasplat.workers.client.api import AWAY, BUSY, Api, ServiceError, Unreachable
 from octasplat.workers.store.names import NameSet
+
+MAX_DAMAGED = 3
+"""So often a file is fetched anew whose content is not what it should be."""
 
 
 def download_results(
@@ -70,26 +73,33 @@ def download_results(
 def _save(api: Api, job_id: str, artifact: dict[str, Any], path: Path, tell: Callable[[int], None]) -> None:
     if path.is_file() and _sha256(path) == artifact["sha256"]:
         return
-    partial = path.with_name(f".{path.name}.{artifact['sha256'][:12]}.partial")
+    partial = path.with_name(f".{artifact['sha256'][:24]}.partial")  # short, as the name may be very long
     address = f"/v1/jobs/{job_id}/artifacts/{urllib.parse.quote(artifact['name'])}"
-    for left in reversed(range(TRIES)):
+    patience, damaged = api.patience(), 0
+    while damaged < MAX_DAMAGED:
+        before = _size(partial)
         try:
             _go_on(api, address, artifact, partial, tell)
-        except httpx.TransportError as error:
-            if left == 0:
-                raise api.unreachable(error) from None
+        except (httpx.TransportError, Unreachable, ServiceError) as error:
+            if isinstance(error, ServiceError) and error.status not in BUSY | AWAY:
+                raise
+            if _size(partial) > before:
+                patience.renew()
+            if not patience.wait():
+                raise (api.unreachable(error) if isinstance(error, httpx.TransportError) else error) from None
             continue
         if _sha256(partial) == artifact["sha256"]:
             partial.replace(path)
             return
         partial.unlink()
-    raise OutputError(f"{path} came damaged {TRIES} times; the store of the service needs to be looked at.")
+        damaged += 1
+    raise OutputError(f"{path} came damaged {damaged} times; the store of the service needs to be looked at.")
 
 
 def _go_on(
     api: Api, address: str, artifact: dict[str, Any], partial: Path, tell: Callable[[int], None]
 ) -> None:
-    begin = partial.stat().st_size if partial.exists() else 0
+    begin = _size(partial)
     if begin >= artifact["size_bytes"]:
         partial.touch()
         return
@@ -97,12 +107,16 @@ def _go_on(
     if begin:
         headers |= {"Range": f"bytes={begin}-", "If-Range": f'"{artifact["sha256"]}"'}
     with api.stream("GET", address, headers=headers) as response:
-        check_stream(response)
+        api.check_stream(response)
         goes_on = response.status_code == 206
         with partial.open("ab" if goes_on else "wb") as handle:
-            for piece in response.iter_bytes(1 << 20):
+            for piece in response.iter_bytes():
                 handle.write(piece)
                 tell(handle.tell())
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
 
 
 def _sha256(path: Path) -> str:

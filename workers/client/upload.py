@@ -13,8 +13,13 @@ from typing import Any
 
 from octasplat.engine.errors import DatasetError
 from octasplat.workers.client.api import Api, ServiceError
+from octasplat.workers.client.patience import Patience
 
 PARALLEL = 4
+CHECK_SECONDS = 600.0
+"""For so long a check of a dataset that somebody else has begun is waited for."""
+MAX_DELETED = 30
+"""So many datasets of one folder that were deleted are looked past for one that is there."""
 _PIECE_BYTES = 1 << 20
 _PARTS = ("images", "masks", "sparse", "colmap/sparse")
 _CLUTTER = frozenset({"thumbs.db", "desktop.ini"})
@@ -76,8 +81,7 @@ def upload_scene(
             _send_archive(api, dataset["id"], files[0], progress)
         else:
             _send_missing(api, dataset["id"], files, progress)
-        dataset = api.post(f"/v1/datasets/{dataset['id']}/commit")
-    return dataset
+    return _committed(api, dataset)
 
 
 def upload_files(
@@ -105,7 +109,21 @@ def upload_files(
     dataset = _dataset_for(api, name, local, holds="files")
     if dataset["state"] == "open":
         _send_missing(api, dataset["id"], local, progress)
-        dataset = api.post(f"/v1/datasets/{dataset['id']}/commit")
+    return _committed(api, dataset)
+
+
+def _committed(api: Api, dataset: dict[str, Any]) -> dict[str, Any]:
+    """Commit a dataset, after a check that is under way; one that was broken off is taken over in a while."""
+    address, patience = f"/v1/datasets/{dataset['id']}", Patience(CHECK_SECONDS)
+    while dataset["state"] != "committed":
+        try:
+            dataset = api.post(f"{address}/commit")
+        except ServiceError as error:
+            if error.status != 409:
+                raise
+            dataset = api.get(address)
+            if dataset["state"] != "committed" and not patience.wait():
+                raise
     return dataset
 
 
@@ -118,13 +136,17 @@ def _dataset_for(
         facts = file.path.stat()
         digest.update(f"{file.name}\0{facts.st_size}\0{facts.st_mtime_ns}\0{facts.st_ino}\n".encode())
     body = {"name": name, "holds": holds} if holds == "files" else {"name": name}
-    try:
-        found: dict[str, Any] = api.post("/v1/datasets", body, key=f"scene-{digest.hexdigest()}")
-    except ServiceError as error:
-        if error.status != 404:  # it was deleted since
-            raise
-        found = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
-    return found
+    key = f"scene-{digest.hexdigest()}"
+    for number in range(MAX_DELETED):
+        try:
+            found: dict[str, Any] = api.post("/v1/datasets", body, key=f"{key}-{number}" if number else key)
+        except ServiceError as error:
+            if error.status != 404:  # it was deleted since, and the next one may be there
+                raise
+        else:
+            return found
+    made: dict[str, Any] = api.post("/v1/datasets", body, key=uuid.uuid4().hex)
+    return made
 
 
 def _send_missing(

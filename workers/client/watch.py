@@ -8,11 +8,13 @@ from typing import Any
 import httpx
 
 from octasplat.engine.events import Listener
-from octasplat.workers.client.api import Api, Unreachable, check_stream
+from octasplat.workers.client.api import AWAY, BUSY, Api, ServiceError, Unreachable
+from octasplat.workers.client.patience import AWAY_SECONDS, Patience
 from octasplat.workers.telling.events import TOLD_KINDS, told_event
 
 TERMINAL = frozenset({"succeeded", "failed", "canceled"})
-_PATIENCE_SECONDS = 120.0
+_LOOK_SECONDS = 0.5
+_BUSY_SECONDS = 2.0
 
 
 def watch_job(
@@ -31,26 +33,28 @@ def watch_job(
 
     Raises:
         ServiceError: there is no such job.
-        Unreachable: the service was away for two minutes.
+        Unreachable: the service was away for too long, see :mod:`octasplat.workers.client.patience`.
     """
     last = "0"
-    away: float | None = None
+    patience = Patience(AWAY_SECONDS)
     while True:
         try:
             for kind, data, number in _events(api, job_id, last):
-                last, away = number, None
+                last = number
+                patience.renew()
                 _tell(kind, data, listener, on_state)
-            job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
         except (httpx.TransportError, Unreachable) as error:
-            away = time.monotonic() if away is None else away
-            if time.monotonic() - away > _PATIENCE_SECONDS:
+            if not patience.wait():
                 raise (error if isinstance(error, Unreachable) else api.unreachable(error)) from None
-            time.sleep(0.5)
             continue
-        away = None
+        except ServiceError as error:
+            if error.status not in BUSY | AWAY:
+                raise
+            time.sleep(_BUSY_SECONDS)  # it has enough streams, so that the job is asked for now and then
+        job: dict[str, Any] = api.get(f"/v1/jobs/{job_id}")
         if job["state"] in TERMINAL:
             return job
-        time.sleep(0.5)
+        time.sleep(_LOOK_SECONDS)
 
 
 def _events(api: Api, job_id: str, last: str) -> Iterator[tuple[str, dict[str, Any], str]]:
@@ -58,11 +62,7 @@ def _events(api: Api, job_id: str, last: str) -> Iterator[tuple[str, dict[str, A
     timeout = httpx.Timeout(10.0, read=60.0)
     headers = {"Last-Event-ID": last, "Accept": "text/event-stream"}
     with api.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
-        if response.status_code == 503:
-            response.read()
-            time.sleep(2)
-            return
-        check_stream(response)
+        api.check_stream(response)
         kind, data, number = "message", "", last
         for line in response.iter_lines():
             name, _, value = line.partition(":")

@@ -158,13 +158,26 @@ class EmbeddedPostgres:
             ) from None
 
     def _socket_folder(self) -> Path:
-        folder = self.home / "run"
-        socket = f"{folder.resolve()}/.s.PGSQL.{PORT}"
-        if len(os.fsencode(socket)) <= _MAX_SOCKET_BYTES:
-            return folder.resolve()
-        digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:16]
-        root = Path(os.environ.get("XDG_RUNTIME_DIR") or "/tmp")  # noqa: S108
-        return root / f"octasplat-{digest}"
+        """Where the socket is: where the server that runs has put it, else always in the same place."""
+        folder = (self.home / "run").resolve()
+        if (told := self._told_socket_folder()) is not None:
+            return told
+        socket = f"{folder}/.s.PGSQL.{PORT}"
+        # A comma separates hosts in what clients are given, and folders in the server's settings.
+        if len(os.fsencode(socket)) <= _MAX_SOCKET_BYTES and "," not in socket:
+            return folder
+        digest = hashlib.sha256(os.fsencode(folder)).hexdigest()[:16]
+        # Not in a folder of the environment's choice, which is another for cron and sudo.
+        return Path("/tmp") / f"octasplat-{digest}"  # noqa: S108
+
+    def _told_socket_folder(self) -> Path | None:
+        """The folder that a server which runs has written down beside its number."""
+        pid_file = self.cluster / "postmaster.pid"
+        try:
+            line = pid_file.read_text(encoding="utf-8", errors="surrogateescape").split("\n")[4]
+        except (OSError, IndexError):
+            return None
+        return (self.cluster / line).resolve() if line and is_postgres(pid_file) else None
 
     def _binaries(self, user: ServerUser) -> PostgresBinaries:
         version = self.cluster / "PG_VERSION"
@@ -243,8 +256,13 @@ class EmbeddedPostgres:
 
     def _start(self, binaries: PostgresBinaries, user: ServerUser) -> None:
         self.rotate_log()
+        # A shell reads the options and the name of the log, so that both are relative: to the cluster, where
+        # the server works. The data folder may have any name.
+        sockets = self._socket_folder()
+        if sockets.parent == self.home.resolve():
+            sockets = Path("../run")
         options = [
-            f"unix_socket_directories={self._socket_folder()}",
+            f"unix_socket_directories={sockets}",
             f"max_connections={self.connections}",
             *_SETTINGS,
         ]
@@ -252,7 +270,7 @@ class EmbeddedPostgres:
         try:
             self._run(
                 binaries, user, "pg_ctl", "-D", ".", "-w", "-t", str(START_SECONDS),
-                "-l", str((self.home / "log").resolve()), "-o", quoted, "start",
+                "-l", "../log", "-o", quoted, "start",
             )  # fmt: skip
         except DatabaseError:
             raise DatabaseError(

@@ -5,20 +5,20 @@ whatever it still wants to write is refused with :class:`Fenced`.
 """
 
 import uuid
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
-
-from psycopg.types.json import Jsonb
 
 from octasplat.workers.queue.jobs import get_job, queue_again
 from octasplat.workers.queue.port import Slips
 from octasplat.workers.queue.storing import Note
 from octasplat.workers.records.database import Connection, Pool
 from octasplat.workers.records.journal import add_event, add_log_lines, trim_log
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.records.quotas import NO_QUOTA, Quota, check_bytes
-from octasplat.workers.records.rows import Job
+from octasplat.workers.records.rows import TERMINAL, Job
+from octasplat.workers.records.texts import as_json, as_json_or_null, storable_text
 
 MAX_RESCUES = 3
 """Lost attempts without a new checkpoint after which a job is taken for one that kills its workers."""
@@ -115,14 +115,13 @@ class Attempt:
             StorageUnavailable: ``note``, under which it was stored, was given up.
             QuotaExceeded: the job's owner may not store as much.
         """
-        async with self._fenced() as (connection, job):
-            if note is not None:
-                await note.confirm(connection, {file["sha256"] for file in manifest["files"]})
+        contents = {file["sha256"] for file in manifest.get("files", ())}
+        async with self._fenced(note, contents, counts=True) as (connection, job):
             await connection.execute(
                 """
                 UPDATE jobs SET checkpoint = %s, rescues = CASE WHEN %s THEN 0 ELSE rescues END WHERE id = %s
                 """,
-                [Jsonb(dict(manifest)), advances, job.id],
+                [as_json(dict(manifest)), advances, job.id],
             )
             await check_bytes(connection, job.owner, self.quota)
             event = {key: manifest[key] for key in ("stage", "step") if key in manifest}
@@ -130,11 +129,9 @@ class Attempt:
 
     async def keep_preview(self, preview: Mapping[str, Any], note: Note | None = None) -> None:
         """Record the newest preview picture: ``sha256``, ``step`` and ``view``; ``note`` as above."""
-        async with self._fenced() as (connection, job):
-            if note is not None:
-                await note.confirm(connection, [preview["sha256"]])
+        async with self._fenced(note, [preview["sha256"]]) as (connection, job):
             await connection.execute(
-                "UPDATE jobs SET preview = %s WHERE id = %s", [Jsonb(dict(preview)), job.id]
+                "UPDATE jobs SET preview = %s WHERE id = %s", [as_json(dict(preview)), job.id]
             )
             await add_event(connection, job.id, job.attempt, "preview", preview)
 
@@ -148,7 +145,7 @@ class Attempt:
         Raises:
             QuotaExceeded: the job's owner may not store as much.
         """
-        async with self._fenced() as (connection, job):
+        async with self._fenced(counts=True) as (connection, job):
             if psnr is not None:
                 await connection.execute("UPDATE jobs SET psnr = %s WHERE id = %s", [psnr, job.id])
             await _show(connection, job, results)
@@ -156,32 +153,58 @@ class Attempt:
             await check_bytes(connection, job.owner, self.quota)
 
     async def fail(
-        self, error: Mapping[str, Any], results: Sequence[Result] = (), note: Note | None = None
+        self,
+        error: Mapping[str, Any],
+        results: Sequence[Result] = (),
+        note: Note | None = None,
+        *,
+        unwanted: Sequence[Result] = (),
     ) -> None:
         """End the job for a reason that another try would meet again, with the results there are so far.
+
+        Args:
+            error: what happened.
+            results: those that there are.
+            note: under which they were stored.
+            unwanted: results that are stored and will not be named, so that they go soon.
 
         Raises:
             StorageUnavailable: ``note``, under which they were stored, was given up.
             QuotaExceeded: the job's owner may not store as much.
         """
-        async with self._fenced() as (connection, job):
+        async with self._fenced(note, _contents(results), counts=bool(results)) as (connection, job):
             if results:
-                await _show(connection, job, results, note)
+                await _show(connection, job, results)
                 await check_bytes(connection, job.owner, self.quota)
             await end_job(connection, job, "failed", self.shown(dict(error)))
+            await connection.execute(
+                "INSERT INTO replaced_contents (sha256) SELECT unnest(%s::text[]) ON CONFLICT DO NOTHING",
+                [sorted(_contents(unwanted))],
+            )
 
     async def cancel(self) -> None:
         """End the job as its owner asked."""
         async with self._fenced() as (connection, job):
             await end_job(connection, job, "canceled", None)
 
-    async def hand_back(self, slips: Slips, reason: str) -> None:
-        """Put the job back into the queue, as its worker has to go; a cancelled one ends instead."""
+    async def hand_back(self, slips: Slips, reason: str, *, uncounted: int | None = None) -> None:
+        """Put the job back into the queue, as its worker has to go; a cancelled one ends instead.
+
+        Args:
+            slips: the queue.
+            reason: why.
+            uncounted: how often in a row, without a checkpoint in between, that may happen for the same
+                reason before it counts as a lost attempt; None never counts it.
+        """
         async with self._fenced() as (connection, job):
             if job.state == "canceling":
                 await end_job(connection, job, "canceled", None)
                 return
-            reason = self.shown(reason)
+            reason = storable_text(self.shown(reason))
+            if uncounted is not None and await _handed_back(connection, job, reason) >= uncounted:
+                error = {"type": "worker_failed", "message": f"Handed back too often: {reason}."}
+                await rescue(connection, slips, job, error, keep_slip=True)
+                return
             await add_event(connection, job.id, job.attempt, "handed_back", {"reason": reason})
             await add_log_lines(connection, job.id, job.attempt, [f"Handed back to the queue: {reason}"])
             await queue_again(connection, slips, job, keep_slip=True)
@@ -210,19 +233,32 @@ class Attempt:
             StorageUnavailable: as by :meth:`fail`.
             QuotaExceeded: as by :meth:`fail`.
         """
-        async with self._fenced() as (connection, job):
+        counts = forget_checkpoint or bool(results)
+        async with self._fenced(note, _contents(results), counts=counts) as (connection, job):
             error = self.shown(dict(error))
             failed = await rescue(connection, slips, job, error, keep_slip=True, wait_seconds=wait_seconds)
             if failed and forget_checkpoint:
                 await connection.execute("UPDATE jobs SET checkpoint = NULL WHERE id = %s", [job.id])
             if failed and results:
-                await _show(connection, job, results, note)
+                await _show(connection, job, results)
                 await check_bytes(connection, job.owner, self.quota)
 
     @asynccontextmanager
-    async def _fenced(self) -> AsyncIterator[tuple[Connection, Job]]:
-        """A transaction that holds the job's lock, if the attempt is still the job's."""
-        async with self.pool.connection() as connection, connection.transaction():
+    async def _fenced(
+        self, note: Note | None = None, contents: Collection[str] = (), *, counts: bool = False
+    ) -> AsyncIterator[tuple[Connection, Job]]:
+        """A transaction that holds the job's lock, if the attempt is still the job's.
+
+        Args:
+            note: under which contents were stored that the transaction names.
+            contents: their digests.
+            counts: whether it changes what the owner stores; the owner's lock is taken before the job's, see
+                :mod:`octasplat.workers.records.locks`.
+        """
+        named = _transaction(self.pool) if note is None else note.naming(contents)
+        async with named as connection:
+            if counts:
+                await lock_owner(connection, self.job.owner)
             job = await get_job(connection, self.job.id, lock=True)
             self._check(job)
             assert job is not None
@@ -231,6 +267,22 @@ class Attempt:
     def _check(self, job: Job | None) -> None:
         if job is None or job.attempt != self.job.attempt or job.state not in ("running", "canceling"):
             raise Fenced(f"attempt {self.job.attempt} of job {self.job.id} is over")
+
+
+async def _handed_back(connection: Connection, job: Job, reason: str) -> int:
+    """How often a job was handed back for a reason since it came any further or was accepted."""
+    cursor = await connection.execute(
+        """
+        SELECT count(*) AS n FROM job_events
+        WHERE job_id = %(job)s AND kind = 'handed_back' AND data->>'reason' = %(reason)s
+          AND id > coalesce((
+            SELECT max(id) FROM job_events WHERE job_id = %(job)s
+              AND (kind = 'checkpoint' OR kind = 'state' AND data->>'state' = ANY(%(over)s))), 0)
+        """,
+        {"job": job.id, "reason": reason, "over": list(TERMINAL)},
+    )
+    row = await cursor.fetchone()
+    return int(row["n"]) if row else 0
 
 
 async def claim(pool: Pool, job_id: uuid.UUID, slip: int, worker: str) -> Attempt | None:
@@ -298,12 +350,18 @@ async def rescue(
     return False
 
 
-async def _show(
-    connection: Connection, job: Job, results: Sequence[Result], note: Note | None = None
-) -> None:
+@asynccontextmanager
+async def _transaction(pool: Pool) -> AsyncIterator[Connection]:
+    async with pool.connection() as connection, connection.transaction():
+        yield connection
+
+
+def _contents(results: Sequence[Result]) -> set[str]:
+    return {result.sha256 for result in results}
+
+
+async def _show(connection: Connection, job: Job, results: Sequence[Result]) -> None:
     """Put results into the place of earlier ones; the one place where they become visible."""
-    if note is not None:
-        await note.confirm(connection, {result.sha256 for result in results})
     await connection.execute("DELETE FROM artifacts WHERE job_id = %s", [job.id])
     await connection.execute(
         """
@@ -328,7 +386,7 @@ async def end_job(connection: Connection, job: Job, state: str, error: Mapping[s
             checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END
         WHERE id = %s
         """,
-        [state, Jsonb(dict(error)) if error is not None else None, state == "succeeded", job.id],
+        [state, as_json_or_null(error), state == "succeeded", job.id],
     )
     data: dict[str, Any] = {"state": state}
     if error is not None:

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from psycopg.rows import class_row
-from psycopg.types.json import Jsonb
 
 from octasplat.workers.queue.port import QueueDepth, Slips
 from octasplat.workers.records.database import Connection, naming
 from octasplat.workers.records.errors import Conflict, Missing
 from octasplat.workers.records.ids import new_id
 from octasplat.workers.records.journal import add_event
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.records.rows import Artifact, Job
+from octasplat.workers.records.texts import as_json, as_json_or_null
 
 LOCK_SECONDS = 10
 """A transaction that has locked a job and falls silent for so long is undone; its process is gone."""
@@ -52,8 +53,8 @@ async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
             """,
             [
                 job_id, new.owner, new.kind, new.dataset_id, new.source_id, new.label,
-                Jsonb(dict(new.options)), new.queue, new.priority, slip, new.traceparent,
-                None if new.estimate is None else Jsonb(dict(new.estimate)), new.files_id,
+                as_json(dict(new.options)), new.queue, new.priority, slip, new.traceparent,
+                as_json_or_null(new.estimate), new.files_id,
             ],
         )  # fmt: skip
         for dataset_id in filter(None, (new.dataset_id, new.files_id)):
@@ -199,6 +200,7 @@ async def retry_job(
         Missing: there is no such job.
     """
     async with connection.transaction():
+        await lock_owner(connection, (await _existing(connection, job_id)).owner)
         job = await _existing(connection, job_id, lock=True)
         if job.state not in ("failed", "canceled"):
             raise Conflict(f"Only failed and canceled jobs are retried; this one is {job.state}.")
@@ -217,8 +219,8 @@ async def retry_job(
             {
                 "fresh": fresh,
                 "forget": fresh or options is not None,
-                "options": Jsonb(dict(options)) if options is not None else None,
-                "estimate": Jsonb(dict(estimate)) if estimate is not None else None,
+                "options": as_json_or_null(options),
+                "estimate": as_json_or_null(estimate),
                 "id": job_id,
             },
         )
@@ -287,6 +289,7 @@ async def delete_job(connection: Connection, job_id: uuid.UUID) -> None:
         Missing: there is no such job.
     """
     async with connection.transaction():
+        await lock_owner(connection, (await _existing(connection, job_id)).owner)
         job = await _existing(connection, job_id, lock=True)
         if not job.is_over:
             raise Conflict(f"The job is {job.state}; cancel it first.")

@@ -1,6 +1,10 @@
 """Jobs whose worker was lost go to another one."""
 
 import logging
+import time
+import uuid
+from collections.abc import Sequence
+from datetime import datetime
 
 from psycopg.rows import class_row
 
@@ -13,10 +17,38 @@ from octasplat.workers.records.rows import Job
 logger = logging.getLogger(__name__)
 
 
-async def rescue_lost_jobs(pool: Pool, slips: Slips, stale_seconds: float) -> int:
+class Suspects:
+    """Attempts that were not heard of for long by the database's clock, and for how long that is known here.
+
+    That clock may jump, as on a laptop that slept, and then nobody was heard of for long. So only those are
+    lost that are still not heard of a while later, by a clock that does not jump.
+
+    Args:
+        wait_seconds: how long that is; by then every worker that lives was heard of.
+    """
+
+    def __init__(self, wait_seconds: float) -> None:
+        self._wait_seconds = wait_seconds
+        self._since: dict[tuple[uuid.UUID, int, datetime | None], float] = {}
+
+    def lost(self, silent: Sequence[Job]) -> list[Job]:
+        """Those of the silent that did not change since they were seen first, long enough ago."""
+        now = time.monotonic()
+        found = {(job.id, job.attempt, job.heartbeat_at): job for job in silent}
+        self._since = {key: self._since.get(key, now) for key in found}
+        return [job for key, job in found.items() if now - self._since[key] >= self._wait_seconds]
+
+
+async def rescue_lost_jobs(pool: Pool, slips: Slips, stale_seconds: float, suspects: Suspects) -> int:
     """Queue again whatever has not been heard of for ``stale_seconds`` by the database's clock.
 
     Safe to run anywhere at any time, also twice at once.
+
+    Args:
+        pool: connections.
+        slips: the queue.
+        stale_seconds: how long.
+        suspects: those of the last time.
 
     Returns:
         Number of jobs that were taken from lost workers.
@@ -35,7 +67,7 @@ async def rescue_lost_jobs(pool: Pool, slips: Slips, stale_seconds: float) -> in
                 ),
                 [stale_seconds],
             )
-            lost = await cursor.fetchall()
+            lost = suspects.lost(await cursor.fetchall())
             for job in lost:
                 logger.warning("worker %s was lost with job %s", job.worker, job.id)
                 message = (

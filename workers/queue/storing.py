@@ -1,11 +1,17 @@
 """Notes of who stores contents and will name them in a table only afterwards, so that nobody collects them.
 
-A note is there before the first byte is stored. Whoever names the contents confirms it in the same
-transaction, which fails if the note was given up: that of a process that was silent for long counts no more.
+A note is there before the first byte is stored. Whoever names the contents does so in a transaction of
+:meth:`Note.naming`, which fails if the note was given up: that of a process that was silent for long counts
+no more.
+
+Contents are removed from the store without a lock, as that may take long. They are marked first, while nobody
+names anything (:func:`marked_for_removal`), and whoever has stored one of them meanwhile waits until it is
+unmarked and then looks whether it is there.
 """
 
 import asyncio
 import logging
+import time
 import uuid
 from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
@@ -17,6 +23,7 @@ from psycopg_pool import PoolTimeout
 
 from octasplat.workers.records.database import Connection, Pool
 from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.locks import STORE, lock_store
 from octasplat.workers.store.errors import BlobMissing, StorageUnavailable
 from octasplat.workers.store.protocol import Storage
 
@@ -26,7 +33,11 @@ SEEN_SECONDS = 10.0
 """How often whoever stores says that it still does."""
 SILENT_SECONDS = 45.0
 """A note of which nothing was heard for so long is given up."""
-_LOCK = 0x73746F72  # "stor"
+REMOVING_SECONDS = 300.0
+"""A mark of removal that is older is one that a lost process left behind; it counts no more."""
+PATIENCE_SECONDS = 60.0
+"""For so long whoever names contents waits for those that are being removed at this moment."""
+_LOOK_SECONDS = 0.2
 _UNREACHABLE = (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, TimeoutError, OSError)
 
 
@@ -36,45 +47,83 @@ class Note:
 
     Attributes:
         id: of the row.
+        pool: connections.
         storage: where.
-        removals: how often contents had been removed before; None if some were just then.
+        removals: how often contents had been marked for removal before; None if some were just then.
     """
 
     id: uuid.UUID
+    pool: Pool
     storage: Storage
     removals: int | None
 
-    async def confirm(self, connection: Connection, contents: Collection[str]) -> None:
-        """Make sure that nothing stored meanwhile is collected before the transaction of ``connection`` ends.
+    async def look(self, contents: Collection[str]) -> int:
+        """Make sure that nothing that was stored under the note has been removed meanwhile.
 
         Args:
-            connection: of the transaction that names the contents.
+            contents: the digests of all that was stored.
+
+        Returns:
+            How often contents had been marked for removal when it was looked.
+
+        Raises:
+            StorageUnavailable: the note was given up, or some of it is gone; it is to be stored again.
+        """
+        deadline = time.monotonic() + PATIENCE_SECONDS
+        while True:
+            async with self.pool.connection() as connection:
+                await self._check(connection, lock=False)
+                removals = await _removals(connection)
+                is_removing = await _are_being_removed(connection, contents)
+            if not is_removing:
+                break
+            if time.monotonic() > deadline:
+                raise StorageUnavailable("Contents are being removed from the store; store them again.")
+            await asyncio.sleep(_LOOK_SECONDS)
+        if removals != self.removals:
+            gone = await asyncio.to_thread(_missing, self.storage, contents)
+            if gone:
+                raise StorageUnavailable(f"{len(gone)} contents were removed meanwhile; store them again.")
+        return removals
+
+    @asynccontextmanager
+    async def naming(self, contents: Collection[str]) -> AsyncIterator[Connection]:
+        """A transaction that names contents; until it ends none of them is removed.
+
+        Args:
             contents: their digests.
 
         Raises:
-            StorageUnavailable: the note was given up, or some of it was removed in the moment when it was
-                stored; it is to be stored again.
+            StorageUnavailable: as by :meth:`look`.
         """
-        cursor = await connection.execute("SELECT id FROM storing WHERE id = %s FOR KEY SHARE", [self.id])
+        while True:
+            looked = await self.look(contents)
+            async with self.pool.connection() as connection, connection.transaction():
+                await lock_store(connection, shared=True)
+                if await _removals(connection) != looked:
+                    continue  # contents were marked in between
+                await self._check(connection, lock=True)
+                yield connection
+                return
+
+    async def _check(self, connection: Connection, *, lock: bool) -> None:
+        query = "SELECT id FROM storing WHERE id = %s"
+        cursor = await connection.execute(f"{query} FOR KEY SHARE" if lock else query, [self.id])
         if await cursor.fetchone() is None:
             raise StorageUnavailable(
                 "Whoever stored this was silent for too long, so it may be gone; store it again."
             )
-        await connection.execute("SELECT pg_advisory_xact_lock_shared(%s)", [_LOCK])
-        if await _removals(connection) != self.removals:
-            gone = await asyncio.to_thread(_missing, self.storage, contents)
-            if gone:
-                raise StorageUnavailable(f"{len(gone)} contents were removed meanwhile; store them again.")
 
 
 @asynccontextmanager
 async def storing(pool: Pool, storage: Storage) -> AsyncIterator[Note]:
     """A note for as long as the block runs, in which contents are stored and then named."""
     async with pool.connection() as connection:
-        cursor = await connection.execute("SELECT pg_try_advisory_xact_lock_shared(%s) AS quiet", [_LOCK])
+        # Of the version before, removals hold the lock instead of marking what they remove.
+        cursor = await connection.execute("SELECT pg_try_advisory_xact_lock_shared(%s) AS quiet", [STORE])
         row = await cursor.fetchone()
-        is_quiet = row is not None and row["quiet"]
-        note = Note(new_id(), storage, await _removals(connection) if is_quiet else None)
+        is_quiet = row is not None and row["quiet"] and not await _are_being_removed(connection, None)
+        note = Note(new_id(), pool, storage, await _removals(connection) if is_quiet else None)
         await connection.execute("INSERT INTO storing (id) VALUES (%s)", [note.id])
     seen = asyncio.create_task(_say_so(pool, note))
     try:
@@ -84,10 +133,29 @@ async def storing(pool: Pool, storage: Storage) -> AsyncIterator[Note]:
         await asyncio.shield(_remove(pool, note))
 
 
-async def removing(connection: Connection) -> None:
-    """Until the transaction ends nobody names contents, which may be removed; call this before."""
-    await connection.execute("SELECT pg_advisory_xact_lock(%s)", [_LOCK])
-    await connection.execute("SELECT nextval('octasplat_removals')")
+@asynccontextmanager
+async def marking(connection: Connection) -> AsyncIterator[None]:
+    """A transaction in which nobody names contents, for :func:`mark`."""
+    async with connection.transaction():
+        await lock_store(connection, shared=False)
+        await connection.execute("SELECT nextval('octasplat_removals')")
+        yield
+
+
+async def mark(connection: Connection, contents: Collection[str]) -> None:
+    """Mark contents that nothing names as being removed, in a transaction of :func:`marking`."""
+    await connection.execute(
+        """
+        INSERT INTO removing_contents (sha256) SELECT unnest(%s::text[])
+        ON CONFLICT (sha256) DO UPDATE SET since = clock_timestamp()
+        """,
+        [sorted(contents)],
+    )
+
+
+async def unmark(connection: Connection, contents: Collection[str]) -> None:
+    """Contents are removed, or left after all."""
+    await connection.execute("DELETE FROM removing_contents WHERE sha256 = ANY(%s)", [list(contents)])
 
 
 async def oldest_note(connection: Connection) -> datetime | None:
@@ -130,6 +198,22 @@ async def _remove(pool: Pool, note: Note) -> None:
             await connection.execute("DELETE FROM storing WHERE id = %s", [note.id])
     except _UNREACHABLE as error:
         logger.info("a note of what is stored stays for a while: %s", error)
+
+
+async def _are_being_removed(connection: Connection, contents: Collection[str] | None) -> bool:
+    """Whether any of these contents, or any at all, are being removed."""
+    cursor = await connection.execute(
+        """
+        SELECT EXISTS (
+            SELECT FROM removing_contents
+            WHERE since > clock_timestamp() - make_interval(secs => %(seconds)s)
+              AND (%(contents)s::text[] IS NULL OR sha256 = ANY(%(contents)s))
+        ) AS found
+        """,
+        {"seconds": REMOVING_SECONDS, "contents": None if contents is None else list(contents)},
+    )
+    row = await cursor.fetchone()
+    return row is not None and bool(row["found"])
 
 
 async def _removals(connection: Connection) -> int:

@@ -1,10 +1,13 @@
 """Connections to the database."""
 
-from collections.abc import AsyncIterator, Mapping
+import asyncio
+import functools
+import random
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import fields
 from functools import cache
-from typing import Any, LiteralString
+from typing import Any, LiteralString, ParamSpec, TypeVar
 
 import psycopg
 from psycopg import sql
@@ -13,9 +16,13 @@ from psycopg_pool import AsyncConnectionPool
 
 from octasplat.workers.records.errors import DatabaseError
 
+Parameters = ParamSpec("Parameters")
+Outcome = TypeVar("Outcome")
 Connection = psycopg.AsyncConnection[DictRow]
 Pool = AsyncConnectionPool[Connection]
 
+TRIES = 5
+"""So often is a transaction tried that the database ends because of another."""
 STATEMENT_SECONDS = 60
 """A statement that takes longer, as it waits for a lock or the database is overwhelmed, is given up."""
 IDLE_SECONDS = 30
@@ -35,7 +42,7 @@ KEEPALIVES: Mapping[str, int] = {
 
 
 @cache
-def naming(query: LiteralString, row: type[Any]) -> sql.Composed:
+def naming(query: LiteralString, row: type[Any], of: str = "") -> sql.Composed:
     """A query with the columns that a row has in the place of its braces.
 
     They are named, as the next version's tables, with which this one goes on for a while, may have more.
@@ -43,8 +50,33 @@ def naming(query: LiteralString, row: type[Any]) -> sql.Composed:
     Args:
         query: with ``{}`` where the columns belong.
         row: a dataclass whose fields are named as the columns.
+        of: name of the table, where the query has several.
     """
-    return sql.SQL(query).format(sql.SQL(", ").join(sql.Identifier(field.name) for field in fields(row)))
+    table = (of,) if of else ()
+    columns = (sql.Identifier(*table, field.name) for field in fields(row))
+    return sql.SQL(query).format(sql.SQL(", ").join(columns))
+
+
+def tried_again(
+    action: Callable[Parameters, Awaitable[Outcome]],
+) -> Callable[Parameters, Coroutine[Any, Any, Outcome]]:
+    """A function whose transaction is begun anew where the database ended it in favour of another.
+
+    The function must leave nothing behind but what it did in that transaction.
+    """
+
+    @functools.wraps(action)
+    async def trying(*values: Parameters.args, **named: Parameters.kwargs) -> Outcome:
+        for left in reversed(range(TRIES)):
+            try:
+                return await action(*values, **named)
+            except (psycopg.errors.DeadlockDetected, psycopg.errors.SerializationFailure):
+                if left == 0:
+                    raise
+                await asyncio.sleep(random.uniform(0.0, 0.1))  # noqa: S311 - only so that twins part
+        raise AssertionError
+
+    return trying
 
 
 @asynccontextmanager

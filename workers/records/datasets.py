@@ -2,16 +2,18 @@
 
 import uuid
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from psycopg.rows import class_row, dict_row
-from psycopg.types.json import Jsonb
 
 from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.records.database import Connection, naming
 from octasplat.workers.records.errors import Conflict, Missing
 from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.records.rows import Dataset, DatasetFile, DatasetHolds
+from octasplat.workers.records.texts import as_json
 
 CHECK_LOST_SECONDS = 60
 """A validation of which nothing was heard for so long counts no more; its process is gone."""
@@ -65,15 +67,69 @@ async def files_named(
     """Files that options may name, whose names end so, with their committed datasets; the newest first."""
     async with connection.cursor(row_factory=dict_row) as cursor:
         await cursor.execute(
-            """
-            SELECT f.path AS file_path, d.* FROM datasets d JOIN dataset_files f ON f.dataset_id = d.id
+            naming(
+                """
+            SELECT f.path AS file_path, {} FROM datasets d JOIN dataset_files f ON f.dataset_id = d.id
             WHERE d.owner = %s AND d.holds = 'files' AND d.state = 'committed'
               AND lower(f.path) LIKE ANY(%s)
             ORDER BY d.id DESC, f.path LIMIT %s
             """,
+                Dataset,
+                "d",
+            ),
             [owner, [f"%{ending}" for ending in endings], limit],
         )
         return [(Dataset(**row), path) for row in await cursor.fetchall() if (path := row.pop("file_path"))]
+
+
+@dataclass(frozen=True)
+class NewFile:
+    """A file that has arrived, see :class:`octasplat.workers.records.rows.DatasetFile`."""
+
+    path: str
+    sha256: str
+    size_bytes: int
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+async def put_files(
+    connection: Connection, dataset_id: uuid.UUID, files: Sequence[NewFile]
+) -> list[DatasetFile]:
+    """Record files that have arrived, each in the place of one of the same path; by path.
+
+    All go in one statement, as the locks of the dataset and its owner are held for as long as it takes.
+
+    Raises:
+        Conflict: the dataset takes no files any more.
+        Missing: there is no such dataset.
+    """
+    async with connection.transaction():
+        await _open_dataset(connection, dataset_id)
+        async with connection.cursor(row_factory=class_row(DatasetFile)) as cursor:
+            await cursor.execute(
+                naming(
+                    """
+            INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts)
+            SELECT %s, given.path, given.sha256, given.size_bytes, given.facts
+            FROM unnest(%s::text[], %s::text[], %s::bigint[], %s::jsonb[])
+                AS given (path, sha256, size_bytes, facts) ORDER BY given.path COLLATE "C"
+            ON CONFLICT (dataset_id, path) DO UPDATE
+            SET sha256 = excluded.sha256, size_bytes = excluded.size_bytes, facts = excluded.facts,
+                uploaded_at = now()
+            RETURNING {}
+            """,
+                    DatasetFile,
+                    "dataset_files",
+                ),
+                [
+                    dataset_id,
+                    [file.path for file in files],
+                    [file.sha256 for file in files],
+                    [file.size_bytes for file in files],
+                    [as_json(dict(file.facts)) for file in files],
+                ],
+            )
+            return sorted(await cursor.fetchall(), key=lambda file: file.path)
 
 
 async def put_file(
@@ -84,26 +140,8 @@ async def put_file(
     size_bytes: int,
     facts: Mapping[str, Any] | None = None,
 ) -> DatasetFile:
-    """Record a file that has arrived, in the place of one of the same path.
-
-    Raises:
-        Conflict: the dataset takes no files any more.
-        Missing: there is no such dataset.
-    """
-    async with connection.transaction():
-        await _open_dataset(connection, dataset_id)
-        await connection.execute(
-            """
-            INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts)
-            VALUES (%s, %s, %s, %s, %s)
-            ON CONFLICT (dataset_id, path) DO UPDATE
-            SET sha256 = excluded.sha256, size_bytes = excluded.size_bytes, facts = excluded.facts,
-                uploaded_at = now()
-            """,
-            [dataset_id, path, sha256, size_bytes, Jsonb(dict(facts or {}))],
-        )
-        file = await get_file(connection, dataset_id, path)
-    assert file is not None
+    """Record one file; as :func:`put_files`."""
+    [file] = await put_files(connection, dataset_id, [NewFile(path, sha256, size_bytes, facts or {})])
     return file
 
 
@@ -193,6 +231,20 @@ async def renew_check(connection: Connection, dataset_id: uuid.UUID) -> None:
     )
 
 
+async def open_lost_checks(connection: Connection) -> int:
+    """Open datasets again whose validation nobody goes on with; returns how many."""
+    cursor = await connection.execute(
+        """
+        UPDATE datasets SET state = 'open' WHERE id IN (
+            SELECT id FROM datasets WHERE state = 'checking' AND used_at < now() - make_interval(secs => %s)
+            ORDER BY id FOR UPDATE SKIP LOCKED
+        )
+        """,
+        [2 * CHECK_LOST_SECONDS],
+    )
+    return cursor.rowcount
+
+
 async def end_check(
     connection: Connection,
     dataset_id: uuid.UUID,
@@ -218,7 +270,7 @@ async def end_check(
             "sound": sound,
             "poses": has_poses,
             "photographs": photographs,
-            "facts": Jsonb(dict(facts or {})),
+            "facts": as_json(dict(facts or {})),
             "id": dataset_id,
         },
     )
@@ -254,6 +306,7 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
         Missing: there is no such dataset.
     """
     async with connection.transaction():
+        await _lock_owner_of(connection, dataset_id)
         dataset = await get_dataset(connection, dataset_id, lock=True)
         if dataset is None:
             raise Missing("dataset")
@@ -278,7 +331,16 @@ async def _check_was_lost(connection: Connection, dataset_id: uuid.UUID) -> bool
     return bool(row and row["lost"])
 
 
+async def _lock_owner_of(connection: Connection, dataset_id: uuid.UUID) -> None:
+    """Take the owner's lock, before that of the dataset; see :mod:`octasplat.workers.records.locks`."""
+    dataset = await get_dataset(connection, dataset_id)
+    if dataset is None:
+        raise Missing("dataset")
+    await lock_owner(connection, dataset.owner)
+
+
 async def _open_dataset(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
+    await _lock_owner_of(connection, dataset_id)
     dataset = await get_dataset(connection, dataset_id, lock=True)
     if dataset is None:
         raise Missing("dataset")

@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from psycopg.rows import class_row
-from psycopg.types.json import Jsonb
 
 from octasplat.workers.records.database import Connection, naming
 from octasplat.workers.records.rows import JobEvent, LogLine
+from octasplat.workers.records.texts import as_json, storable_text
 
 CHANNEL = "octasplat_events"
 """Notifications on this channel carry the id of the job that has a new event."""
@@ -20,7 +20,7 @@ async def add_event(
     """Add an event; whoever listens on :data:`CHANNEL` hears of it when the transaction commits."""
     await connection.execute(
         "INSERT INTO job_events (job_id, attempt, kind, data) VALUES (%s, %s, %s, %s)",
-        [job_id, attempt, kind, Jsonb(dict(data))],
+        [job_id, attempt, kind, as_json(dict(data))],
     )
 
 
@@ -33,7 +33,7 @@ async def add_log_lines(
         INSERT INTO job_logs (job_id, attempt, text)
         SELECT %s, %s, line FROM unnest(%s::text[]) WITH ORDINALITY AS given (line, number) ORDER BY number
         """,
-        [job_id, attempt, [line.replace("\0", "\N{REPLACEMENT CHARACTER}") for line in lines]],
+        [job_id, attempt, [storable_text(line) for line in lines]],
     )
 
 

@@ -20,6 +20,9 @@ OLDEST_SERVER = 140000
 OLDEST_READER = "0007_files.sql"
 """Processes that know this step of ours may go on with the tables of this version."""
 WAIT_SECONDS = 120.0
+LOCK_SECONDS = 2.0
+"""For so long a step waits for a table at a time, and then leaves it to others as long."""
+_LOOK_SECONDS = 0.2
 _LOCK = 0x6F637461  # "octa"
 _VERSIONS = """
 CREATE TABLE IF NOT EXISTS schema_steps (
@@ -70,7 +73,7 @@ def migrate(conninfo: str, only: Collection[str] | None = None) -> tuple[str, ..
             if connection.info.server_version < OLDEST_SERVER:
                 major = connection.info.server_version // 10000
                 raise DatabaseError(f"The database is Postgres {major}; Postgres 14 or newer is needed.")
-            connection.execute("SELECT pg_advisory_lock(%s)", [_LOCK])
+            _wait_for_turn(connection)
             return tuple(_apply_missing(connection, only))
     except psycopg.OperationalError as error:
         raise _unreachable(error) from None
@@ -78,6 +81,48 @@ def migrate(conninfo: str, only: Collection[str] | None = None) -> tuple[str, ..
         raise DatabaseError(
             f"The database's tables cannot be brought up to date: {_one_line(error)}"
         ) from None
+
+
+def _wait_for_turn(connection: psycopg.Connection) -> None:
+    """Take the lock under which tables are changed; it ends with the connection.
+
+    Raises:
+        DatabaseError: somebody else has it for too long.
+    """
+    deadline = time.monotonic() + WAIT_SECONDS
+    while connection.execute("SELECT pg_try_advisory_lock(%s)", [_LOCK]).fetchone() != (True,):
+        if time.monotonic() > deadline:
+            raise DatabaseError(
+                f"Another process has changed the tables for {WAIT_SECONDS:g} s; wait for it, or end it."
+            )
+        time.sleep(_LOOK_SECONDS)
+
+
+def _apply(connection: psycopg.Connection, step: Step) -> None:
+    """Apply a step. Its locks are asked for again and again for a short time each.
+
+    Whoever waits for the lock of a table holds up everybody who comes after it, so that none is waited for
+    longer than a running service can bear.
+
+    Raises:
+        DatabaseError: somebody holds a table for too long.
+    """
+    deadline = time.monotonic() + WAIT_SECONDS
+    while True:
+        try:
+            with connection.transaction():
+                connection.execute("SELECT set_config('lock_timeout', %s, true)", [f"{LOCK_SECONDS:g}s"])
+                connection.execute(step.sql)
+                _record(connection, step)
+            return
+        except (psycopg.errors.LockNotAvailable, psycopg.errors.DeadlockDetected) as error:
+            if time.monotonic() > deadline:
+                raise DatabaseError(
+                    f"The tables are in use, so that the step {step.name} cannot be applied "
+                    f"({_one_line(error)}); end what holds them, such as a backup, and start again."
+                ) from None
+            logger.info("the step %s waits for tables that are in use", step.name)
+        time.sleep(LOCK_SECONDS)
 
 
 def wait_for_tables(conninfo: str, seconds: float = WAIT_SECONDS) -> None:
@@ -133,9 +178,7 @@ def _apply_missing(connection: psycopg.Connection, only: Collection[str] | None)
     for step in steps:
         left_out = only is not None and step.component == OURS and step.name not in only
         if (step.component, step.name) not in applied and not left_out:
-            with connection.transaction():
-                connection.execute(step.sql)
-                _record(connection, step)
+            _apply(connection, step)
             yield step.name
     connection.execute(
         """

@@ -2,8 +2,8 @@
 
 The checks take a lock of the owner that ends with the transaction, so that what is checked and what is then
 entered in the same transaction belong together, however many requests come at once. Whoever also locks a job
-or a dataset locks that first. The database counts bytes as they change (``migrations/0008_usage.sql``), so no
-check takes longer for who has more.
+or a dataset takes that lock before, see :mod:`octasplat.workers.records.locks`. The database counts bytes as
+they change (``migrations/0012_locks.sql``), so no check takes longer for who has more.
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,7 @@ from psycopg.rows import class_row
 
 from octasplat.engine.errors import OctasplatError
 from octasplat.workers.records.database import Connection
-
-_LOCK = 0x71756F74  # "quot"
+from octasplat.workers.records.locks import lock_owner
 
 
 class QuotaExceeded(OctasplatError):
@@ -107,6 +106,32 @@ async def bytes_left(connection: Connection, owner: str, default: Quota = NO_QUO
     return max(0, quota.max_bytes - await _bytes_of(connection, owner))
 
 
+@dataclass(frozen=True)
+class Recounted:
+    """An owner whose bytes were counted wrong."""
+
+    owner: str
+    bytes_before: int
+    bytes: int
+
+
+async def recount(connection: Connection) -> list[Recounted]:
+    """Count all owners' bytes anew, while nobody changes anything; those whose count was wrong, by owner."""
+    async with connection.transaction(), connection.cursor(row_factory=class_row(Recounted)) as cursor:
+        await cursor.execute(
+            "SELECT whose AS owner, bytes_before, bytes_after AS bytes FROM octasplat_recount()"
+        )
+        return await cursor.fetchall()
+
+
+async def owned_bytes(connection: Connection, owner: str, sha256: str) -> int:
+    """What of an owner's bytes is content of that digest; 0 if they do not have it."""
+    query = """
+        SELECT coalesce(sum(size_bytes), 0)::bigint AS n FROM owner_contents WHERE owner = %s AND sha256 = %s
+        """
+    return await _number(connection, query, [owner, sha256])
+
+
 async def check_bytes(connection: Connection, owner: str, default: Quota = NO_QUOTA) -> None:
     """Refuse what was just entered in this transaction if it is too much.
 
@@ -165,7 +190,7 @@ async def check_new_job(connection: Connection, owner: str, default: Quota = NO_
 async def _locked_quota(connection: Connection, owner: str, default: Quota) -> Quota:
     quota = await quota_of(connection, owner, default)
     if quota != NO_QUOTA:
-        await connection.execute("SELECT pg_advisory_xact_lock(%s, hashtext(%s))", [_LOCK, owner])
+        await lock_owner(connection, owner)
     return quota
 
 

@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from psycopg.rows import class_row
-from psycopg.types.json import Jsonb
 
 from octasplat.workers.records.database import Connection, naming
 from octasplat.workers.records.rows import WorkerRow
+from octasplat.workers.records.texts import as_json
 
 
 async def see_worker(
@@ -26,7 +26,7 @@ async def see_worker(
         INSERT INTO workers (id, name, queues, slots, facts) VALUES (%s, %s, %s, %s, %s)
         ON CONFLICT (id) DO UPDATE SET seen_at = now(), facts = excluded.facts
         """,
-        [worker_id, name, list(queues), slots, Jsonb(dict(facts))],
+        [worker_id, name, list(queues), slots, as_json(dict(facts))],
     )
 
 

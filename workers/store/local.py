@@ -221,6 +221,10 @@ class LocalStorage:
                 os.unlink(name, dir_fd=self._documents_fd)
             except (FileNotFoundError, NotADirectoryError):
                 return False
+            folder = name.rpartition("/")[0]
+            if "/" in folder:  # a job's own; that of all jobs is about to be used by others
+                with suppress(OSError):  # other documents are in it
+                    os.rmdir(folder, dir_fd=self._documents_fd)
             return True
 
     def free_bytes(self) -> int:

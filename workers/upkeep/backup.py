@@ -33,7 +33,7 @@ from octasplat.workers.store.trees import read_manifest
 
 FORMAT = 1
 RECORD, TABLES, STORE = "backup.json", "tables-", "store"
-_LEFT_OUT = ("schema_steps", "schema_reach", "workers", "storing")
+_LEFT_OUT = ("schema_steps", "schema_reach", "workers", "storing", "removing_contents")
 _CONTENTS = """
     SELECT sha256 FROM dataset_files UNION SELECT sha256 FROM artifacts
     UNION SELECT file->>'sha256' FROM jobs, jsonb_array_elements(checkpoint->'files') AS file
@@ -75,24 +75,26 @@ def back_up(
         if names and not names & {RECORD, STORE}:
             raise BackupError(f"{folder} holds files and no backup; name another folder.")
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with psycopg.connect(conninfo) as collecting, psycopg.connect(conninfo) as connection:
+    with psycopg.connect(conninfo) as collecting:
         # Whoever collects unused contents leaves it to us, so that all that is named now stays.
         collecting.execute("SELECT id FROM installation FOR UPDATE")
-        connection.isolation_level = psycopg.IsolationLevel.REPEATABLE_READ
-        connection.read_only = True
-        rows = folder / f"{TABLES}{uuid.uuid4().hex[:12]}"
-        with told(folder):
-            rows.mkdir(mode=0o700)
-        tables = [_write_table(connection, name, rows) for name in _tables(connection)]
-        steps = [name for (name,) in connection.execute(
-            "SELECT name FROM schema_steps WHERE component = %s ORDER BY name", [OURS]
-        )]  # fmt: skip
-        sequences: dict[str, int] = dict(connection.execute(
-            "SELECT sequencename, last_value FROM pg_sequences "
-            "WHERE schemaname = current_schema() AND last_value IS NOT NULL"
-        ).fetchall())  # fmt: skip
-        wanted = {sha256 for (sha256,) in connection.execute(_CONTENTS)}
-        jobs = {str(job_id) for (job_id,) in connection.execute("SELECT id FROM jobs")}
+        # The snapshot ends before contents are copied: its locks hold up whoever changes the tables.
+        with psycopg.connect(conninfo) as connection:
+            connection.isolation_level = psycopg.IsolationLevel.REPEATABLE_READ
+            connection.read_only = True
+            rows = folder / f"{TABLES}{uuid.uuid4().hex[:12]}"
+            with told(folder):
+                rows.mkdir(mode=0o700)
+            tables = [_write_table(connection, name, rows) for name in _tables(connection)]
+            steps = [name for (name,) in connection.execute(
+                "SELECT name FROM schema_steps WHERE component = %s ORDER BY name", [OURS]
+            )]  # fmt: skip
+            sequences: dict[str, int] = dict(connection.execute(
+                "SELECT sequencename, last_value FROM pg_sequences "
+                "WHERE schemaname = current_schema() AND last_value IS NOT NULL"
+            ).fetchall())  # fmt: skip
+            wanted = {sha256 for (sha256,) in connection.execute(_CONTENTS)}
+            jobs = {str(job_id) for (job_id,) in connection.execute("SELECT id FROM jobs")}
         copy = LocalStorage(folder / STORE, floor_bytes=0)
         contents, size_bytes = _copy_store(storage, copy, wanted, jobs, on_content)
     record = {

@@ -12,7 +12,7 @@ import uuid
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
-from octasplat.workers.queue.storing import give_up_silent, oldest_note, removing
+from octasplat.workers.queue.storing import give_up_silent, mark, marking, oldest_note, unmark
 from octasplat.workers.records.database import Connection, Pool, allow_long
 from octasplat.workers.records.references import references
 from octasplat.workers.store.collect import Collected, Unused, remove, unchanged, unnamed, unused
@@ -31,7 +31,7 @@ _SETTLED_SECONDS = 2.0
 COLLECT_SECONDS = 3600
 """After so long others may collect although somebody still does."""
 AT_ONCE = 50
-"""Contents that are removed while nobody names anything."""
+"""Contents that are marked and removed together."""
 INSTALLATION = "installation"
 _RESULTS = re.compile(r"results/([0-9a-f-]{36})/\d+")
 
@@ -171,21 +171,34 @@ async def _collect_at_once(pool: Pool, storage: Storage) -> Collected:
 
 
 async def _remove(connection: Connection, storage: Storage, contents: Sequence[Unused]) -> Collected:
-    """Remove contents, some at a time, while nobody names anything.
+    """Remove contents, some at a time, each marked before, while nobody could name it.
 
-    Whoever stored one of them once more in this very moment names it afterwards and then looks whether it is
-    there, see :meth:`octasplat.workers.queue.storing.Note.confirm`; or has named it before, and then it
-    stays.
+    Whoever stored one of them once more in this very moment waits until it is unmarked and then looks whether
+    it is there, see :meth:`octasplat.workers.queue.storing.Note.look`; or has named it before, and then it
+    stays. The store is asked without any lock, as its answers may take long.
     """
     removed = Collected()
     for start in range(0, len(contents), AT_ONCE):
         some = contents[start : start + AT_ONCE]
-        async with connection.transaction():
-            await removing(connection)
+        async with marking(connection):
             named = await _named_now(connection, [content.sha256 for content in some])
             left = [content for content in some if content.sha256 not in named]
+            digests = [content.sha256 for content in left]
+            await mark(connection, digests)
+        try:
             removed += await asyncio.to_thread(remove, storage, left)
+        except asyncio.CancelledError:
+            raise  # the thread goes on removing, so that the marks stay until they count no more
+        except BaseException:
+            await _unmark(connection, digests)
+            raise
+        await _unmark(connection, digests)
     return removed
+
+
+async def _unmark(connection: Connection, digests: Sequence[str]) -> None:
+    async with connection.transaction():
+        await unmark(connection, digests)
 
 
 async def _named_now(connection: Connection, contents: Sequence[str]) -> set[str]:

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 from psycopg import sql
 
-from octasplat.workers.queue.jobs import delete_job
+from octasplat.workers.queue.jobs import delete_job, get_job
 from octasplat.workers.records.database import Connection
 from octasplat.workers.records.datasets import get_dataset
 from octasplat.workers.records.errors import Conflict
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.settings import Retention
 
 logger = logging.getLogger(__name__)
@@ -151,6 +152,10 @@ async def _expired(connection: Connection, table: str) -> list[uuid.UUID]:
 async def _forget_job(connection: Connection, job_id: uuid.UUID) -> bool:
     try:
         async with connection.transaction():
+            job = await get_job(connection, job_id)
+            if job is None:
+                return False
+            await lock_owner(connection, job.owner)
             cursor = await connection.execute(
                 "SELECT owner FROM jobs WHERE id = %s AND expires_at < now() AND NOT pinned FOR UPDATE",
                 [job_id],
@@ -167,6 +172,10 @@ async def _forget_job(connection: Connection, job_id: uuid.UUID) -> bool:
 
 async def _forget_dataset(connection: Connection, dataset_id: uuid.UUID) -> bool:
     async with connection.transaction():
+        dataset = await get_dataset(connection, dataset_id)
+        if dataset is None:
+            return False
+        await lock_owner(connection, dataset.owner)
         dataset = await get_dataset(connection, dataset_id, lock=True)
         if dataset is None or dataset.pinned or dataset.expires_at is None or dataset.state == "checking":
             return False

@@ -30,9 +30,10 @@ from octasplat.workers.queue.attempts import Fenced, claim
 from octasplat.workers.queue.fairness import choose
 from octasplat.workers.queue.limits import end_abandoned
 from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
-from octasplat.workers.queue.rescue import rescue_lost_jobs
+from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
 from octasplat.workers.records.audit import forget_old_entries
 from octasplat.workers.records.database import Pool, open_pool
+from octasplat.workers.records.datasets import open_lost_checks
 from octasplat.workers.records.ids import new_id
 from octasplat.workers.records.migrate import wait_for_tables
 from octasplat.workers.records.sessions import forget_old_sessions
@@ -70,6 +71,8 @@ LEFT_POLLS = 3
 LEFT_SECONDS = 15.0
 """... and for twice as many each further time, up to this time."""
 EXIT_LOST_DATABASE = 69
+FORGIVEN_FAILURES = 3
+"""So many failures of workers over one job, one after another, are taken for their own fault."""
 
 
 def make_slips(settings: WorkerSettings, pool: Pool | None = None) -> ProcrastinateSlips:
@@ -160,6 +163,8 @@ class _Worker:
         self._lost = False
         self._openings = Openings(name, pool, around)
         self._left: Counter[uuid.UUID] = Counter()
+        # A worker that lives is heard of in between, also where all of this machine stood still.
+        self._suspects = Suspects(1.5 * settings.heartbeat_seconds + settings.poll_seconds)
         self._sender = Sender(pool, settings.webhook_hosts)
 
     async def run(self) -> int:
@@ -260,7 +265,9 @@ class _Worker:
             logger.exception("the attempt at job %s failed in its worker", job_id)
             self._around.host.fail(f"it cannot look after jobs ({type(error).__name__}: {error})")
             with contextlib.suppress(Fenced, *DATABASE_ERRORS):
-                await attempt.hand_back(self._around.slips, "its worker failed")
+                # Not with the error's text, which may differ each time.
+                reason = f"its worker failed ({type(error).__name__})"
+                await attempt.hand_back(self._around.slips, reason, uncounted=FORGIVEN_FAILURES)
 
     async def _leaves(self, job_id: uuid.UUID, slip: int) -> bool:
         """Whether a job was left to workers of another version."""
@@ -316,7 +323,7 @@ class _Worker:
         }
 
     async def _rescue(self) -> None:
-        await rescue_lost_jobs(self._pool, self._around.slips, self._settings.stale_seconds)
+        await rescue_lost_jobs(self._pool, self._around.slips, self._settings.stale_seconds, self._suspects)
         async with self._pool.connection() as connection:
             await forget_lost_workers(connection, max(60.0, 3 * self._settings.stale_seconds))
 
@@ -326,6 +333,8 @@ class _Worker:
     async def _forget(self) -> None:
         """Let go of what is older than it is to be kept."""
         async with self._pool.connection() as connection:
+            if opened := await open_lost_checks(connection):
+                logger.warning("%d datasets were closed by checks that were lost, and are open again", opened)
             await set_expiries(connection, self._settings.retention)
             await forget_expired(connection)
             await forget_old(connection)

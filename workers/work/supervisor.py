@@ -10,6 +10,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
+import psycopg
+
 from octasplat.engine import versions
 from octasplat.engine.errors import ConfigError, OctasplatError
 from octasplat.workers.ending import end
@@ -97,6 +99,8 @@ class Supervisor:
             await self._work()
         except Fenced:
             logger.warning("attempt %d of job %s is over: others have it", self._job.attempt, self._job.id)
+        except psycopg.DataError as error:
+            await self._verdicts.refuse(error)
         except DATABASE_ERRORS as error:
             raise LostDatabase(str(error)) from error
         finally:

@@ -5,6 +5,8 @@ import logging
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, TypeVar
 
+import psycopg
+
 from octasplat.engine.errors import OctasplatError
 from octasplat.workers.queue.attempts import MAX_RESCUES, Attempt, Result
 from octasplat.workers.queue.storing import Note, storing
@@ -20,6 +22,9 @@ from octasplat.workers.work.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
+
+CONTRADICTIONS = 3
+"""So often a verdict is told again that contradicts what others changed at the same time."""
 
 
 class Verdicts:
@@ -69,7 +74,8 @@ class Verdicts:
             await self._said(lambda: self._attempt.succeed(results, psnr))
         except QuotaExceeded as error:
             described = {"type": "quota", "message": f"The results cannot be stored. {error}"}
-            await self._said(lambda: self._attempt.fail(described))
+            await self._said(lambda: self._attempt.fail(described, unwanted=results))
+            await self._withdraw()
         self._around.host.worked()
 
     async def fail(self, error: dict[str, Any]) -> None:
@@ -81,6 +87,15 @@ class Verdicts:
             await self._said(lambda: self._attempt.fail({**error, "message": message}))
         except StorageError as storage_error:
             await self.give_up(storage_error)
+
+    async def refuse(self, error: psycopg.DataError) -> None:
+        """End the job with the database's refusal of something that was to be written about it."""
+        logger.error("what was to be written about job %s is refused: %s", self._job.id, error)
+        described = {
+            "type": "refused_value",
+            "message": "The job says something that cannot be written down.",
+        }
+        await self._said(lambda: self._attempt.fail(described))
 
     async def cancel(self) -> None:
         """End the job as its owner asked."""
@@ -157,11 +172,25 @@ class Verdicts:
             try:
                 async with storing(self._attempt.pool, self._around.storage) as note:
                     manifest = await asyncio.to_thread(self._workspace.store_results)
-                    async with self._attempt.pool.connection() as connection:
-                        await note.confirm(connection, {file.sha256 for file in manifest.files})
-                        return await asyncio.to_thread(self._workspace.publish, manifest)
+                    contents = {file.sha256 for file in manifest.files}
+                    await note.look(contents)
+                    results = await asyncio.to_thread(self._workspace.publish, manifest)
+                    try:
+                        # The manifest names them for whoever collects; nobody did before it was there.
+                        await note.look(contents)
+                    except StorageUnavailable:
+                        await asyncio.to_thread(self._workspace.withdraw)
+                        raise
+                    return results
             except DATABASE_ERRORS as error:
                 await self._pause(error)
+
+    async def _withdraw(self) -> None:
+        """Nothing names results any more that are not wanted, so that they are collected."""
+        try:
+            await asyncio.to_thread(self._workspace.withdraw)
+        except StorageError as error:
+            logger.warning("the results of job %s stay in the store: %s", self._job.id, error)
 
     async def _with_partial_results(self, say: Callable[[list[Result], Note], Awaitable[None]]) -> None:
         """Store what a program has finished and say so."""
@@ -178,10 +207,16 @@ class Verdicts:
         """What ``say`` brings; it is given longer each time, or a slow database would never be told."""
         settings = self._around.settings
         seconds = settings.heartbeat_seconds
+        contradicted = 0
         while True:
             try:
                 async with asyncio.timeout(seconds):
                     return await say()
+            except psycopg.IntegrityError as error:  # something was deleted at the same moment
+                contradicted += 1
+                if contradicted > CONTRADICTIONS:
+                    raise
+                await self._pause(error)
             except DATABASE_ERRORS as error:
                 await self._pause(error)
                 seconds = max(seconds, min(2 * seconds, settings.stale_seconds / 3))

@@ -226,6 +226,11 @@ class Workspace:
             raise StorageError("Another result was published for this attempt; ask for a retry.")
         return _results(manifest)
 
+    def withdraw(self) -> None:
+        """Take back the manifests of this attempt, and of those before it that it would begin with."""
+        for attempt in range(self._job.attempt, self._job.fresh_after, -1):
+            self.storage.withdraw(_document(self._job, attempt))
+
     def store_partial_results(self) -> list[Result]:
         """Store what results there are of a program that failed; its job's row shows them, nothing else."""
         folder = self.folder / RESULTS

@@ -18,10 +18,12 @@ _SHOWN = 50
 )
 @click.option("--verify", is_flag=True, help="Read every content and compare its digest; takes long.")
 @click.option("--json", "as_json", is_flag=True, help="Write the report as JSON, whole.")
-def fsck(data: Path | None, verify: bool, as_json: bool) -> None:
+@click.option("--recount", is_flag=True, help="Count anew what each owner stores; uploads wait meanwhile.")
+def fsck(data: Path | None, verify: bool, as_json: bool, recount: bool) -> None:
     """Report contents that the tables name but the store lacks or has damaged, and contents nothing names.
 
-    Changes nothing. The exit code is 1 if something that is needed is missing or damaged.
+    Changes nothing but, with --recount, the numbers of bytes that quotas are checked against. The exit code
+    is 1 if something that is needed is missing or damaged.
     """
     import dataclasses
     import json
@@ -29,6 +31,9 @@ def fsck(data: Path | None, verify: bool, as_json: bool) -> None:
     from octasplat.workers.settings import WorkerSettings, load_settings
 
     settings = load_settings(WorkerSettings, data=data)
+    if recount:
+        for line in _recount(settings):
+            click.echo(line, err=as_json)
     report = _report(settings, verify)
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(report), indent=2))
@@ -72,6 +77,22 @@ def _report(settings: "WorkerSettings", verify: bool) -> "Report":
     conninfo = settings.conninfo()
     storage = open_storage(settings.storage_address, floor_bytes=0)
     return compare(storage, asyncio.run(_references(conninfo)), verify=verify)
+
+
+def _recount(settings: "WorkerSettings") -> list[str]:
+    import asyncio
+
+    from octasplat.workers.records.database import open_pool
+    from octasplat.workers.records.quotas import recount
+
+    async def count() -> list[str]:
+        async with open_pool(settings.conninfo(), max_size=1) as pool, pool.connection() as connection:
+            return [
+                f"{found.owner}: {found.bytes_before} bytes were counted; {found.bytes} it is."
+                for found in await recount(connection)
+            ]
+
+    return asyncio.run(count())
 
 
 async def _references(conninfo: str) -> "list[Reference]":

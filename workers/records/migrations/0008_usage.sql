@@ -16,6 +16,8 @@ CREATE TABLE owner_usage (
     PRIMARY KEY (owner, part)
 );
 
+-- Nobody writes while it is counted, or what they write would be missed for ever.
+LOCK TABLE jobs, datasets, dataset_files, artifacts IN SHARE ROW EXCLUSIVE MODE;
 INSERT INTO owner_contents (owner, sha256, size_bytes, places)
 SELECT owner, sha256, max(size_bytes), count(*) FROM (
     SELECT d.owner, f.sha256, f.size_bytes FROM dataset_files f JOIN datasets d ON d.id = f.dataset_id

@@ -2,6 +2,10 @@
 
 import asyncio
 import socket
+import threading
+from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import httpx
 
@@ -12,6 +16,12 @@ from octasplat.workers.upkeep.webhooks.addresses import (
     is_public,
     read_address,
 )
+
+LOOK_UPS_AT_ONCE, LOOK_UPS_OF_ONE_OWNER = 40, 5
+OWNER = "octasplat_owner"
+"""Extension of a request that says for whose message a host is looked up."""
+_LOOK_UPS = ThreadPoolExecutor(LOOK_UPS_AT_ONCE, "look_up")
+"""Threads of their own: a name server that does not answer holds one for half a minute, and nobody else."""
 
 
 class GuardedTransport(httpx.AsyncBaseTransport):
@@ -29,6 +39,8 @@ class GuardedTransport(httpx.AsyncBaseTransport):
     def __init__(self, allowed_hosts: tuple[str, ...], inner: httpx.AsyncBaseTransport) -> None:
         self._allowed_hosts = allowed_hosts
         self._inner = inner
+        self._looking: Counter[str] = Counter()
+        self._counting = threading.Lock()
 
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
         """Send a request.
@@ -39,7 +51,7 @@ class GuardedTransport(httpx.AsyncBaseTransport):
         """
         host = request.url.raw_host.decode("ascii")
         port = request.url.port or (443 if request.url.scheme == "https" else 80)
-        addresses = await self._judged(host, port)
+        addresses = await self._judged(host, port, str(request.extensions.get(OWNER, "")))
         for left, address in enumerate(addresses, start=1 - len(addresses)):
             numeric = httpx.Request(
                 request.method,
@@ -59,13 +71,30 @@ class GuardedTransport(httpx.AsyncBaseTransport):
         """Close the connections."""
         await self._inner.aclose()
 
-    async def _judged(self, host: str, port: int) -> list[IPAddress]:
+    async def _judged(self, host: str, port: int, owner: str) -> list[IPAddress]:
         """The addresses of a host, all of them fit to connect to."""
         try:
-            found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            found = await asyncio.wrap_future(self._look_up(host, port, owner))
         except (OSError, UnicodeError) as error:
             raise httpx.ConnectError("The host has no address.") from error
         addresses = list(dict.fromkeys(read_address(str(sockaddr[0])) for *_, sockaddr in found))
         if not is_allowed(host, self._allowed_hosts) and not all(map(is_public, addresses)):
             raise AddressRefused("The address leads into a network that messages are not sent to.")
         return addresses
+
+    def _look_up(self, host: str, port: int, owner: str) -> "Future[list[Any]]":
+        """Look a host up in a thread, which counts until it ends, also where nobody waits for it any more."""
+        with self._counting:
+            if self._looking[owner] >= LOOK_UPS_OF_ONE_OWNER:
+                raise OSError("Too many hosts of one owner are being looked up.")
+            self._looking[owner] += 1
+
+        def ended(_future: object) -> None:
+            with self._counting:
+                self._looking[owner] -= 1
+                if not self._looking[owner]:
+                    del self._looking[owner]
+
+        future: Future[list[Any]] = _LOOK_UPS.submit(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
+        future.add_done_callback(ended)
+        return future

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from psycopg.rows import class_row
 
-from octasplat.workers.records.database import Connection
+from octasplat.workers.records.database import Connection, naming
 from octasplat.workers.upkeep.webhooks.rows import Delivery, Endpoint, get_endpoint
 
 LEASE_SECONDS = 60
@@ -13,6 +13,8 @@ LEASE_SECONDS = 60
 WAITS_SECONDS = (5, 60, 300, 1800, 7200, 14_400, 28_800, 33_000)
 """Between the tries; 23.7 hours in all, to which up to a tenth is added by chance."""
 KEPT_DAYS = 30
+PAUSED_DAYS = 3
+"""After so long nobody wants to hear what happened while a webhook was paused."""
 NOTHING: Mapping[str, int] = {}
 
 
@@ -51,7 +53,8 @@ async def take_due(
     """
     async with connection.transaction(), connection.cursor(row_factory=class_row(Delivery)) as cursor:
         await cursor.execute(
-            """
+            naming(
+                """
             WITH ranked AS (
                 SELECT deliveries.id, endpoints.owner,
                     row_number() OVER (PARTITION BY endpoints.owner ORDER BY deliveries.due_at) AS place
@@ -68,8 +71,11 @@ async def take_due(
             )
             UPDATE webhook_deliveries SET tries = tries + 1, tried_at = now(),
                 due_at = now() + make_interval(secs => %(lease)s)
-            FROM due WHERE webhook_deliveries.id = due.id RETURNING webhook_deliveries.*
+            FROM due WHERE webhook_deliveries.id = due.id RETURNING {}
             """,
+                Delivery,
+                "webhook_deliveries",
+            ),
             {
                 "limit": limit,
                 "lease": LEASE_SECONDS,
@@ -90,6 +96,9 @@ async def settle(connection: Connection, delivery: Delivery, outcome: Outcome) -
     wait = WAITS_SECONDS[delivery.failures] if delivery.failures < len(WAITS_SECONDS) else None
     again = wait is not None and not outcome.is_gone
     async with connection.transaction():
+        if outcome.is_gone:  # its row before those of its messages, as where it is deleted
+            query = "SELECT id FROM webhook_endpoints WHERE id = %s FOR UPDATE"
+            await connection.execute(query, [delivery.endpoint_id])
         cursor = await connection.execute(
             """
             UPDATE webhook_deliveries SET status = %(status)s, error = %(error)s,
@@ -124,7 +133,16 @@ async def settle(connection: Connection, delivery: Delivery, outcome: Outcome) -
 
 
 async def forget_old(connection: Connection) -> None:
-    """Forget messages that were settled long ago."""
+    """Forget messages that were settled long ago; give up those that wait too long for a paused webhook."""
+    await connection.execute(
+        """
+        UPDATE webhook_deliveries SET state = 'failed', error = 'The webhook was paused for too long.'
+        FROM webhook_endpoints endpoints
+        WHERE endpoints.id = endpoint_id AND NOT endpoints.enabled AND state = 'pending'
+          AND due_at < now() - make_interval(days => %s)
+        """,
+        [PAUSED_DAYS],
+    )
     await connection.execute(
         """
         DELETE FROM webhook_deliveries

@@ -7,12 +7,13 @@ from datetime import datetime
 from typing import Any, Literal
 
 from psycopg.rows import class_row
-from psycopg.types.json import Jsonb
 
 from octasplat.engine.errors import OctasplatError
 from octasplat.workers.records.database import Connection, naming
 from octasplat.workers.records.errors import Missing
 from octasplat.workers.records.ids import new_id
+from octasplat.workers.records.locks import lock_owner
+from octasplat.workers.records.texts import as_json
 
 EventName = Literal[
     "job.queued", "job.running", "job.canceling", "job.succeeded", "job.failed", "job.canceled"
@@ -104,9 +105,7 @@ async def add_endpoint(
         TooManyEndpoints: the owner has enough.
     """
     async with connection.transaction(), connection.cursor(row_factory=class_row(Endpoint)) as cursor:
-        await connection.execute(
-            "SELECT pg_advisory_xact_lock(hashtext('octasplat webhooks'), hashtext(%s))", [owner]
-        )
+        await lock_owner(connection, owner)
         count = await connection.execute(
             "SELECT count(*) AS n FROM webhook_endpoints WHERE owner = %s AND job_id IS NOT DISTINCT FROM %s",
             [owner, job_id],
@@ -226,7 +225,7 @@ async def add_delivery(
             """,
                 Delivery,
             ),
-            {"endpoint": endpoint_id, "kind": kind, "data": Jsonb(data)},
+            {"endpoint": endpoint_id, "kind": kind, "data": as_json(data)},
         )
         delivery = await cursor.fetchone()
     assert delivery is not None

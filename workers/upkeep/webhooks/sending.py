@@ -12,7 +12,7 @@ from psycopg_pool import PoolTimeout
 from octasplat.workers.ending import end
 from octasplat.workers.records.database import Pool
 from octasplat.workers.upkeep.webhooks.addresses import AddressRefused, check_url
-from octasplat.workers.upkeep.webhooks.guarding import GuardedTransport
+from octasplat.workers.upkeep.webhooks.guarding import OWNER, GuardedTransport
 from octasplat.workers.upkeep.webhooks.outbox import Outcome, settle, take_due
 from octasplat.workers.upkeep.webhooks.rows import Delivery, Endpoint
 from octasplat.workers.upkeep.webhooks.signing import message
@@ -122,7 +122,13 @@ async def send(
         check_url(endpoint.url, allowed_hosts)
         async with (
             asyncio.timeout(TIMEOUT_SECONDS),
-            client.stream("POST", endpoint.url, content=body, headers=headers) as answer,
+            client.stream(
+                "POST",
+                endpoint.url,
+                content=body,
+                headers=headers,
+                extensions={OWNER: endpoint.owner},
+            ) as answer,
         ):
             status = answer.status_code
     except AddressRefused:

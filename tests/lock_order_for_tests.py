@@ -1,0 +1,78 @@
+"""Makes a database refuse locks that are taken in another order than that of ``workers/records/locks.py``.
+
+Functions of the names of Postgres's own stand before these in the search path of the database, so that every
+lock that a process or a trigger takes in a test is seen, whichever code it comes from.
+"""
+
+import psycopg
+from psycopg import sql
+
+_CHECKS = """
+CREATE SCHEMA lock_order;
+CREATE FUNCTION lock_order.holds(first bigint, second bigint, sub integer) RETURNS boolean LANGUAGE sql AS $$
+    SELECT EXISTS (SELECT FROM pg_catalog.pg_locks WHERE pid = pg_catalog.pg_backend_pid()
+        AND locktype = 'advisory' AND granted AND (second IS NULL OR objid = second::oid)
+        AND (first IS NULL OR classid = first::oid) AND objsubid = sub)
+$$;
+CREATE FUNCTION lock_order.check_rows(what text) RETURNS void LANGUAGE plpgsql AS $$
+DECLARE
+    locked text;
+BEGIN
+    SELECT string_agg(DISTINCT relation::regclass::text, ', ') INTO locked FROM pg_catalog.pg_locks
+    WHERE pid = pg_catalog.pg_backend_pid() AND locktype = 'relation'
+      AND relation IN ('public.jobs'::regclass, 'public.datasets'::regclass)
+      AND mode IN ('RowShareLock', 'RowExclusiveLock');
+    IF locked IS NOT NULL THEN
+        RAISE EXCEPTION 'order of locks: % is waited for while rows of % are locked', what, locked;
+    END IF;
+END;
+$$;
+CREATE FUNCTION lock_order.pg_advisory_xact_lock(first integer, second integer) RETURNS void
+LANGUAGE plpgsql AS $$
+BEGIN
+    IF NOT lock_order.holds(first, second & 4294967295, 2) THEN
+        PERFORM lock_order.check_rows('the lock of an owner');
+    END IF;
+    PERFORM pg_catalog.pg_advisory_xact_lock(first, second);
+END;
+$$;
+CREATE FUNCTION lock_order.pg_advisory_xact_lock(key bigint) RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    PERFORM lock_order.check_store();
+    PERFORM pg_catalog.pg_advisory_xact_lock(key);
+END;
+$$;
+CREATE FUNCTION lock_order.pg_advisory_xact_lock_shared(key bigint) RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    PERFORM lock_order.check_store();
+    PERFORM pg_catalog.pg_advisory_xact_lock_shared(key);
+END;
+$$;
+CREATE FUNCTION lock_order.check_store() RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    PERFORM lock_order.check_rows('the lock of the store');
+    IF lock_order.holds(NULL, NULL, 2) THEN
+        RAISE EXCEPTION 'order of locks: the lock of the store is waited for while an owner''s is held';
+    END IF;
+END;
+$$;
+"""
+
+
+def install(conninfo: str) -> None:
+    """Put the checks into a database; connections that are made later have them."""
+    with psycopg.connect(conninfo, autocommit=True) as connection:
+        connection.execute(_CHECKS)
+        name = sql.Identifier(connection.info.dbname)
+        path = "public, lock_order, pg_catalog"  # where tables are made comes first
+        connection.execute(
+            sql.SQL("ALTER DATABASE {} SET search_path = " + path).format(name)  # type: ignore[arg-type]
+        )
+
+
+def uninstall(conninfo: str) -> None:
+    """Leave a database without them, for versions that keep to no order."""
+    with psycopg.connect(conninfo, autocommit=True) as connection:
+        name = sql.Identifier(connection.info.dbname)
+        connection.execute(sql.SQL("ALTER DATABASE {} RESET search_path").format(name))
+        connection.execute("DROP SCHEMA lock_order CASCADE")

@@ -1,0 +1,257 @@
+"""One job's trouble, or that of the machine around it, stays where it is."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import pytest
+
+from octasplat.workers.queue.attempts import Attempt, Result, claim
+from octasplat.workers.queue.jobs import NewJob, create_job, get_job
+from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
+from octasplat.workers.queue.storing import mark, marking, storing, unmark
+from octasplat.workers.records.database import Pool, open_pool, tried_again
+from octasplat.workers.records.datasets import begin_check, create_dataset, get_dataset, open_lost_checks
+from octasplat.workers.records.journal import events_after, log_after
+from octasplat.workers.records.locks import lock_owner, lock_store
+from octasplat.workers.records.rows import Job
+from octasplat.workers.store.errors import StorageUnavailable
+from octasplat.workers.store.local import LocalStorage
+from octasplat.workers.upkeep.webhooks.rows import add_endpoint, delete_endpoint
+
+NEW = NewJob(owner="me", kind="toy", options={}, queue="cpu")
+SLIPS = ProcrastinateSlips(stale_seconds=5)
+SOON_SECONDS = 5.0
+"""What waits for nobody takes less, also on a busy machine."""
+
+
+def run(conninfo: str, what: Callable[[Pool], Awaitable[Any]]) -> Any:
+    async def inside() -> Any:
+        async with open_pool(conninfo, max_size=6) as pool:
+            return await what(pool)
+
+    return asyncio.run(inside())
+
+
+async def begun(pool: Pool, job: Job | None = None) -> Attempt:
+    if job is None:
+        async with pool.connection() as connection:
+            job = await create_job(connection, SLIPS, NEW)
+    assert job.slip is not None
+    attempt = await claim(pool, job.id, job.slip, "w")
+    assert attempt is not None
+    return attempt
+
+
+async def now(pool: Pool, attempt: Attempt) -> Job:
+    async with pool.connection() as connection:
+        job = await get_job(connection, attempt.job.id)
+    assert job is not None
+    return job
+
+
+def test_whatever_a_job_says_is_written_down(conninfo: str) -> None:
+    odd = "header \0 and \ud800"
+
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        await attempt.tell("warning", {"message": odd, "value": float("nan")})
+        await attempt.log([odd])
+        await attempt.keep_checkpoint({"stage": odd, "step": 1, "files": []}, advances=True)
+        await attempt.fail({"type": "odd", "message": odd})
+        job = await now(pool, attempt)
+        assert job.state == "failed" and job.error is not None
+        assert job.error["message"] == "header \ufffd and \ufffd"
+        async with pool.connection() as connection:
+            told = {event.kind: event.data for event in await events_after(connection, job.id)}
+            lines = [line.text for line in await log_after(connection, job.id)]
+        assert told["warning"] == {"message": "header \ufffd and \ufffd", "value": None}
+        assert "header \ufffd and \ufffd" in lines
+
+    run(conninfo, what)
+
+
+def test_a_job_over_which_workers_fail_again_and_again_comes_to_an_end(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        rescues = []
+        while (job := await now(pool, attempt)).state != "failed":
+            attempt = attempt if job.state == "running" else await begun(pool, job)
+            if len(rescues) == 2:
+                await attempt.hand_back(SLIPS, "its worker is stopping", uncounted=3)
+                attempt = await begun(pool, await now(pool, attempt))
+            await attempt.hand_back(SLIPS, "its worker failed (KeyError)", uncounted=3)
+            rescues.append((await now(pool, attempt)).rescues)
+        assert rescues == [0, 0, 0, 1, 2, 3, 3]
+        assert job.error is not None and job.error["type"] == "worker_failed"
+        assert "its worker failed (KeyError)" in job.error["message"]
+
+    run(conninfo, what)
+
+
+def test_a_checkpoint_forgives_workers_that_failed(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        for step in range(8):
+            await attempt.keep_checkpoint({"stage": "x", "step": step, "files": []}, advances=True)
+            await attempt.hand_back(SLIPS, "its worker failed (KeyError)", uncounted=3)
+            job = await now(pool, attempt)
+            assert job.rescues == 0
+            attempt = await begun(pool, job)
+
+    run(conninfo, what)
+
+
+def test_a_jump_of_the_clock_takes_no_job_away(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        living, lost = await begun(pool), await begun(pool)
+        async with pool.connection() as connection:  # as by a clock that jumped
+            await connection.execute("UPDATE jobs SET heartbeat_at = heartbeat_at - interval '1 hour'")
+        suspects = Suspects(0.3)
+        assert await rescue_lost_jobs(pool, SLIPS, 5, suspects) == 0
+        await living.beat()
+        await asyncio.sleep(0.4)
+        assert await rescue_lost_jobs(pool, SLIPS, 5, suspects) == 1
+        assert [(await now(pool, a)).state for a in (living, lost)] == ["running", "queued"]
+
+    run(conninfo, what)
+
+
+@pytest.mark.parametrize("lock", ["owner", "store"])
+def test_heartbeats_wait_for_no_other_lock(conninfo: str, tmp_path: Path, lock: str) -> None:
+    """An owner's archive is being entered, or unused contents are being marked, for a long time."""
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+    with storage.begin() as writer:
+        writer.write(b"x")
+        blob = writer.commit()
+    manifest = {"stage": "x", "step": 1, "files": [{"path": "a", "sha256": blob.sha256, "size_bytes": 1}]}
+
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        async with storing(pool, storage) as note, pool.connection() as connection:
+            if lock == "owner":
+                await lock_owner(connection, "me")
+            else:
+                await lock_store(connection, shared=False)
+            keeping = asyncio.create_task(attempt.keep_checkpoint(manifest, advances=True, note=note))
+            ending = asyncio.create_task(
+                attempt.fail({"type": "x", "message": "x"}, [Result("a", blob.sha256, 1, "")], note)
+            )
+            await asyncio.sleep(0.5)
+            assert not keeping.done() and not ending.done()
+            async with asyncio.timeout(SOON_SECONDS):
+                assert await attempt.beat() == "running"
+            await connection.rollback()
+            await asyncio.wait([keeping, ending])
+        assert (await now(pool, attempt)).state == "failed"
+
+    run(conninfo, what)
+
+
+def test_contents_that_are_being_removed_are_waited_for_without_a_lock(conninfo: str, tmp_path: Path) -> None:
+    storage = LocalStorage(tmp_path / "store", floor_bytes=0)
+
+    def stored(content: bytes) -> str:
+        with storage.begin() as writer:
+            writer.write(content)
+            return writer.commit().sha256
+
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        async with storing(pool, storage) as note, pool.connection() as connection:
+            kept, gone = stored(b"kept"), stored(b"gone")
+            async with marking(connection):
+                await mark(connection, [kept, gone])
+            tellings = [
+                asyncio.create_task(attempt.keep_preview({"sha256": sha256, "step": 1, "view": "a"}, note))
+                for sha256 in (kept, gone)
+            ]
+            await asyncio.sleep(0.5)
+            assert not any(telling.done() for telling in tellings)
+            async with asyncio.timeout(SOON_SECONDS):
+                await attempt.beat()
+            storage.delete(gone)
+            async with connection.transaction():
+                await unmark(connection, [kept, gone])
+            await tellings[0]
+            with pytest.raises(StorageUnavailable, match="removed meanwhile"):
+                await tellings[1]
+
+    run(conninfo, what)
+
+
+def test_a_webhook_may_be_deleted_while_a_job_ends(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        async with pool.connection() as connection:
+            hook = await add_endpoint(
+                connection, owner="me", url="https://example.org", secret="s", events=["job.failed"]
+            )
+        async with pool.connection() as connection:
+            await delete_endpoint(connection, hook.id)
+            ending = asyncio.create_task(attempt.fail({"type": "x", "message": "x"}))
+            await asyncio.sleep(0.5)
+            assert not ending.done()
+            await connection.commit()
+            await ending
+        assert (await now(pool, attempt)).state == "failed"
+
+    run(conninfo, what)
+
+
+def test_a_transaction_that_lost_to_another_is_tried_again(conninfo: str) -> None:
+    """Two that lock the same rows in different orders; the database ends one of them."""
+
+    async def what(pool: Pool) -> None:
+        ids = [(await begun(pool)).job.id for _ in range(2)]
+        both = asyncio.Barrier(2)
+        tries = 0
+
+        @tried_again
+        async def lock(first: int, second: int) -> None:
+            nonlocal tries
+            tries += 1
+            async with pool.connection() as connection, connection.transaction():
+                await get_job(connection, ids[first], lock=True)
+                if tries <= 2:
+                    await both.wait()
+                await get_job(connection, ids[second], lock=True)
+
+        await asyncio.gather(lock(0, 1), lock(1, 0))
+        assert tries == 3
+
+    run(conninfo, what)
+
+
+def test_the_order_of_locks_is_checked_here(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        for lock in (lambda c: lock_owner(c, "me"), lambda c: lock_store(c, shared=True)):
+            with pytest.raises(psycopg.errors.RaiseException, match="order of locks"):
+                async with pool.connection() as connection:
+                    await get_job(connection, attempt.job.id, lock=True)
+                    await lock(connection)
+        with pytest.raises(psycopg.errors.RaiseException, match="order of locks"):
+            async with pool.connection() as connection:
+                await lock_owner(connection, "me")
+                await lock_store(connection, shared=False)
+
+    run(conninfo, what)
+
+
+def test_a_check_that_nobody_goes_on_with_is_opened(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        async with pool.connection() as connection:
+            ids = [(await create_dataset(connection, "me", "d")).id for _ in range(2)]
+            for dataset_id in ids:
+                await begin_check(connection, dataset_id)
+            query = "UPDATE datasets SET used_at = now() - interval '10 minutes' WHERE id = %s"
+            await connection.execute(query, [ids[0]])
+            assert await open_lost_checks(connection) == 1
+            found = [await get_dataset(connection, dataset_id) for dataset_id in ids]
+        assert [dataset.state for dataset in found if dataset] == ["open", "checking"]
+
+    run(conninfo, what)
