@@ -54,7 +54,7 @@ def test_requests_of_one_owner_with_a_quota_do_not_stop_each_other(talk: Callabl
         source = await new_job(http, dataset_id=shared)
         await (await claimed(service, source)).succeed([result(service, b"ply")])
         failed = await new_job(http, dataset_id=shared)
-        export = {"kind": "export", "source_id": source["id"], "options": {}}
+        export = {"kind": "export", "source_id": source["id"], "options": {"files": ["a.glb"]}}
         answers: list[httpx.Response] = []
         for number in range(10):
             await (await claimed(service, failed)).fail({"type": "x", "message": "x"})
@@ -117,7 +117,7 @@ def test_a_job_whose_source_was_deleted_is_not_tried_again(talk: Callable[..., N
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         source = await new_job(http, dataset_id=await committed_dataset(service))
         await (await claimed(service, source)).succeed([result(service, b"ply")])
-        job = await new_job(http, kind="export", source_id=source["id"], options={})
+        job = await new_job(http, kind="export", source_id=source["id"], options={"files": ["a.glb"]})
         await (await claimed(service, job)).fail({"type": "x", "message": "x"})
         assert (await http.delete(f"/v1/jobs/{source['id']}")).status_code == 204
         answer = await http.post(f"/v1/jobs/{job['id']}/retry", json={})

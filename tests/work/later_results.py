@@ -4,6 +4,6 @@ import toy_kind
 
 from octasplat.engine import versions
 
-versions.RESULTS = 2
+versions.RESULTS += 1
 
 __all__ = ["toy_kind"]
