@@ -81,7 +81,7 @@ def test_octagons_are_lit_where_asked(shiny, octasplat, tmp_path):
     result = octasplat("export", shiny / "plain.ply", tmp_path / "b.glb", "--materials")
     assert result.exit_code == 1 and "plain.ply has no materials" in result.output
     result = octasplat("export", shiny, tmp_path / "b.ply", "--materials")
-    assert result.exit_code == 2 and "--materials is for octagon GLB" in result.output
+    assert result.exit_code == 2 and "--materials is for GLB of octagons" in result.output
     result = octasplat("export", shiny, tmp_path / "b.glb", "--up", "z")
     assert result.exit_code == 2 and "--up goes with --materials" in result.output
     result = octasplat("surface", shiny, "-o", tmp_path / "b.glb", "--up", "z")
