@@ -61,8 +61,14 @@ BASELINE = 0.05
 other things."""
 FOR_ONE, MOST_FOR_ONE = 1.6, 10.0
 """Pixels that show something are drawn for each point; and at the most, with those that show nothing."""
+OWN_SPAN, LEAST_OBSERVED = 4.0, 10
+"""The points are taken to be as far from a view as their middle is, but within this factor of the median
+distance of those that it is known to show, if these are so many: a long capture has its middle anywhere.
+"""
 JURY = 24
-"""Views that vote on each point."""
+"""Views that vote on each point, spread evenly over all, or nearest to its own where few of these look."""
+LEAST_LOOKING = 3
+"""Jurors that must look towards a point."""
 AGREES = 0.12
 """Largest mean difference of colour, in display values, of a view that agrees."""
 MAJORITY = 0.3
@@ -150,7 +156,7 @@ def dense_points(
             parts = list(pool.map(lift, jobs))
             found = LiftedPoints.joined([points for points, _ in parts])
             evidence = Evidence.joined([e for _, e in parts])
-            elected = _elected(photographs, found, pool)
+            elected = _elected(photographs, found, evidence.view, pool)
         found, evidence = found[elected], evidence[elected]
         found = found[~found.swept | borne_out(found, evidence, known)]
         lifted = LiftedPoints.joined([lifted, found])
@@ -173,14 +179,35 @@ def _neighbouring_views(dataset: Dataset, points: Float64[np.ndarray, "n 3"]) ->
     centres = np.stack([dataset.views[i].origin_world for i in train])
     axes = np.stack([dataset.views[i].rotation_cam_from_world[2] for i in train])
     middle = np.median(points, axis=0)
+    own = _observed_distances(dataset)
     result = {}
     for k, index in enumerate(train):
         distance = np.linalg.norm(centres - centres[k], axis=1)
-        wanted = BASELINE * np.linalg.norm(middle - centres[k])
+        reach = float(np.linalg.norm(middle - centres[k]))
+        if own[index] > 0:
+            reach = min(max(reach, own[index] / OWN_SPAN), own[index] * OWN_SPAN)
+        wanted = BASELINE * reach
         usable = (axes @ axes[k] > LEAST_COSINE) & (distance > 0.1 * wanted)
         unfit = np.abs(np.log(np.maximum(distance, 1e-12) / max(wanted, 1e-12)))
         order = np.argsort(np.where(usable, unfit, np.inf), kind="stable")
         result[index] = [train[j] for j in order[:NEIGHBOURS] if usable[j]]
+    return result
+
+
+def _observed_distances(dataset: Dataset) -> Float64[np.ndarray, " v"]:
+    """Return the median distance of the points that each view is known to show; 0 where these are few."""
+    result = np.zeros(len(dataset.views))
+    seen, points = dataset.observations, dataset.points
+    if len(points) == 0 or len(seen) == 0:
+        return result
+    row = np.minimum(np.searchsorted(points.ids, seen.point), len(points) - 1)
+    known = points.ids[row] == seen.point
+    origins = np.stack([view.origin_world for view in dataset.views])
+    away = np.linalg.norm(points.xyz_world[row].astype(np.float64) - origins[seen.view], axis=1)
+    for index in range(len(result)):
+        own = away[known & (seen.view == index)]
+        if len(own) >= LEAST_OBSERVED:
+            result[index] = np.median(own)
     return result
 
 
@@ -329,27 +356,53 @@ def _cost(
 
 
 def _elected(
-    photographs: _Photographs, points: LiftedPoints, pool: ThreadPoolExecutor
+    photographs: _Photographs,
+    points: LiftedPoints,
+    own_view: Int64[np.ndarray, " n"],
+    pool: ThreadPoolExecutor,
 ) -> Bool[np.ndarray, " n"]:
-    """Whether enough of the views that look towards each point show its colour there."""
+    """Return whether enough of the views that look towards each point show its colour there."""
     limits = np.where(points.swept, SWEPT_AGREES, AGREES)
     majority = np.where(points.swept, SWEPT_MAJORITY, MAJORITY)
     agree, looking = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     dataset = photographs.dataset
     train, xyz_world = dataset.train_indices, points.xyz_world.astype(np.float64)
 
-    def vote(index: int) -> tuple[np.ndarray, np.ndarray]:
-        where_px, depth = _project(dataset, index, xyz_world)
+    def vote(juror: tuple[int, np.ndarray | slice]) -> tuple[np.ndarray, np.ndarray]:
+        index, rows = juror
+        where_px, depth = _project(dataset, index, xyz_world[rows])
         inside = np.flatnonzero(_inside(dataset, index, where_px) & (depth > 0))
         pixel = np.floor(where_px[inside]).astype(np.int64)
         rgb, _, _ = photographs.pixels(np.full(len(inside), index), pixel[:, 1], pixel[:, 0])
-        return inside, np.abs(rgb - points.rgb_srgb[inside]).mean(axis=1) < limits[inside]
+        which = inside if isinstance(rows, slice) else rows[inside]
+        return which, np.abs(rgb - points.rgb_srgb[which]).mean(axis=1) < limits[which]
 
     jury = train[np.unique(np.linspace(0, len(train) - 1, JURY).astype(np.int64))].tolist()
-    for inside, agrees in pool.map(vote, jury):
-        looking[inside] += 1
-        agree[inside] += agrees
+    for which, agrees in pool.map(vote, [(index, slice(None)) for index in jury]):
+        looking[which] += 1
+        agree[which] += agrees
+    if len(jury) < len(train):
+        unseen = np.flatnonzero(looking < LEAST_LOOKING)
+        looking[unseen] = agree[unseen] = 0
+        for which, agrees in pool.map(vote, _near_jurors(dataset, own_view, unseen)):
+            looking[which] += 1
+            agree[which] += agrees
     return np.asarray(agree >= majority * np.maximum(looking, 1))
+
+
+def _near_jurors(
+    dataset: Dataset, own_view: Int64[np.ndarray, " n"], rows: Int64[np.ndarray, " k"]
+) -> list[tuple[int, Int64[np.ndarray, "_"]]]:
+    """Return training views and the rows of points that they vote on: those of the nearest other views."""
+    train = dataset.train_indices
+    centres = np.stack([dataset.views[i].origin_world for i in train.tolist()])
+    jurors = []
+    for index in np.unique(own_view[rows]).tolist():
+        away = np.linalg.norm(centres - dataset.views[index].origin_world, axis=1)
+        near = train[np.argsort(away, kind="stable")[: JURY + 1]]
+        mine = rows[own_view[rows] == index]
+        jurors += [(juror, mine) for juror in near.tolist() if juror != index]
+    return jurors
 
 
 def _project(
