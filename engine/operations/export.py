@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
-from octasplat.engine.errors import ExportFailed, SceneFileError
+from octasplat.engine.errors import Cancelled, ExportFailed, SceneFileError
 from octasplat.engine.events import Listener, StageProgress, Warned, ignore
 from octasplat.engine.export_names import ExportName
 from octasplat.engine.fields import Group, Positional, Spelling
@@ -162,7 +162,7 @@ def run(
 ) -> ExportResult:
     """Write a scene in other formats; see :class:`octasplat.engine.operations.base.Run`.
 
-    Tells the steps of a stage ``export``, one for each file.
+    Tells the steps of a stage ``export``, one for each of several files.
 
     Raises:
         ExportFailed: a file could not be written; the others were.
@@ -182,13 +182,15 @@ def run(
     else:
         for text in export_losses(gaussians, list(request.files), request.format):
             progress(Warned(text))
-    forms = _Forms(request, gaussians, lambda: progress(StageProgress("export", 0, count)), progress, threads)
-    files, failed = export_files(
-        request.files,
-        forms.of,
-        on_done=lambda done: progress(StageProgress("export", done, count)),
-        format=request.format,
-    )
+
+    def step(done: int) -> None:
+        if should_stop():
+            raise Cancelled("The export was stopped.")
+        if count > 1:  # one file needs no counting
+            progress(StageProgress("export", done, count))
+
+    forms = _Forms(request, gaussians, lambda: step(0), progress, threads)
+    files, failed = export_files(request.files, forms.of, on_done=step, format=request.format)
     if failed is not None:
         raise ExportFailed(failed)
     return ExportResult(files=files)
