@@ -65,8 +65,7 @@ def reconstruct(
         check_writable(config.exports)
     began = time.perf_counter()
     use_threads(threads)
-    is_made = not output.exists()
-    is_new = claim_output(scene, output, config, resume)
+    is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
     recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
     events = JsonLinesListener(output / EVENTS, hold=recorded is not None)
     tell = broadcast([events, listener])
@@ -78,12 +77,16 @@ def reconstruct(
             run_steps(OPENING, run)
         run_steps(WORK, run)
         run.dataset.release_pages()
-        names = (path.name for path in output.iterdir())
-        outputs = tuple(sorted(name for name in names if name != CACHE and not name.startswith(".")))
-        tell(RunFinished(outputs, time.perf_counter() - began))
+        tell(RunFinished(_results(output), time.perf_counter() - began))
     finally:
         events.close()
     return output
+
+
+def _results(output: Path) -> tuple[str, ...]:
+    """The names of what is in the folder of a run, but for its cache."""
+    names = (path.name for path in output.iterdir())
+    return tuple(sorted(name for name in names if name != CACHE and not name.startswith(".")))
 
 
 def _only_the_same(
