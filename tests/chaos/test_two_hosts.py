@@ -19,6 +19,7 @@ from namespaces import GATEWAY, Host, door, hosts, lacking
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 from worker_bench import ROOT, Bench, alive, child_pids
 
+from octasplat.workers.records.locks import OWNER
 from octasplat.workers.settings import WorkerSettings
 from octasplat.workers.store.opening import open_storage
 
@@ -97,6 +98,7 @@ def dataset(two: Hosts, store: str) -> uuid.UUID:
     storage = open_storage(store)
     made = uuid.uuid4()
     with psycopg.connect(two.bench.conninfo) as connection:
+        connection.execute("SELECT pg_advisory_xact_lock(%s, hashtext('me'))", [OWNER])
         connection.execute(
             "INSERT INTO datasets (id, owner, name, state) VALUES (%s, 'me', 'd', 'committed')", [made]
         )
