@@ -118,7 +118,8 @@ def shiny_run(run, tmp_path_factory) -> Path:
         root / "run" / "scene.ply",
         facts=SceneFacts(turned_beyond=given.train.trace.turned_beyond),
     )
-    write_environment(root / "run" / "environment.hdr", np.full((16, 32, 3), 0.5, np.float32))
+    for name in ("environment.exr", "environment.hdr"):
+        write_environment(root / "run" / name, np.full((16, 32, 3), 0.5, np.float32))
     content = json.loads((root / "run" / "config.json").read_text())
     content["reconstruction"] = given.model_dump(mode="json")
     (root / "run" / "config.json").write_text(json.dumps(content))

@@ -124,7 +124,7 @@ def test_the_one_colour_of_a_format_without_harmonics_is_chosen(run, octasplat, 
         assert all(np.abs(colours["constant"] - colours[name]).max() > 0.01 for name in ("cameras", "0,0,1"))
     for text in ("red", "1,2", "0,0,0"):
         result = octasplat("export", run.output, tmp_path / "x.splat", "--colour", text)
-        assert result.exit_code == 2 and not (tmp_path / "x.splat").exists()
+        assert result.exit_code == 1 and not (tmp_path / "x.splat").exists()
 
 
 def test_for_viewers_puts_a_run_in_the_order_of_its_cameras(run, octasplat, tmp_path):
@@ -140,7 +140,9 @@ def test_for_viewers_puts_a_run_in_the_order_of_its_cameras(run, octasplat, tmp_
     centres = np.stack([seen.views[index].origin_world for index in seen.train_indices])
     order, agreement = common_order(back.means_world, centres)
     in_order = bool((order == np.arange(len(back))).all())
-    assert in_order == (len(document["meshes"]) == 1) == (agreement >= AGREEMENT)
+    assert in_order == (agreement >= AGREEMENT)
+    if in_order:
+        assert len(document["meshes"]) == 1
 
 
 def test_for_viewers_is_for_octagon_glb(run, octasplat, tmp_path):
