@@ -112,7 +112,7 @@ def test_versions_that_give_other_results_are_not_mixed(bench: Bench) -> None:
 def test_the_release_before_works_beside_this_one(
     postgres: EmbeddedPostgres, previous: Path, tmp_path: Path
 ) -> None:
-    """Jobs are taken over in both directions, and the earlier front end answers."""
+    """Jobs go to workers of the version that began them, else begin anew; the earlier front end answers."""
     with copied_database(postgres, "template0") as conninfo:
         bench = Bench(conninfo, tmp_path, stale_seconds=STALE_SECONDS)
         environment = {**os.environ, "DATABASE_URL": conninfo, "PYTHONPATH": str(previous)}
@@ -133,8 +133,8 @@ def test_the_release_before_works_beside_this_one(
             address = front.stdout.readline().decode().strip()  # its tables are there
             old = bench.worker(name="old", root=previous)
             gates = [str(tmp_path / f"gate-{number}") for number in range(3)]
-            to_new = bench.submit(options=bench.held(gate=gates[0]))
-            bench.wait_at_gate(to_new)
+            begun = bench.submit(options=bench.held(gate=gates[0]))
+            bench.wait_at_gate(begun)
             bench.worker(name="old-too", root=previous)
             stays = bench.submit(options=bench.held(gate=gates[1]))
             bench.wait_at_gate(stays)
@@ -143,22 +143,24 @@ def test_the_release_before_works_beside_this_one(
             new = bench.worker(name="new")
             bench.up("new")
             old.kill()
-            bench.wait(to_new, lambda job: job.worker == "new")
-            Path(gates[0]).touch()
-            assert bench.over(to_new).state == "succeeded" and starts(bench, to_new) == [0, 30]
-            with urllib.request.urlopen(f"{address}/v1/jobs/{to_new}", timeout=30) as answer:
-                assert b'"succeeded"' in answer.read()
-
-            to_old = bench.submit(options=bench.held(gate=gates[2]))
-            bench.wait_at_gate(to_old)
-            assert bench.job(to_old).worker == "new"
+            # Results of two versions are not mixed: it waits for the other old worker.
+            handed_back = bench.submit(options=bench.held(gate=gates[2]))
+            bench.wait_at_gate(handed_back)
+            assert bench.job(handed_back).worker == "new"
             Path(gates[1]).touch()
             assert bench.over(stays).worker == "old-too"
+            bench.wait(begun, lambda job: job.worker == "old-too")
+            Path(gates[0]).touch()
+            assert bench.over(begun).state == "succeeded" and starts(bench, begun) == [0, 30]
+            with urllib.request.urlopen(f"{address}/v1/jobs/{begun}", timeout=30) as answer:
+                assert b'"succeeded"' in answer.read()
+
             new.kill()
-            bench.wait(to_old, lambda job: job.worker == "old-too")
+            bench.wait(handed_back, lambda job: job.worker == "old-too")
             Path(gates[2]).touch()
-            done = bench.over(to_old)
-            assert (done.state, starts(bench, to_old)) == ("succeeded", [0, 30])
+            done = bench.over(handed_back)
+            assert (done.state, starts(bench, handed_back)) == ("succeeded", [0])
+            assert "begins anew" in bench.log(handed_back)
         finally:
             front.terminate()
             front.wait(30)
