@@ -8,7 +8,7 @@ from pathlib import Path
 from octasplat.engine.versions import versions
 
 ROOT = Path(__file__).resolve().parent.parent
-HARMLESS = {"pydantic", "jaxtyping", "Jinja2", "pyoidn"}
+HARMLESS = {"pydantic", "pydantic_core", "jaxtyping", "Jinja2", "pyoidn"}
 """Checks of values and types, the layout of the report, the denoiser of stages: no figure comes from them."""
 
 

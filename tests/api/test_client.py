@@ -99,7 +99,7 @@ def test_what_a_service_refuses_is_told(service: Service, photographs: Path) -> 
 
 
 def test_nobody_at_an_address_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("octasplat.workers.client.api.TRIES", 1)
+    monkeypatch.setattr("octasplat.workers.client.api.STRANGER_SECONDS", 0.1)
     with (
         osp.Client("http://127.0.0.1:9", "token") as client,
         pytest.raises(Unreachable, match="octasplat serve"),

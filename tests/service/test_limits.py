@@ -13,6 +13,7 @@ from service_bench import claimed, committed_dataset, running, with_token
 from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import Result
 from octasplat.workers.records.datasets import put_file
+from octasplat.workers.records.locks import lock_owner
 from octasplat.workers.records.workers import see_worker
 
 Conversation = Callable[[httpx.AsyncClient, Service], Awaitable[None]]
@@ -34,6 +35,7 @@ def talk(conninfo: str, tmp_path: Path) -> Callable[..., None]:
 async def photographed_dataset(service: Service, width_px: int, height_px: int, count: int) -> str:
     dataset = await committed_dataset(service)
     async with service.pool.connection() as connection:
+        await lock_owner(connection, "local")
         await connection.execute("UPDATE datasets SET state = 'open' WHERE id = %s", [dataset])
         for number in range(count):
             facts = {"kind": "PNG", "width_px": width_px, "height_px": height_px}

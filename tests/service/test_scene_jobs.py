@@ -22,7 +22,8 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.files.gaussian_ply import read_gaussian_ply
 from octasplat.engine.scene.views_file import ViewsRecord
 from octasplat.workers.cli.main import cli
-from octasplat.workers.client.submission import Derivation, with_named_files
+from octasplat.workers.cli.named_files import with_named_files
+from octasplat.workers.client.submission import Derivation
 
 RUN_FILES = ("scene.ply", "config.json", "held_out.json", "views.json", "training.json")
 CUBE = [(x, y, z) for x in (-9, 9) for y in (-9, 9) for z in (-9, 9)]

@@ -27,6 +27,7 @@ from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generat
 from octasplat.service.state import Service
 from octasplat.workers.cli.main import cli
 from octasplat.workers.queue.attempts import Result
+from octasplat.workers.records.locks import lock_owner
 
 TRIANGLE = b"v 0 0 0\nv .3 0 0\nv 0 -.3 0\nf 1 2 3\n"
 HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 2\n" + bytes([128, 128, 128, 128] * 4)
@@ -50,6 +51,7 @@ async def finished(http: httpx.AsyncClient, service: Service, files: dict[str, b
     dataset = await committed_dataset(service)
     facts = json.dumps({"width_px": 48, "height_px": 36})
     async with service.pool.connection() as connection:
+        await lock_owner(connection, "local")
         for number in range(8):
             await connection.execute(
                 "INSERT INTO dataset_files (dataset_id, path, sha256, size_bytes, facts) "

@@ -54,6 +54,8 @@ def pages(database: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
 def test_every_kind_of_job_has_a_form(pages: Callable[..., tuple[str, str]]) -> None:
     job, new = pages(*RESULTS)
     for kind in job_kinds():
+        if not kind.program.startswith("octasplat."):  # of another test
+            continue
         if kind.name == "relight":
             assert 'id="relight"' in job
         elif kind.needs == "result":

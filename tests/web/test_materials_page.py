@@ -92,5 +92,5 @@ def test_a_result_without_materials_has_none_of_it(
     with urllib.request.urlopen(f"{service.url}/jobs/{plain}", timeout=60) as answer:
         text = answer.read().decode()
     assert "Held-out views" in text
-    for part in ('id="relight"', 'data-kind="material"', "Base colour"):
+    for part in ('id="relight"', 'data-kind="material"', "Base colour, times"):
         assert part not in text

@@ -10,8 +10,6 @@ from octasplat.engine.errors import ConfigError, OctasplatError
 from octasplat.engine.events import Listener, Warned, ignore
 from octasplat.engine.light.companions import companions
 from octasplat.engine.light.stage_file import named_files, read_stage, with_files
-from octasplat.engine.operations import operation, operation_names
-from octasplat.engine.operations.patterns import expanded
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.stages import counted_stage
 from octasplat.workers.client.api import Api
@@ -143,50 +141,6 @@ def with_environments(what: Derivation, maps: Sequence[Path]) -> Derivation:
             raise ConfigError(f"{path}: two environments are called {name}; rename one.")
         files[name] = path
     return replace(what, options={**what.options, "environments": list(files)}, files={**what.files, **files})
-
-
-def with_named_files(what: Derivation, given: Sequence[tuple[str, Path]]) -> Derivation:
-    """The same with files for options that name some, such as ``("meshes", Path("edited.ply"))``.
-
-    An option that takes several gets all that are given for it, and patterns such as ``frames/*.ply`` stand
-    for their matches.
-
-    Raises:
-        ConfigError: a file is not there, or several are given for an option that takes one.
-    """
-    options, files = dict(what.options), dict(what.files)
-    for option in dict.fromkeys(name for name, _ in given):
-        paths = expanded([path for name, path in given if name == option])
-        names = [_sent_name(path, files) for path in paths]
-        if _takes_several(what.kind, option):
-            options[option] = names
-        elif len(names) == 1:
-            options[option] = names[0]
-        else:
-            raise ConfigError(f"{option}: takes one file, and {len(names)} are given.")
-    return replace(what, options=options, files=files)
-
-
-def _sent_name(path: Path, files: dict[str, Path]) -> str:
-    """A name for a file among those that are sent, which it is added to."""
-    if not path.is_file():
-        raise ConfigError(f"{path}: there is no such file.")
-    try:
-        name = check_name(path.name)
-    except NameRefused:
-        name = check_name(f"file_{len(files)}{path.suffix.lower()}")
-    if name in files:
-        name = check_name(f"{len(files)}/{name}")
-    files[name] = path
-    return name
-
-
-def _takes_several(kind: str, option: str) -> bool:
-    """Whether an option of a verb is a list; one of another kind is taken for one that is not."""
-    if kind not in operation_names():
-        return False
-    schema = operation(kind).options.model_json_schema()["properties"].get(option, {})
-    return bool(schema.get("type") == "array")
 
 
 def derive(api: Api, what: Derivation, listener: Listener = ignore) -> dict[str, Any]:

@@ -149,12 +149,12 @@ def derive(
     octasplat derive material last --set set.roughness=0.3 --set where="metallic > 0.5" --wait, or:
     octasplat derive edit last --file meshes=edited.ply, or: octasplat derive import --file file=a.splat
     """
+    from octasplat.workers.cli.named_files import with_named_files
     from octasplat.workers.cli.submitting import derive, submit_and_wait
     from octasplat.workers.client.submission import (
         Derivation,
         with_camera_path,
         with_environments,
-        with_named_files,
         with_stage,
     )
 
