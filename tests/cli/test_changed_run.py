@@ -37,7 +37,13 @@ def test_a_moved_run_shows_its_scene_from_the_same_places(shiny_run, octasplat, 
     assert done.exit_code == 0, done.output
     assert "environment.hdr was turned with the scene" in done.stderr
     kept = {"config.json", "held_out.json", "views.json", "training.json", "events.jsonl", "scene.ply"}
-    assert names(tmp_path / "moved") == {*kept, "environment.hdr", "background.exr", "edits.json"}
+    assert names(tmp_path / "moved") == {
+        *kept,
+        "environment.exr",
+        "environment.hdr",
+        "background.exr",
+        "edits.json",
+    }
     old, new = (read_views(run / "views.json").viewpoints(None) for run in (shiny_run, tmp_path / "moved"))
     assert new.extent == pytest.approx(2 * old.extent)
     for before, after in zip(
