@@ -143,7 +143,7 @@ def _rendered(
             weight,
             alpha if dataset.has_alpha else None,
             shown_layers(image),
-            depth_spread(image.depth, image.depth_median),
+            depth_spread(image.depth, image.depth_median, weight),
         )
 
 

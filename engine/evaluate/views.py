@@ -160,21 +160,26 @@ def measure_view(view: RenderedView) -> MeasuredView:
     return MeasuredView(metrics, flip_map)
 
 
-def depth_spread(depth: Float32[np.ndarray, "h w"], depth_median: Float32[np.ndarray, "h w"]) -> float | None:
+def depth_spread(
+    depth: Float32[np.ndarray, "h w"],
+    depth_median: Float32[np.ndarray, "h w"],
+    weight: Float32[np.ndarray, "h w"] | None = None,
+) -> float | None:
     """Share of the covered pixels that show more than one surface: haze, clouds and strokes at other depths.
 
     Args:
         depth: Expected distances.
         depth_median: Distances at which half of the light is gone, 0 where it never is: not covered.
+        weight: How much each pixel counts; None for all alike.
 
     Returns:
         The share of pixels whose two distances differ by more than a tenth; ``None`` where none is covered.
     """
-    covered = depth_median > 0
+    covered = (depth_median > 0) if weight is None else (depth_median > 0) & (weight > 0)
     if not covered.any():
         return None
     apart = np.abs(depth - depth_median) > SPREAD * depth_median
-    return float(apart[covered].mean())
+    return float(np.average(apart[covered], weights=None if weight is None else weight[covered]))
 
 
 def summarise(views: Iterable[ViewMetrics]) -> Metrics:

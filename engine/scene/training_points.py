@@ -29,7 +29,9 @@ def known_to(
         return np.ones(len(points), np.bool_)
     row = np.minimum(np.searchsorted(points.ids, observations.point), len(points) - 1)
     counted = np.isin(observations.view, views) & (points.ids[row] == observations.point)
-    known = np.bincount(row[counted], minlength=len(points)) >= LEAST_OBSERVATIONS
+    # A track may name a photograph twice, which tells no more than once.
+    once = np.unique(np.stack([row[counted], observations.view[counted]], axis=1), axis=0)
+    known = np.bincount(once[:, 0], minlength=len(points)) >= LEAST_OBSERVATIONS
     return known if known.any() else np.ones(len(points), np.bool_)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, cast
 
+from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener
 from octasplat.notebook import default_listener, table_html
 from octasplat.places import PathLike
@@ -121,10 +122,15 @@ class Client:
             options: of the kind.
 
         Raises:
+            ConfigError: two files have one name.
             ServiceError: the service refuses something.
             Unreachable: nobody answers.
         """
         named = files if isinstance(files, Mapping) else {Path(path).name: path for path in files}
+        if len(named) < len(files):
+            raise ConfigError(
+                "Two of the files have one name; give them as a mapping with names that differ."
+            )
         what = Derivation(
             source.id if isinstance(source, Job) else source,
             kind,

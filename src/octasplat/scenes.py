@@ -1,6 +1,7 @@
 """Scenes in memory: their parameters as arrays, read from and written to files of any format."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -172,6 +173,8 @@ class Scene:
     def camera(self, width: int = 640, height: int = 480, *, fov: float = 50.0) -> "RenderCamera":
         """Return a camera that sees the whole scene; ``fov`` is its angle of view in degrees, down.
 
+        It sees nothing nearer than the scene's file says, as in :func:`octasplat.render` of that file.
+
         >>> import octasplat as osp
         >>> camera = osp.load("scene.ply").camera(width=96, height=64)
         >>> camera.width_px, camera.height_px
@@ -184,6 +187,8 @@ class Scene:
     ) -> tuple["RenderCamera", ...]:
         """Return cameras that go round the scene once, with -y up as in most scenes that COLMAP made.
 
+        They see nothing nearer than the scene's file says.
+
         >>> import octasplat as osp
         >>> len(osp.load("scene.ply").turntable(12))
         12
@@ -191,7 +196,8 @@ class Scene:
         from octasplat.engine.render.jobs import gaussian_turntable, turntable_cameras
 
         table = gaussian_turntable(self.gaussians, fov_y_degrees=fov, aspect=width / height)
-        return turntable_cameras(table, frames, width, height, fov)
+        cameras = turntable_cameras(table, frames, width, height, fov)
+        return tuple(replace(camera, near_world=self.facts.near_world) for camera in cameras)
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -202,16 +208,15 @@ class Scene:
         return f"Scene({len(self):,} Gaussian{plural}, harmonics of degree {self.sh_degree}{more})"
 
     def _repr_html_(self) -> str:
-        low, high = self.means.min(axis=0), self.means.max(axis=0)
+        corners = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else ()
         return table_html(
             "Scene",
             {
                 "Gaussians": f"{len(self):,}",
                 "harmonics": f"degree {self.sh_degree}",
                 "channels": ", ".join(self.channels) or "none",
-                "centres": " to ".join(
-                    " ".join(f"{value:.4g}" for value in corner) for corner in (low, high)
-                ),
+                "centres": " to ".join(" ".join(f"{value:.4g}" for value in corner) for corner in corners)
+                or "none",
             },
         )
 

@@ -99,7 +99,9 @@ class Rays:
         return len(self.directions)
 
     def __getitem__(self, which: Any) -> "Rays":
-        """Return the rays of a slice, a mask or numbers."""
+        """Return the rays of a slice, a mask or numbers; of a single number, one ray."""
+        if isinstance(which, int):
+            which = [which]
         shared = len(self.origins) == 1 and len(self) != 1
         origins = self.origins if shared else self.origins[which]
         return Rays(origins, self.directions[which], self.t_min, self.t_max)

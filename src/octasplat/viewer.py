@@ -86,12 +86,16 @@ def view(
     path = None if isinstance(source, Scene) else Path(source)
     run = path if path is not None and is_run(path) and (path / CONFIG).exists() else None
     folder = tempfile.TemporaryDirectory(prefix="octasplat-view-")
-    ply = Path(folder.name) / "scene.ply"
-    write_gaussian_ply(scene.gaussians, ply, facts=scene.facts)
-    name = "Scene" if path is None else path.resolve().name
-    q = None if run is None else float(Run(run).settings["train"]["trace"]["q"])
-    shown = ShownScene(name, ply, {"views": []} if run is None else _cameras(run), q, background)
-    viewer = Viewer(SceneServer(shown, port), folder)
+    try:
+        ply = Path(folder.name) / "scene.ply"
+        write_gaussian_ply(scene.gaussians, ply, facts=scene.facts)
+        name = "Scene" if path is None else path.resolve().name
+        q = None if run is None else float(Run(run).settings["train"]["trace"]["q"])
+        shown = ShownScene(name, ply, {"views": []} if run is None else _cameras(run), q, background)
+        viewer = Viewer(SceneServer(shown, port), folder)
+    except BaseException:
+        folder.cleanup()
+        raise
     if open_browser:
         webbrowser.open(viewer.url)
     return viewer

@@ -111,3 +111,11 @@ def test_examples_of_the_client_run(service: Service, in_folder: Path) -> None:
     found = {"url": service.url, "token": service.token}
     failed, count = doctest.testmod(octasplat.client, extraglobs=found, optionflags=doctest.ELLIPSIS)
     assert failed == 0 and count > 0
+
+
+def test_files_of_one_name_are_refused() -> None:
+    with (
+        osp.Client("http://127.0.0.1:9", "token") as client,
+        pytest.raises(osp.OctasplatError, match="one name"),
+    ):
+        client.derive("job", "relight", files=["a/sky.hdr", "b/sky.hdr"])

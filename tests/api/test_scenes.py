@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import octasplat as osp
+from octasplat.engine.gaussians.scene_facts import SceneFacts
 
 
 def test_arrays_are_views_of_the_scene(scene_file: Path) -> None:
@@ -77,3 +79,23 @@ def test_saved_pictures_are_read_back(scene_file: Path, tmp_path: Path) -> None:
     found = read_image(image.save(tmp_path / "a.png"))
     np.testing.assert_allclose(found[..., :3], image.rgb, atol=0.5 / 255 + 1e-6)
     assert image.save(tmp_path / "a.exr").stat().st_size > 0
+
+
+def test_cameras_of_a_scene_see_what_the_command_shows(scene_file: Path, tmp_path: Path) -> None:
+    whole = osp.load(scene_file)
+    away = float(np.linalg.norm(whole.camera().centre_world))  # the ball has its middle at the origin
+    scene = osp.Scene(whole.gaussians, SceneFacts(near_world=away))
+    osp.save(scene, tmp_path / "cut.ply")
+    options = {"mode": "turntable", "frames": 1, "width_px": 48, "height_px": 36}
+    osp.render(tmp_path / "cut.ply", tmp_path / "frames", **options)
+    (frame,) = (tmp_path / "frames").rglob("*.png")
+    shown = np.asarray(Image.open(frame).convert("RGB")) / 255
+    loaded = osp.load(tmp_path / "cut.ply")
+    np.testing.assert_allclose(osp.render(loaded, loaded.turntable(1, 48, 36)[0]).rgb, shown, atol=0.6 / 255)
+    assert loaded.camera().near_world == pytest.approx(away)
+
+
+def test_a_scene_of_nothing_has_a_page(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    nothing = scene.select(scene.opacities > 2)
+    assert len(nothing) == 0 and "harmonics" in nothing._repr_html_()

@@ -150,3 +150,12 @@ def test_camera_moves_to_where_the_picture_was_taken() -> None:
         ((seen.rgb - target) ** 2).mean().backward()
         optimizer.step()
     assert shift.detach().norm() < 0.01
+
+
+def test_one_ray_is_taken_by_its_number() -> None:
+    scene = osp.Scene(make_cloud(np.random.default_rng(3), 40))
+    rays = osp.Rays.of(scene.camera(12, 8))
+    everything = osp.trace(scene, rays)
+    for number in (45, -1):
+        assert rays[number].directions.shape == (1, 3)
+        torch.testing.assert_close(osp.trace(scene, rays[number]).rgb[0], everything.rgb[number])

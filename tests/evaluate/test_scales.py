@@ -73,3 +73,10 @@ def test_depths_spread_where_there_is_more_than_a_surface() -> None:
     mean = np.array([[2.1, 1.7, 2.0, 0.4]], np.float32)
     assert depth_spread(mean, median) == pytest.approx(1 / 3)
     assert depth_spread(mean, np.zeros_like(median)) is None
+
+
+def test_depths_under_a_mask_do_not_count() -> None:
+    mean, median = np.float32([[1, 2, 3, 9]]), np.float32([[1, 1, 3, 0]])
+    assert depth_spread(mean, median, np.float32([[1, 0, 1, 1]])) == 0
+    assert depth_spread(mean, median, np.float32([[1, 1, 0, 1]])) == pytest.approx(1 / 2)
+    assert depth_spread(mean, median, np.float32([[0, 0, 0, 1]])) is None

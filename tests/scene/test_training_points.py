@@ -8,6 +8,8 @@ import pycolmap
 import pytest
 
 from octasplat.engine.scene import Dataset
+from octasplat.engine.scene.model import Observations, SparsePoints
+from octasplat.engine.scene.training_points import known_to
 
 SPACING, AWAY, VIEWS = 5.0, 2.0, 60
 
@@ -56,3 +58,13 @@ def test_the_near_distance_of_a_long_path_stays_before_the_wall(wall: Path, tmp_
     assert dataset.near_world == pytest.approx(0.25 * AWAY, rel=0.15)
     short = Dataset.open(wall, tmp_path / "cache", near=1e-4)
     assert short.near_world == 1e-4 * short.extent
+
+
+def test_a_photograph_that_a_track_names_twice_counts_once() -> None:
+    nothing = np.zeros((2, 3), np.float32)
+    points = SparsePoints(
+        nothing, nothing, np.full(2, 3, np.int32), np.zeros(2, np.float32), np.array([4, 7])
+    )
+    views, ids = np.array([0, 0, 5, 0, 1]), np.array([4, 4, 4, 7, 7])  # view 5 is held out
+    known = known_to(np.array([0, 1]), points, Observations(views, ids, np.zeros((5, 2))))
+    assert known.tolist() == [False, True]

@@ -1,7 +1,10 @@
 """The viewer of one scene without the service."""
 
+import errno
 import http.client
 import json
+import socket
+import tempfile
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -77,3 +80,14 @@ def test_browser_draws_the_scene(viewer: osp.Viewer, browse: Browse) -> None:
     found = browse("scene", viewer.url)
     assert found["heading"] == "Scene" and found["count"] == "400 Gaussians"
     assert found["complaints"] == [] and found["shown"]["deviation"] > 2
+
+
+def test_a_port_that_is_taken_leaves_no_folder(
+    scene: osp.Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        with pytest.raises(OSError, match="in use") as failure:  # holds the frames, and the folder with them
+            osp.view(scene, open_browser=False, port=other.getsockname()[1])
+        assert failure.value.errno == errno.EADDRINUSE
+        assert not list(tmp_path.glob("octasplat-view-*"))
