@@ -4,10 +4,10 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from small_run import RUN_OPTIONS
 
 import octasplat as osp
 from octasplat.engine.files.gaussian_ply import write_gaussian_ply
@@ -18,15 +18,6 @@ from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.scene.generated import GeneratedSceneConfig, write_generated_scene
 
 COUNT = 1200
-RUN_OPTIONS: dict[str, Any] = {
-    "preset": "fast",
-    "iterations": 60,
-    "rays": 512,
-    "sh_degree": 0,
-    "max_gaussians": 300,
-    "train": {"initial_points": 300},
-    "exports": ["mesh.ply"],
-}
 
 
 def small_scene() -> FlatGaussians:

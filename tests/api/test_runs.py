@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_run import RUN_OPTIONS
 
 import octasplat as osp
-from conftest import RUN_OPTIONS
 from octasplat.engine.events import Event, StageFinished, TrainingProgress
 
 
