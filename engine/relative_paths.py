@@ -1,5 +1,6 @@
-"""Names in files from elsewhere that become paths: they may lead nowhere but below a folder."""
+"""Names in files from elsewhere: paths that stay below a folder, in one spelling of umlauts."""
 
+import unicodedata
 from pathlib import PurePosixPath, PureWindowsPath
 
 
@@ -18,3 +19,8 @@ def checked_relative(name: str) -> str:
     if not name or not any(path.name for path in paths) or climbs or elsewhere or "\0" in name:
         raise ValueError(f"{name[:60]!r} is no path below the folder of the file")
     return name
+
+
+def normalised(name: str) -> str:
+    """Return a file name in the one spelling (NFC) in which names from two machines are compared."""
+    return unicodedata.normalize("NFC", name)

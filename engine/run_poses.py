@@ -8,8 +8,10 @@ from octasplat.engine.errors import DatasetError, PosesCrashed
 from octasplat.engine.events import Listener, StageProgress, Warned
 from octasplat.engine.poses import Given, adjust_lenses, find_poses, lens_is_in_doubt, place_doubtful
 from octasplat.engine.poses.find import read_record
+from octasplat.engine.poses.photographs import photographs_in
+from octasplat.engine.poses.readable import refuse_damaged
 from octasplat.engine.run_folder import POSES, found_model
-from octasplat.engine.scene import Dataset
+from octasplat.engine.scene import Dataset, split_views
 from octasplat.engine.scene.colmap import find_model_folder, has_model
 from octasplat.engine.scene.load import photograph_folder
 from octasplat.engine.stages import stage
@@ -40,9 +42,22 @@ def find_missing_poses(
         return
     if not scene.is_dir():
         raise DatasetError(f"{scene} is not a folder; name the folder that holds the photographs.")
-    find_poses(
-        photograph_folder(scene), output / POSES, threads=threads, listener=tell, should_stop=should_stop
-    )
+    folder = photograph_folder(scene)
+    if not (output / POSES).is_dir():
+        _refuse_before_search(scene, folder, config, threads)
+    find_poses(folder, output / POSES, threads=threads, listener=tell, should_stop=should_stop)
+
+
+def _refuse_before_search(scene: Path, folder: Path, config: ReconstructionConfig, threads: int) -> None:
+    """Refuse photographs and settings that the dataset would refuse after the search, which takes long."""
+    names = photographs_in(folder)
+    split_views(names, config.test_every, config.held_out, where="photographs")
+    if config.masks == "alpha" and not (scene / "masks").is_dir():
+        raise DatasetError(
+            f"Masks are to be the alpha, but there is no folder {scene / 'masks'}; put them there (as "
+            f"{names[0]}.png) or leave --masks alpha out."
+        )
+    refuse_damaged(folder, names, threads=threads)
 
 
 def place_misfits(

@@ -16,6 +16,7 @@ from octasplat.engine.light.stage_scene import StageScene
 from octasplat.engine.operations.axes import axis_named
 from octasplat.engine.operations.pictures import PictureRequest
 from octasplat.engine.operations.scenes import open_scene
+from octasplat.engine.relative_paths import normalised
 from octasplat.engine.render.cameras import RenderCamera
 from octasplat.engine.render.jobs import Shot, gaussian_turntable, view_shots
 from octasplat.engine.render.orbit import (
@@ -157,12 +158,14 @@ def requested_views(request: PictureRequest, source: RenderSource) -> tuple[Shot
     if viewpoints is None:
         raise ConfigError(f"{request.source}: a file has no photographs; choose a turntable, or cameras.")
     if request.photographs is not None:
-        numbers = {view.name: number for number, view in enumerate(viewpoints.views)}
-        missing = [name for name in request.photographs if name not in numbers]
+        numbers = {normalised(view.name): number for number, view in enumerate(viewpoints.views)}
+        missing = [name for name in request.photographs if normalised(name) not in numbers]
         if missing:
             raise ConfigError(f"{missing[0]}: the run has no photograph of this name.")
         return view_shots(
-            viewpoints, np.array([numbers[name] for name in request.photographs]), source.near_world
+            viewpoints,
+            np.array([numbers[normalised(name)] for name in request.photographs]),
+            source.near_world,
         )
     indices = {
         "train": viewpoints.train_indices,

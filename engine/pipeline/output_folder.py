@@ -7,7 +7,9 @@ from pathlib import Path
 
 from octasplat.engine.config import ReconstructionConfig, read_config
 from octasplat.engine.errors import ConfigError, DatasetError, OutputError
-from octasplat.engine.run_folder import CONFIG, EVENTS, POSES
+from octasplat.engine.poses.find import read_record
+from octasplat.engine.relative_paths import normalised
+from octasplat.engine.run_folder import CACHE, CONFIG, EVENTS, POSES
 from octasplat.engine.scene.colmap import has_model
 from octasplat.engine.versions import versions
 from octasplat.engine.writing import write_json
@@ -32,7 +34,7 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
             )
         _check_settings(scene, output, config)
         return False
-    if output.is_dir() and any(not path.name.startswith(".") for path in output.iterdir()):
+    if output.is_dir() and not _is_free(output, config.with_poses_decided(has_model(scene)).poses == "auto"):
         raise OutputError(f"{output} is not empty and holds no run; name an empty or a new folder.")
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -50,6 +52,8 @@ def claim_output(scene: Path, output: Path, config: ReconstructionConfig, resume
 def freed_if_refused(output: Path, *, is_new: bool, is_made: bool) -> Iterator[None]:
     """Free the folder of a new run if its photographs or settings are refused, for the corrected command.
 
+    The decoded photographs stay, and poses that were found: the corrected command goes on with them.
+
     Args:
         output: the folder.
         is_new: whether the run was begun by this command.
@@ -61,11 +65,31 @@ def freed_if_refused(output: Path, *, is_new: bool, is_made: bool) -> Iterator[N
         if is_new:
             (output / CONFIG).unlink()
             (output / EVENTS).unlink()
-            shutil.rmtree(output / POSES, ignore_errors=True)
+            if not _were_found(output / POSES):
+                shutil.rmtree(output / POSES, ignore_errors=True)
             if is_made:
                 with suppress(OSError):  # it holds something
                     output.rmdir()
         raise
+
+
+def _is_free(output: Path, finds_poses: bool) -> bool:
+    """Return whether a folder holds nothing, or only what a start that was refused has left."""
+    for path in output.iterdir():
+        if path.name == CACHE and path.is_dir():
+            if not all(file.suffix in (".bin", ".json") for file in path.iterdir()):
+                return False
+        elif path.name == POSES and finds_poses:
+            if not _were_found(path):
+                return False
+        elif not path.name.startswith("."):
+            return False
+    return True
+
+
+def _were_found(poses: Path) -> bool:
+    """Return whether poses are those of a search, which says of which photographs they are."""
+    return "photographs_sha256" in read_record(poses)
 
 
 def write_config(scene: Path, output: Path, config: ReconstructionConfig) -> None:
@@ -82,8 +106,14 @@ def _check_settings(scene: Path, output: Path, config: ReconstructionConfig) -> 
     """Refuse settings that are not the run's, but for the files to export."""
     is_posed = has_model(scene)
     before = read_config(output / CONFIG).model_copy(update={"exports": config.exports})
-    if before.with_poses_decided(is_posed) != config.with_poses_decided(is_posed):
+    if _comparable(before, is_posed) != _comparable(config, is_posed):
         raise ConfigError(
             f"{output / CONFIG} has other settings than this command; repeat the settings of the run, "
             "or name another folder."
         )
+
+
+def _comparable(config: ReconstructionConfig, is_posed: bool) -> ReconstructionConfig:
+    """Return settings in which what means the same is the same."""
+    held_out = None if config.held_out is None else tuple(sorted(map(normalised, config.held_out)))
+    return config.with_poses_decided(is_posed).model_copy(update={"held_out": held_out})

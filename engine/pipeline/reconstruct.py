@@ -12,6 +12,7 @@ from octasplat.engine.pipeline.dataset_steps import FindPoses, OpenDataset
 from octasplat.engine.pipeline.output_folder import claim_output, freed_if_refused
 from octasplat.engine.pipeline.result_steps import Evaluate, Export
 from octasplat.engine.pipeline.run import Run, Watcher, run_steps
+from octasplat.engine.pipeline.run_lock import held_alone
 from octasplat.engine.pipeline.train_step import Train
 from octasplat.engine.run_folder import CACHE, EVENTS, SCENE, VIEWS
 from octasplat.engine.scene.views_file import ViewsRecord, read_views
@@ -63,15 +64,24 @@ def reconstruct(
     """
     if not (output / SCENE).exists():
         check_writable(config.exports)
-    began = time.perf_counter()
     use_threads(threads)
     is_made, is_new = not output.exists(), claim_output(scene, output, config, resume)
+    with held_alone(output):
+        _go_through(
+            Run(scene, output, config, threads, listener, should_stop, watch), is_new=is_new, is_made=is_made
+        )
+    return output
+
+
+def _go_through(run: Run, *, is_new: bool, is_made: bool) -> None:
+    """Do all steps of a run whose folder is claimed."""
+    began, output = time.perf_counter(), run.output
     recorded = read_views(output / VIEWS) if (output / VIEWS).exists() else None
     events = JsonLinesListener(output / EVENTS, hold=recorded is not None)
-    tell = broadcast([events, listener])
-    run = Run(scene, output, config, threads, tell, should_stop, watch, recorded)
+    tell = broadcast([events, run.progress])
+    run.progress, run.recorded = tell, recorded
     if recorded is not None:
-        run.accept = _only_the_same(recorded, scene, output, events)
+        run.accept = _only_the_same(recorded, run.scene, output, events)
     try:
         with freed_if_refused(output, is_new=is_new, is_made=is_made):
             run_steps(OPENING, run)
@@ -80,7 +90,6 @@ def reconstruct(
         tell(RunFinished(_results(output), time.perf_counter() - began))
     finally:
         events.close()
-    return output
 
 
 def _results(output: Path) -> tuple[str, ...]:

@@ -1,11 +1,13 @@
 """Which files of a folder are photographs to find poses for."""
 
 import hashlib
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from octasplat.engine.errors import DatasetError
 from octasplat.engine.poses.config import MIN_PHOTOGRAPHS
+from octasplat.engine.results_among import is_results
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
@@ -14,12 +16,12 @@ def photographs_in(folder: Path) -> list[str]:
     """Names of the photographs that poses can be found for, relative to ``folder``.
 
     Those in folders below count only where ``folder`` is called ``images``; below a bare folder there may be
-    anything, masks and results among it.
+    anything, masks and results among it. Results of a run within ``images`` are no photographs either.
 
     Raises:
         DatasetError: there are fewer than three.
     """
-    below = folder.rglob("*") if folder.name == "images" else folder.glob("*")
+    below = _files_below(folder) if folder.name == "images" else folder.glob("*")
     names = sorted(
         path.relative_to(folder).as_posix()
         for path in below
@@ -31,6 +33,12 @@ def photographs_in(folder: Path) -> list[str]:
             f"at least {MIN_PHOTOGRAPHS} are needed."
         )
     return names
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not is_results(Path(parent) / name)]
+        yield from (Path(parent) / name for name in names)
 
 
 def photographs_sha256(folder: Path, names: Sequence[str]) -> str:

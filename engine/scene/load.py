@@ -1,13 +1,14 @@
 """Matching a COLMAP model with the photographs and masks on disk."""
 
 import os
-import unicodedata
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
 from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.relative_paths import normalised
+from octasplat.engine.results_among import is_results
 from octasplat.engine.scene.cameras import Camera
 from octasplat.engine.scene.colmap import ColmapModel, PosedImage, read_colmap_model
 from octasplat.engine.scene.image_info import ImageInfo
@@ -137,7 +138,7 @@ def _image_paths(folder: Path, model: ColmapModel, warnings: list[str], *, tell_
     missing: list[str] = []
     for image in model.images:
         # Nothing outside images/ is read, whatever a model from elsewhere asks for.
-        path = on_disk.pop(unicodedata.normalize("NFC", image.name), None)
+        path = on_disk.pop(normalised(image.name), None)
         if path is None:
             missing.append(image.name)
         else:
@@ -160,7 +161,7 @@ def _mask_paths(root: Path, names: list[str], warnings: list[str]) -> list[Path 
     if not folder.is_dir():
         return [None] * len(names)
     on_disk = _files_below(folder)
-    masks = [on_disk.get(unicodedata.normalize("NFC", f"{name}.png")) for name in names]
+    masks = [on_disk.get(normalised(f"{name}.png")) for name in names]
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(names):
         warnings.append(
@@ -173,15 +174,17 @@ def _mask_paths(root: Path, names: list[str], warnings: list[str]) -> list[Path 
 
 
 def _files_below(folder: Path) -> dict[str, Path]:
-    """Files by their NFC-normalised path below ``folder``, hidden ones left out."""
+    """Files by their NFC-normalised path below ``folder``, without hidden ones and results of runs."""
     files: dict[str, Path] = {}
     for parent, folders, names in os.walk(folder, followlinks=True):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        folders[:] = sorted(
+            name for name in folders if not name.startswith(".") and not is_results(Path(parent) / name)
+        )
         for name in sorted(names):
             if not name.startswith("."):
                 path = Path(parent) / name
                 # File systems differ in how they spell an umlaut; models come from other machines.
-                files[unicodedata.normalize("NFC", path.relative_to(folder).as_posix())] = path
+                files[normalised(path.relative_to(folder).as_posix())] = path
     return files
 
 

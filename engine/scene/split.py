@@ -7,18 +7,24 @@ import numpy as np
 from jaxtyping import Int64
 
 from octasplat.engine.errors import ConfigError, DatasetError
+from octasplat.engine.relative_paths import normalised
 from octasplat.engine.writing import write_json
 
 
 def split_views(
-    names: Sequence[str], test_every: int = 8, held_out: Sequence[str] | None = None
+    names: Sequence[str],
+    test_every: int = 8,
+    held_out: Sequence[str] | None = None,
+    *,
+    where: str = "model",
 ) -> tuple[Int64[np.ndarray, " train"], Int64[np.ndarray, " test"]]:
     """Indices of the training and of the held-out views.
 
     Args:
         names: names of the views, sorted.
         test_every: every how-manieth view is held out, beginning with the first; 0 holds out none.
-        held_out: names of the views to hold out instead.
+        held_out: names of the views to hold out instead; an umlaut may be spelt as one character or as two.
+        where: what the names are of, for complaints.
 
     Raises:
         DatasetError: a name in ``held_out`` is unknown, or nothing is left to train on.
@@ -27,14 +33,14 @@ def split_views(
     if test_every < 0:
         raise ConfigError(f"test_every is {test_every}; it must be 0 (hold out none) or more.")
     if held_out is not None:
-        unknown = sorted(set(held_out) - set(names))
+        chosen = set(map(normalised, held_out))
+        unknown = sorted(chosen - set(map(normalised, names)))
         if unknown:
             raise DatasetError(
-                f"{len(unknown)} of the images to hold out are not in the model ({', '.join(unknown[:3])}); "
-                "give names as they stand in the model."
+                f"{len(unknown)} of the images to hold out are not in the {where} "
+                f"({', '.join(unknown[:3])}); give names as they stand there."
             )
-        chosen = set(held_out)
-        is_test = np.array([name in chosen for name in names], dtype=bool)
+        is_test = np.array([normalised(name) in chosen for name in names], dtype=bool)
     else:
         is_test = np.arange(len(names)) % test_every == 0 if test_every else np.zeros(len(names), dtype=bool)
     if is_test.all():

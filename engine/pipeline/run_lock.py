@@ -1,0 +1,36 @@
+"""One process at a time works in the folder of a run."""
+
+import errno
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from octasplat.engine.errors import OutputError
+
+_HELD = frozenset({errno.EAGAIN, errno.EACCES})
+
+
+@contextmanager
+def held_alone(output: Path) -> Iterator[None]:
+    """Hold the folder of a run until the block ends; the end of the process frees it, too.
+
+    A file system that has no locks goes without.
+
+    Raises:
+        OutputError: another process works there.
+    """
+    folder = os.open(output, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in _HELD:
+                raise OutputError(
+                    f"Another octasplat works on the run in {output}; wait for it or stop it, or name "
+                    "another folder."
+                ) from None
+        yield
+    finally:
+        os.close(folder)

@@ -1,0 +1,144 @@
+"""Starts that are refused cost no search for poses, and leave a folder that the corrected command takes."""
+
+import shutil
+import time
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from neighbouring_photographs import write_neighbours
+from octasplat.engine.poses.photographs import photographs_in
+
+PATCH_TOO_LARGE = ("--set", "patch_side=64", "--set", "loss.ssim=0.2", "--max-side", "32")
+"""Settings that the photographs rule out, which is known only when they are open."""
+
+
+@pytest.fixture
+def noise(tmp_path: Path) -> Path:
+    """Photographs of nothing: a search for their poses would fail."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    rng = np.random.default_rng(3)
+    for number in range(4):
+        Image.fromarray(rng.integers(0, 256, (60, 80, 3), dtype=np.uint8)).save(folder / f"{number}.jpg")
+    return folder
+
+
+@pytest.fixture
+def posed_copy(scene: Path, tmp_path: Path) -> Path:
+    """A copy of the generated scene with its model as text, its first photograph called 0001.png."""
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    model = pycolmap.Reconstruction(str(copy / "sparse/0"))
+    shutil.rmtree(copy / "sparse/0")
+    (copy / "sparse/0").mkdir()
+    model.write_text(str(copy / "sparse/0"))
+    first = min((copy / "images").iterdir())
+    first.rename(first.with_name("0001.png"))
+    text = (copy / "sparse/0/images.txt").read_text()
+    (copy / "sparse/0/images.txt").write_text(text.replace(first.name, "0001.png"))
+    return copy
+
+
+def test_an_unknown_name_to_hold_out_is_refused_before_the_search(noise, octasplat, tmp_path, tiny):
+    output = tmp_path / "out"
+    refused = octasplat("reconstruct", noise, "-o", output, "--held-out", "5.jpg", *tiny)
+    assert refused.exit_code == 1
+    assert "1 of the images to hold out are not in the photographs (5.jpg)" in refused.stderr
+    assert "features" not in refused.stdout and not output.exists()
+
+
+def test_a_photograph_cut_short_is_refused_before_the_search(noise, octasplat, tmp_path, tiny):
+    whole = (noise / "2.jpg").read_bytes()
+    (noise / "2.jpg").write_bytes(whole[: len(whole) // 2])
+    refused = octasplat("reconstruct", noise, "-o", tmp_path / "out", *tiny)
+    assert refused.exit_code == 1 and "2.jpg is damaged or cut short" in refused.stderr
+    assert "features" not in refused.stdout and not (tmp_path / "out").exists()
+
+
+def test_masks_that_are_not_there_are_refused_before_the_search(noise, octasplat, tmp_path, tiny):
+    refused = octasplat("reconstruct", noise, "-o", tmp_path / "out", "--masks", "alpha", *tiny)
+    assert refused.exit_code == 1 and "--masks alpha" in refused.stderr
+    assert "features" not in refused.stdout and not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_a_refused_start_left_is_used_again(scene, octasplat, tmp_path, tiny):
+    output = tmp_path / "out"
+    output.mkdir()
+    refused = octasplat("reconstruct", scene, "-o", output, *tiny, *PATCH_TOO_LARGE)
+    assert refused.exit_code == 1 and "patch_side" in refused.stderr
+    assert [path.name for path in output.iterdir()] == ["cache"]
+    done = octasplat("reconstruct", scene, "-o", output, *tiny)
+    assert done.exit_code == 0, done.stderr
+
+
+def test_a_folder_with_somebody_elses_cache_is_left_alone(scene, octasplat, tmp_path, tiny):
+    (tmp_path / "out/cache").mkdir(parents=True)
+    (tmp_path / "out/cache/letters.txt").write_text("kept")
+    refused = octasplat("reconstruct", scene, "-o", tmp_path / "out", *tiny)
+    assert refused.exit_code == 1 and "is not empty and holds no run" in refused.stderr
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["cache"]
+
+
+@pytest.mark.heavy
+def test_poses_are_kept_when_the_settings_are_refused(octasplat, tmp_path, tiny):
+    photographs, output = tmp_path / "photographs", tmp_path / "out"
+    write_neighbours(photographs, 7)
+    refused = octasplat("reconstruct", photographs, "-o", output, *tiny, *PATCH_TOO_LARGE)
+    assert refused.exit_code == 1 and "patch_side" in refused.stderr, refused.output
+    found = (output / "poses/images.bin").read_bytes()
+    done = octasplat("reconstruct", photographs, "-o", output, "--max-side", "64", *tiny)
+    assert done.exit_code == 0, done.stderr
+    assert "features" not in done.stdout and (output / "poses/images.bin").read_bytes() == found
+
+
+def test_a_second_process_is_told_of_the_first(scene, octasplat, start_octasplat, tmp_path, tiny):
+    output = tmp_path / "out"
+    settings = [*tiny, "--iterations", "100000"]
+    first = start_octasplat("reconstruct", scene, "-o", output, *settings)
+    try:
+        until = time.monotonic() + 100
+        while not (output / "views.json").exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        second = octasplat("reconstruct", scene, "-o", output, "--resume", *settings)
+        assert first.poll() is None
+    finally:
+        first.kill()
+        first.communicate()
+    assert second.exit_code == 1
+    assert f"Another octasplat works on the run in {output}" in second.stderr
+
+
+@pytest.mark.parametrize(("option", "value"), [("--seed", "0"), ("--test-every", "0")])
+def test_a_zero_is_a_setting_when_a_run_goes_on(scene, octasplat, tmp_path, tiny, option, value):
+    output = tmp_path / "out"
+    assert octasplat("reconstruct", scene, "-o", output, *tiny, "--seed", "5").exit_code == 0
+    refused = octasplat("reconstruct", scene, "-o", output, "--resume", *tiny, option, value)
+    assert refused.exit_code == 1 and "other settings" in refused.stderr
+
+
+def test_a_run_within_images_goes_on(posed_copy, octasplat, tiny):
+    output = posed_copy / "images/run"
+    settings = [*tiny, "--held-out", "0001.png"]
+    assert octasplat("reconstruct", posed_copy, "-o", output, *settings).exit_code == 0
+    assert (output / "renders").is_dir()
+    again = octasplat("reconstruct", posed_copy, "-o", output, "--resume")
+    assert again.exit_code == 0 and "have no pose" not in again.stderr, again.stderr
+    assert all("run/" not in name for name in photographs_in(posed_copy / "images"))
+
+
+def test_names_to_hold_out_are_compared_however_an_umlaut_is_spelt(posed_copy, octasplat, tmp_path, tiny):
+    spelt = {form: unicodedata.normalize(form, "töpfe.png") for form in ("NFC", "NFD")}
+    (posed_copy / "images/0001.png").rename(posed_copy / "images" / spelt["NFD"])
+    model = posed_copy / "sparse/0/images.txt"
+    model.write_text(model.read_text().replace("0001.png", spelt["NFD"]))
+    output = tmp_path / "out"
+    done = octasplat("reconstruct", posed_copy, "-o", output, *tiny, "--held-out", spelt["NFC"])
+    assert done.exit_code == 0, done.stderr
+    assert [path.name for path in (output / "renders").iterdir()] == [f"{spelt['NFD'][:-4]}.png"]
+    again = octasplat("reconstruct", posed_copy, "-o", output, "--resume", *tiny, "--held-out", spelt["NFD"])
+    assert again.exit_code == 0, again.stderr
