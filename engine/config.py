@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_valid
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.fields import ADVANCED, Spelling
+from octasplat.engine.nested_options import merged
 from octasplat.engine.refusals import Refusal, SettingsRefused, refusals_of, submodels, unknown_setting
 from octasplat.engine.run_settings import RunSettings
 from octasplat.engine.settings import Settings
@@ -126,23 +127,6 @@ def revise_config(
     asked = merged(kept, changes)
     base = _base(values.get("preset"), _learns_materials(asked))
     return _validated({**values, "train": merged(base, asked)})
-
-
-def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``base`` with the values of ``over``, section by section; another kind of section begins anew.
-
-    >>> merged({"rates": {"quat": 1, "mean": 2}}, {"rates": {"quat": 3}})
-    {'rates': {'quat': 3, 'mean': 2}}
-    """
-    result = dict(base)
-    for key, value in over.items():
-        old = result.get(key)
-        if isinstance(old, Mapping) and isinstance(value, Mapping):
-            is_same = "kind" not in old or value.get("kind", old["kind"]) == old["kind"]
-            result[key] = merged(old, value) if is_same else value
-        else:
-            result[key] = value
-    return result
 
 
 def read_config(path: Path) -> ReconstructionConfig:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, GetJsonSchemaHandler
+from pydantic.fields import FieldInfo
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -88,12 +89,20 @@ class Spelling:
         metavar: what stands for the value in the help.
         hidden: whether the command does not have it.
         repeated: whether the option may be given several times, each time with a text that the field reads.
+        negatable: whether a switch that is off by default can be said to be off, as where another option
+            switches it on.
     """
 
     flags: tuple[str, ...] = ()
     metavar: str | None = None
     hidden: bool = False
     repeated: bool = False
+    negatable: bool = False
+
+
+def is_negatable(info: FieldInfo) -> bool:
+    """Return whether the field is a switch that differs between off and not said, see :class:`Spelling`."""
+    return any(isinstance(mark, Spelling) and mark.negatable for mark in info.metadata)
 
 
 @dataclass(frozen=True)

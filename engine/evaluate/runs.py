@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from octasplat.engine.config import ReconstructionConfig, read_config
-from octasplat.engine.errors import ConfigError, OutputError
+from octasplat.engine.errors import ConfigError, DatasetError, OutputError
 from octasplat.engine.evaluate.held_out import evaluate_held_out
 from octasplat.engine.evaluate.scales import measure_scales
 from octasplat.engine.evaluate.truth import Truth, find_truth
@@ -88,6 +88,7 @@ def evaluate(
     if on is not None:
         return _evaluate_on(on, output, config, threads, listener)
     dataset = _photographs(output, config, scene, threads, listener)
+    _check_world(output, dataset, photographs_folder(output, scene))
     if (output / VIEWS).exists():
         difference = read_views(output / VIEWS).difference(dataset.record)
         if difference is not None:
@@ -129,6 +130,7 @@ def evaluate_scales(
     use_threads(threads)
     config = _finished(output, background)
     dataset = _photographs(output, config, scene, threads, listener)
+    _check_world(output, dataset, photographs_folder(output, scene))
     gaussians, _ = read_gaussian_ply(output / SCENE)
     extent = _extent_world(output, dataset)
     shading = finished_shading(output, config.train, dataset, extent)
@@ -171,6 +173,19 @@ def _photographs(
         listener,
         model_folder=found_model(output),
     )
+
+
+def _check_world(output: Path, dataset: Dataset, folder: Path) -> None:
+    """Refuse photographs whose model stands in another world than the scene, as after a transform.
+
+    Raises:
+        DatasetError: it does.
+    """
+    if (output / VIEWS).exists() and read_views(output / VIEWS).is_of_another_world(dataset.record):
+        raise DatasetError(
+            f"The photographs in {folder} have other poses than the scene of {output} was made or moved "
+            "with; name a folder whose model stands in the same world."
+        )
 
 
 def _extent_world(output: Path, dataset: Dataset) -> float:
@@ -289,6 +304,7 @@ def _evaluate_on(
     )
     for warning in dataset.warnings:
         listener(Warned(warning))
+    _check_world(output, dataset, on)
     if (into / VIEWS).exists():
         difference = read_views(into / VIEWS).difference(dataset.record)
         if difference is not None:

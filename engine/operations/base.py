@@ -9,7 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from octasplat.engine.errors import ConfigError
+from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.events import Event, Listener, Warned, ignore
 from octasplat.engine.fields import Output, Positional, Source
 
@@ -135,6 +135,16 @@ class Operation(Generic[RequestT, ResultT_co]):
     run: Run[RequestT, ResultT_co]
 
 
+def stop_if(should_stop: Callable[[], bool]) -> None:
+    """End quick work that is asked to stop before its next file is written.
+
+    Raises:
+        Cancelled: it is.
+    """
+    if should_stop():
+        raise Cancelled("Stopped; files that were not written yet are not.")
+
+
 def options_of(model: type[OptionsT], request: Options) -> OptionsT:
     """Return the options that a request has, whose class inherits from theirs."""
     options = model.model_construct(**{name: getattr(request, name) for name in model.model_fields})
@@ -212,5 +222,6 @@ __all__ = [
     "ignore",
     "never",
     "options_of",
+    "stop_if",
     "warn",
 ]

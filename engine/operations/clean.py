@@ -18,6 +18,7 @@ from octasplat.engine.operations.base import (
     SourceRequest,
     never,
     options_of,
+    stop_if,
 )
 
 
@@ -112,6 +113,7 @@ def run(
     counts = {"count": len(gaussians), **asdict(report)}
     if request.output is None:
         return CleanResult(notes=(told,), **counts)
+    stop_if(should_stop)
     note = edit_note("clean", options_of(CleanOptions, request), gaussians=report.kept)
     written = write_changed(source, gaussians.select(keep), request.output, progress, note=note)
     return CleanResult(files=written.files, folder=written.folder, notes=(told, written.sentence), **counts)

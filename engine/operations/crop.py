@@ -15,6 +15,7 @@ from octasplat.engine.operations.base import (
     ScenesWritten,
     never,
     options_of,
+    stop_if,
 )
 
 
@@ -75,6 +76,7 @@ def run(
             "its solid part is)."
         )
     kept, count = int(keep.sum()), len(keep)
+    stop_if(should_stop)
     note = edit_note("crop", options_of(CropOptions, request), gaussians=kept)
     written = write_changed(source, gaussians.select(keep), request.output, progress, note=note)
     notes = (f"{source}: {kept:,} of {count:,} Gaussians kept.", written.sentence)

@@ -16,7 +16,7 @@ from octasplat.engine.errors import SceneFileError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Spelling, Unit
 from octasplat.engine.files import Mesh, read_mesh
-from octasplat.engine.operations.base import Operation, Options, ScenesWritten, never, options_of
+from octasplat.engine.operations.base import Operation, Options, ScenesWritten, never, options_of, stop_if
 from octasplat.engine.operations.patterns import expanded
 from octasplat.engine.operations.sequence_request import SequenceRequest
 
@@ -110,8 +110,10 @@ def run(
     for number, path in enumerate(paths):
         vertices = _turned(_same_mesh(path, request.proxy, rest), request.axes)
         result, report = deform_to(gaussians, corners, binding.deform(vertices), binding.mirrored(vertices))
+        stop_if(should_stop)
         notes += [*_told(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
+        frames.tell(number, progress)
     frames.write_report(request.report, [{"deformed": str(path)} for path in paths], map(asdict, reports))
     return DeformResult(
         files=frames.files,

@@ -11,7 +11,15 @@ from octasplat.engine.edit.choices import MeshRecovery
 from octasplat.engine.edit.reports import EditReport
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Spelling
-from octasplat.engine.operations.base import Operation, Options, ScenesWritten, never, options_of, warn
+from octasplat.engine.operations.base import (
+    Operation,
+    Options,
+    ScenesWritten,
+    never,
+    options_of,
+    stop_if,
+    warn,
+)
 from octasplat.engine.operations.patterns import expanded
 from octasplat.engine.operations.sequence_request import SequenceRequest
 
@@ -54,6 +62,8 @@ def run(
 ) -> EditResult:
     """Recover the scene from each edited mesh; see :class:`octasplat.engine.operations.base.Run`.
 
+    Tells the steps of a stage ``edit``, one for each of several meshes.
+
     Raises:
         OctasplatError: something cannot be read, matched or written.
     """
@@ -75,8 +85,10 @@ def run(
             recovery = recovery.model_copy(update={"axes": report.axes})
             _warn_of_axes(path, report, progress)
         _warn_of_torn(report, progress)
+        stop_if(should_stop)
         notes += [*_told(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
+        frames.tell(number, progress)
     frames.write_report(request.report, [{"mesh": str(path)} for path in meshes], map(asdict, reports))
     return EditResult(files=frames.files, folder=frames.folder, notes=tuple(notes), reports=tuple(reports))
 

@@ -171,10 +171,11 @@ def run(
     from octasplat.engine.files import export_losses
     from octasplat.engine.files.several import export_files
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scenes import open_scene
+    from octasplat.engine.operations.scenes import check_keeps_inputs, open_scene
 
     for path in request.files:
         exporter_for(path, request.format)  # complain before the long work
+    check_keeps_inputs(request.files, [request.source])
     count = len(request.files)
     gaussians = open_scene(request.source, progress)
     if request.materials:

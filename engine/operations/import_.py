@@ -10,7 +10,7 @@ from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Positional, Spelling
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.gaussians.flattening import ImportReport
-from octasplat.engine.operations.base import Operation, Options, Request, Result, never
+from octasplat.engine.operations.base import Operation, Options, Request, Result, never, stop_if
 
 
 def read_channels(value: object) -> object:
@@ -105,14 +105,16 @@ def run(
     See :class:`octasplat.engine.operations.base.Run`; tells of a stage ``read``.
 
     Raises:
+        ConfigError: the output is the file that is read.
         SceneFileError: the scene cannot be read.
         OutputError: it cannot be written.
     """
     from octasplat.engine.files import read_facts, read_scene
     from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-    from octasplat.engine.operations.scenes import tell_import_losses
+    from octasplat.engine.operations.scenes import check_keeps_inputs, tell_import_losses
 
     source: Path = request.file
+    check_keeps_inputs([request.output], [source])
     gaussians, report = read_scene(
         source,
         request.format,
@@ -124,6 +126,7 @@ def run(
     degree = request.sh_degree
     if degree is not None and degree < gaussians.sh_degree:
         gaussians.sh = gaussians.sh[:, : (degree + 1) ** 2].copy()
+    stop_if(should_stop)
     write_gaussian_ply(gaussians, request.output, facts=read_facts(source))
     return ImportResult(files=(request.output,), report=report, channels=tuple(gaussians.channels))
 

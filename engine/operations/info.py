@@ -13,7 +13,7 @@ from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES, QUANTILES, HitF
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Source, Spelling
 from octasplat.engine.operations.axes import Axis, axis_named
-from octasplat.engine.operations.base import Operation, Options, Request, Result, never
+from octasplat.engine.operations.base import Operation, Options, Request, Result, never, stop_if
 
 _BAR = 24
 
@@ -151,6 +151,7 @@ def run(
         hits=found.hits,
         picture_srgb=found.picture_srgb,
     )
+    stop_if(should_stop)
     if request.picture is not None:
         write_png(request.picture, found.picture_srgb)
     if request.output is not None:

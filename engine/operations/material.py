@@ -8,7 +8,7 @@ from pydantic import Field
 from octasplat.engine.edit.choices import MaterialChange, Selection
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Output, Spelling
-from octasplat.engine.operations.base import Operation, Options, SceneRequest, ScenesWritten, never
+from octasplat.engine.operations.base import Operation, Options, SceneRequest, ScenesWritten, never, stop_if
 
 
 class MaterialOptions(Selection, MaterialChange, Options):
@@ -96,6 +96,7 @@ def run(
     mesh = {"mesh": request.mesh.name} if request.mesh is not None else {}
     masks = {"masks": [path.name for path in request.masks]} if request.masks else {}
     note = edit_note(request, request, chosen) | mesh | masks
+    stop_if(should_stop)
     written = write_changed(source, changed, output, progress, note=note)
     return MaterialResult(
         files=written.files,

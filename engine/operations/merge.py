@@ -15,6 +15,7 @@ from octasplat.engine.operations.base import (
     ScenesWritten,
     never,
     options_of,
+    stop_if,
     warn,
 )
 
@@ -82,6 +83,7 @@ def run(
         if missing := ", ".join(name for name in every if name not in scene.channels):
             warn(progress, f"{source}: has no channel {missing}; it is 0 there.")
     merged = merge(scenes, request.sh_degree)
+    stop_if(should_stop)
     written = write_changed(
         first,
         merged,

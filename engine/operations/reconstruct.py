@@ -9,6 +9,7 @@ from pydantic import Field, ValidationError
 
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import ADVANCED, BASIC, PartOf, Positional, Shortcut, Spelling
+from octasplat.engine.nested_options import merged
 from octasplat.engine.operations.base import Operation, Options, Output, Request, Result, never
 from octasplat.engine.refusals import SettingsRefused, refusals_of
 from octasplat.engine.run_settings import RunSettings
@@ -95,7 +96,6 @@ class ReconstructOptions(RunSettings, Options):
 
     def _training(self) -> dict[str, Any]:
         """The settings of the training that are asked for by name, nested."""
-        from octasplat.engine.config import merged
         from octasplat.engine.train.config import FOR_SURFACE
 
         names = {name: info.metadata for name, info in ReconstructOptions.model_fields.items()}

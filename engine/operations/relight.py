@@ -160,7 +160,7 @@ def run(
             "relight", source.gaussians, source.settings, list(environments), list(environments.values()), up,
             cameras, len(shots), [(rays.origin_world, rays.directions_world) for rays in ends], request.by,
             request.samples_per_pixel, request.depth, request.rotation_degrees, request.spin, background,
-            request.format,
+            request.format, *output.numbered(shots),
         )
     )  # fmt: skip
     relighter = _relighter(request, source, learnt, threads)

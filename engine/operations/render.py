@@ -209,7 +209,7 @@ def _render_plain(
     kept = output.kept_images(
         identity_of(
             source.gaussians, source.settings, background, transparent, cameras, None, views,
-            source.trained_rad, None if learnt is None else learnt.rgb_srgb,
+            source.trained_rad, None if learnt is None else learnt.rgb_srgb, *output.numbered(shots),
         )
     )  # fmt: skip
     tracer = make_tracer(source.settings, threads=threads, build_quality=2)
@@ -248,7 +248,7 @@ def _render_on_stage(
     kept = output.kept_images(
         identity_of(
             source.gaussians, source.settings, background, False, cameras,
-            stage_identity(stage, request.stage_folder), views, scene.photographs,
+            stage_identity(stage, request.stage_folder), views, scene.photographs, *output.numbered(shots),
         )
     )  # fmt: skip
     return output.write(shots, compile_stage(stage, scene, shots).paint, kept, progress)

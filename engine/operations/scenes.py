@@ -23,7 +23,7 @@ from octasplat.engine.files import (
 from octasplat.engine.gaussians.flattening import ImportReport
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_facts import SceneFacts
-from octasplat.engine.run_folder import is_run, not_exported
+from octasplat.engine.run_folder import SCENE, is_run, not_exported
 
 
 def open_scene(path: Path, progress: Listener, *, drop_invalid: bool = False) -> FlatGaussians:
@@ -71,8 +71,19 @@ def check_target(output: Path, inputs: Sequence[Path]) -> None:
         SceneFileError: no format takes the name.
     """
     exporter_for(output)
-    if any(path.exists() and output.resolve() == path.resolve() for path in inputs):
-        raise ConfigError(f"{output}: would overwrite what the command reads; choose another -o.")
+    check_keeps_inputs([output], inputs)
+
+
+def check_keeps_inputs(outputs: Sequence[Path], inputs: Sequence[Path]) -> None:
+    """Check before long work that no file to write is one that is read; of a run that is its scene.
+
+    Raises:
+        ConfigError: one is.
+    """
+    read = {(path / SCENE if is_run(path) else path).resolve() for path in inputs if path.exists()}
+    for output in outputs:
+        if output.resolve() in read:
+            raise ConfigError(f"{output}: would overwrite what the command reads; choose another name.")
 
 
 def write_scene(

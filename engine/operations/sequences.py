@@ -5,7 +5,7 @@ from pathlib import Path
 
 from octasplat.engine.edit.changed_run import check_new_run
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Listener
+from octasplat.engine.events import Listener, StageProgress
 from octasplat.engine.files import read_facts
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.operations.scenes import becomes_run, check_target, write_changed, write_scene
@@ -85,6 +85,11 @@ class Frames:
             return written.sentence
         self.files = (*self.files, target)
         return write_scene(gaussians, read_facts(self._source), target, progress, warn=number == 0)
+
+    def tell(self, number: int, progress: Listener) -> None:
+        """Tell that the scene of the mesh with this number is written, where there are several."""
+        if len(self._targets) > 1:
+            progress(StageProgress("edit", number + 1, len(self._targets)))
 
     def write_report(
         self,

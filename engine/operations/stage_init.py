@@ -9,7 +9,7 @@ from octasplat.engine.errors import OutputError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Output, Source
 from octasplat.engine.operations.axes import Axis, axis_named
-from octasplat.engine.operations.base import Operation, Options, Request, Result, never
+from octasplat.engine.operations.base import Operation, Options, Request, Result, never, stop_if
 from octasplat.engine.operations.pictures import Point
 
 
@@ -75,6 +75,7 @@ def run(
         raise OutputError(f"{output} is there already; name another file, or remove it.")
     scene = open_stage_scene(request.source, progress, dataset=request.dataset, threads=threads)
     facts = first_stage_facts(scene, None if request.up is None else axis_named(request.up))
+    stop_if(should_stop)
     try:
         write_first_stage(output, facts)
     except OSError as error:

@@ -215,14 +215,15 @@ def run(
     """Extract a surface and write it; see :class:`octasplat.engine.operations.base.Run`.
 
     Raises:
-        ConfigError: the file's name does not fit, or the region to mesh is empty or too large.
+        ConfigError: the file's name does not fit or is that of the scene, or the region to mesh is empty or
+            too large.
         OutputError: the source has no scene yet, or the place of the output cannot be used.
         SceneFileError: the scene cannot be read, or the mesh not be written.
         Cancelled: stopped as asked; nothing was written.
     """
     from octasplat.engine.files import check_surface_path, write_surface
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scenes import open_scene
+    from octasplat.engine.operations.scenes import check_keeps_inputs, open_scene
     from octasplat.engine.operations.surface_inputs import camera_views
     from octasplat.engine.run_folder import SCENE, is_run
     from octasplat.engine.shading.environment_frame import environment_frame
@@ -232,6 +233,7 @@ def run(
 
     source, output = request.source, request.output
     check_surface_path(output, textured=request.texture_side is not None, lit=request.materials)
+    check_keeps_inputs(request.outputs, [source])
     if is_run(source) and not (source / SCENE).exists():
         raise OutputError(
             f"{source} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume."

@@ -18,6 +18,7 @@ from octasplat.engine.operations.base import (
     ScenesWritten,
     never,
     options_of,
+    stop_if,
 )
 
 _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -121,6 +122,7 @@ def run(
     check_changed(source, request.output, [] if request.matrix is None else [request.matrix])
     matrix = request.world_map()
     moved = transform(open_scene(source, progress), matrix)
+    stop_if(should_stop)
     rows = tuple(map(tuple, matrix.tolist()))
     written = write_changed(
         source,

@@ -1,5 +1,6 @@
 """Where the images of a render go: files of their own or a film, and what of them an earlier try has left."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,6 +74,10 @@ class RenderOutput:
         if not self.is_named_image:
             return self.path / f"{shot.name}{'.exr' if self.exr else '.png'}"
         return self.path.with_name(self.path.name % number) if names_by_number(self.path) else self.path
+
+    def numbered(self, shots: Sequence[Shot]) -> tuple[list[str], ...]:
+        """Return the names of the shots where files have numbers only: what those stand for; else nothing."""
+        return ([shot.name for shot in shots],) if self.is_named_image else ()
 
     def kept_images(self, identity: str) -> KeptImages:
         """Return what there is already of images that look as ``identity`` says.

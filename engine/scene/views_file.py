@@ -160,15 +160,27 @@ class ViewsRecord(_Frozen):
         """Return whether ``other`` has photographs of the same names, and all of them in the same poses."""
         others = {view.name: view for view in other.views}
         shared = [(view, others[view.name]) for view in self.views if view.name in others]
-        return bool(shared) and all(
-            np.allclose(one.rotation_cam_from_world, two.rotation_cam_from_world, atol=_SAME_POSE)
-            and np.allclose(
-                one.translation_cam_from_world,
-                two.translation_cam_from_world,
-                rtol=_SAME_POSE,
-                atol=_SAME_POSE * self.extent_world,
-            )
-            for one, two in shared
+        return bool(shared) and all(self._is_of_one_pose(one, two) for one, two in shared)
+
+    def is_of_another_world(self, other: "ViewsRecord") -> bool:
+        """Return whether most of the photographs that ``other`` shares stand in other poses there.
+
+        Single ones may: those that were placed anew for a run stand elsewhere in the model of their folder.
+        """
+        others = {(view.name, view.photograph_sha256): view for view in other.views}
+        names = ((view, (view.name, view.photograph_sha256)) for view in self.views)
+        shared = [(view, others[name]) for view, name in names if name in others]
+        moved = sum(not self._is_of_one_pose(one, two) for one, two in shared)
+        return 2 * moved > len(shared)
+
+    def _is_of_one_pose(self, one: _View, two: _View) -> bool:
+        return np.allclose(
+            one.rotation_cam_from_world, two.rotation_cam_from_world, atol=_SAME_POSE
+        ) and np.allclose(
+            one.translation_cam_from_world,
+            two.translation_cam_from_world,
+            rtol=_SAME_POSE,
+            atol=_SAME_POSE * self.extent_world,
         )
 
     def _aspects(self, view: _View) -> dict[str, object]:

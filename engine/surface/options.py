@@ -7,6 +7,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_valida
 from octasplat.engine.fields import Group, Spelling, Unit
 
 Box = tuple[float, float, float, float, float, float]
+_SAID = Spelling(negatable=True)
+"""Of what ``room`` switches on where nothing is said."""
 
 
 def _read_box(value: object) -> object:
@@ -41,7 +43,7 @@ class ExtractionOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    unbounded: bool = Field(
+    unbounded: Annotated[bool, _SAID] = Field(
         False, description="Reach to the horizon, with ever coarser voxels, instead of meshing a box."
     )
     bounds: Annotated[
@@ -96,11 +98,11 @@ class ExtractionOptions(BaseModel):
         description="Space near the surface that no view saw: open leaves holes there, solid closes the "
         "mesh.",
     )
-    backdrop: bool = Field(
+    backdrop: Annotated[bool, _SAID] = Field(
         False,
         description="A sphere around everything that shows what the scene shows in the gaps of the mesh.",
     )
-    settle: bool = Field(
+    settle: Annotated[bool, _SAID] = Field(
         False, description="Move vertices along their normals to where the pictures agree, before colours."
     )
     keep_components: Annotated[int | None, Spelling(("--components",))] = Field(

@@ -97,7 +97,7 @@ class Client:
 
     def derive(
         self,
-        source: "Job | str",
+        source: "Job | str | None",
         kind: str,
         *,
         files: Mapping[str, PathLike] | Sequence[PathLike] = (),
@@ -108,10 +108,10 @@ class Client:
         progress: Listener | None = None,
         **options: Any,
     ) -> "Job":
-        """Queue a job on the results of a finished one, such as a render.
+        """Queue a job on the results of a finished one, such as a render, or on files alone.
 
         Args:
-            source: the finished job, or its id.
+            source: the finished job, or its id; None for kinds that work on files alone, such as import.
             kind: of the new one; ``GET /v1/options`` lists them.
             files: files that the options name, by these names, or by their own.
             photographs: a folder, a ZIP file, or the id of a dataset to work on in the place of the job's.
@@ -122,7 +122,7 @@ class Client:
             options: of the kind.
 
         Raises:
-            ConfigError: two files have one name.
+            ConfigError: two files have one name, or one is not there.
             ServiceError: the service refuses something.
             Unreachable: nobody answers.
         """

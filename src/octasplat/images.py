@@ -12,6 +12,7 @@ from jaxtyping import Float32, Int32
 
 from octasplat.engine.rays import ImageRays
 from octasplat.engine.render.cameras import RenderCamera
+from octasplat.operating import names_checked
 from octasplat.places import PathLike
 from octasplat.scenes import Scene
 
@@ -99,6 +100,7 @@ class Image:
         return f'<img src="data:image/png;base64,{source}" alt="{html.escape(repr(self))}">'
 
 
+@names_checked
 def render_view(
     scene: Scene, camera: RenderCamera, *, background: Background = "black", threads: int = 0
 ) -> Image:

@@ -1,16 +1,48 @@
 """Operations of the engine, done with the values that a caller gives in Python."""
 
+import functools
+import inspect
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from pydantic import BaseModel
 
+from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener
+from octasplat.engine.fields import is_negatable
+from octasplat.engine.nearest_names import nearest_name
 from octasplat.engine.operations.base import build
 from octasplat.engine.operations.registry import operation
 from octasplat.notebook import default_listener
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class UnknownOption(ConfigError, TypeError):
+    """A function was called with an option that it does not have."""
+
+
+def names_checked(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function, which refuses an option that it does not have and offers the nearest name.
+
+    Raises:
+        UnknownOption: when it is called with one.
+    """
+    names = tuple(inspect.signature(function).parameters)
+
+    @functools.wraps(function)
+    def call(*values: P.args, **options: P.kwargs) -> R:
+        for name in options:
+            if name not in names:
+                nearest = nearest_name(name, names)
+                more = f"the nearest is {nearest}" if nearest else "help() of it lists all"
+                raise UnknownOption(f"{function.__name__} has no option '{name}'; {more}.")
+        return function(*values, **options)
+
+    return call
 
 
 def run_operation(
@@ -24,7 +56,7 @@ def run_operation(
 
     Args:
         name: of the operation.
-        values: those of its request by field; None, and a boolean that is the default, count as not given.
+        values: those of its request by field; for what counts as given see :func:`given_values`.
         progress: told the events; None logs them, or shows them in a notebook.
         should_stop: asked now and then; True ends the work with ``Cancelled``.
         threads: 0 takes all cores.
@@ -41,12 +73,16 @@ def run_operation(
 
 
 def given_values(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those values of a model's fields that a caller gave, as the model takes them."""
+    """Return those values of a model's fields that a caller gave, as the model takes them.
+
+    None counts as not given, and so does a boolean that is the default, unless it can be said.
+    """
     fields = model.model_fields
     return {
         name: _plain(value)
         for name, value in values.items()
-        if value is not None and not (isinstance(value, bool) and value is fields[name].default)
+        if value is not None
+        and not (isinstance(value, bool) and value is fields[name].default and not is_negatable(fields[name]))
     }
 
 

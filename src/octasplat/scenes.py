@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
+from octasplat.engine.errors import ConfigError
 from octasplat.engine.gaussians.channels import Channels
+from octasplat.engine.gaussians.flattening import LARGEST_LOGIT
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import Index
 from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
@@ -31,7 +33,7 @@ class Scene:
     ((1200, 4, 3), 1)
 
     ``means``, ``quats``, ``log_scales``, ``opacity_logits`` and ``sh`` are views: what is written to them
-    changes the scene.
+    changes the scene. What is assigned must have the same shape, but that ``sh`` may be of another degree.
 
     >>> scene.means += np.float32([0, 0, 1])
     """
@@ -58,9 +60,12 @@ class Scene:
             quats: rotations (w, x, y, z) of any length; the columns of the matrix are the normal and the two
                 axes in the plane.
             scales: standard deviations along these axes, world units.
-            opacities: in (0, 1).
+            opacities: from 0 to 1.
             sh: spherical harmonics of the display colour, 1, 4, 9 or 16 coefficients a Gaussian.
             channels: further numbers of each Gaussian, by name.
+
+        Raises:
+            ConfigError: an array has another shape, or a value is out of range.
 
         >>> import numpy as np
         >>> import octasplat as osp
@@ -73,13 +78,14 @@ class Scene:
         ... )
         Scene(1 Gaussian, harmonics of degree 0)
         """
-        opacity = np.asarray(opacities, np.float64)
+        count = len(means)
+        _check_sh(np.asarray(sh), count)
         return cls(
             FlatGaussians(
-                np.array(means, np.float32),
-                np.array(quats, np.float32),
-                np.log(np.asarray(scales, np.float64)).astype(np.float32),
-                np.log(opacity / (1 - opacity)).astype(np.float32),
+                _rows("means", means, (count, 3)),
+                _rows("quats", quats, (count, 4)),
+                _rows("scales", _log_scales(scales), (count, 2)),
+                _rows("opacities", _opacity_logits(opacities), (count,)),
                 np.array(sh, np.float32),
                 Channels({name: np.array(rows, np.float32) for name, rows in (channels or {}).items()}),
             )
@@ -92,7 +98,7 @@ class Scene:
 
     @means.setter
     def means(self, values: Float[np.ndarray, "n 3"]) -> None:
-        self.gaussians.means_world[...] = values
+        _put("means", self.gaussians.means_world, values)
 
     @property
     def quats(self) -> Float32[np.ndarray, "n 4"]:
@@ -101,7 +107,7 @@ class Scene:
 
     @quats.setter
     def quats(self, values: Float[np.ndarray, "n 4"]) -> None:
-        self.gaussians.quats_wxyz[...] = values
+        _put("quats", self.gaussians.quats_wxyz, values)
 
     @property
     def log_scales(self) -> Float32[np.ndarray, "n 2"]:
@@ -115,7 +121,7 @@ class Scene:
 
     @scales.setter
     def scales(self, values: Float[np.ndarray, "n 2"]) -> None:
-        self.gaussians.log_scales[...] = np.log(values)
+        _put("scales", self.gaussians.log_scales, _log_scales(values))
 
     @property
     def opacity_logits(self) -> Float32[np.ndarray, " n"]:
@@ -129,8 +135,7 @@ class Scene:
 
     @opacities.setter
     def opacities(self, values: Float[np.ndarray, " n"]) -> None:
-        opacity = np.asarray(values, np.float64)
-        self.gaussians.opacity_logits[...] = np.log(opacity / (1 - opacity))
+        _put("opacities", self.gaussians.opacity_logits, _opacity_logits(values))
 
     @property
     def sh(self) -> Float32[np.ndarray, "n k 3"]:
@@ -139,7 +144,12 @@ class Scene:
 
     @sh.setter
     def sh(self, values: Float[np.ndarray, "n k 3"]) -> None:
-        self.gaussians.sh[...] = values
+        coefficients = np.asarray(values)
+        if coefficients.shape == self.gaussians.sh.shape:
+            self.gaussians.sh[...] = coefficients
+        else:  # of another degree
+            _check_sh(coefficients, len(self))
+            self.gaussians.sh = np.array(coefficients, np.float32)
 
     @property
     def sh_degree(self) -> int:
@@ -219,6 +229,43 @@ class Scene:
                 or "none",
             },
         )
+
+
+def _rows(name: str, values: Float[np.ndarray, "..."], shape: tuple[int, ...]) -> Float32[np.ndarray, "..."]:
+    """Return a copy as float32; refuses another shape."""
+    rows = np.array(values, np.float32)
+    if rows.shape != shape:
+        raise ConfigError(f"{name}: has the shape {rows.shape}; it must be {shape}.")
+    return rows
+
+
+def _put(name: str, rows: Float32[np.ndarray, "..."], values: Float[np.ndarray, "..."]) -> None:
+    """Overwrite rows by values of the same shape."""
+    rows[...] = _rows(name, values, rows.shape)
+
+
+def _check_sh(values: Float[np.ndarray, "..."], count: int) -> None:
+    """Refuse what are no coefficients of so many Gaussians."""
+    shape = values.shape
+    if len(shape) != 3 or shape[0] != count or shape[1] not in (1, 4, 9, 16) or shape[2] != 3:
+        raise ConfigError(f"sh: has the shape {shape}; it must be ({count}, k, 3) with k 1, 4, 9 or 16.")
+
+
+def _log_scales(scales: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
+    """Return the logarithms of standard deviations; refuses those that have none."""
+    values = np.asarray(scales, np.float64)
+    if not (np.isfinite(values) & (values > 0)).all():
+        raise ConfigError("scales: must be finite and above 0.")
+    return np.log(values)
+
+
+def _opacity_logits(opacities: Float[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
+    """Return what the sigmoid turns into opacities, finite for 0 and 1, too; refuses what is none."""
+    values = np.asarray(opacities, np.float64)
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ConfigError("opacities: must be from 0 to 1.")
+    with np.errstate(divide="ignore"):
+        return np.clip(np.log(values) - np.log1p(-values), -LARGEST_LOGIT, LARGEST_LOGIT)
 
 
 def load(source: PathLike, *, drop_invalid: bool = False) -> Scene:

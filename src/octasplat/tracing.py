@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from octasplat.engine.gaussians.model import FlatGaussians
+from octasplat.engine.gaussians.scene_facts import NOTHING_KNOWN, SceneFacts
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.render.cameras import RenderCamera
 from octasplat.engine.trace.make import make_tracer
@@ -34,6 +35,7 @@ class GaussianTensors:
         opacity_logits: what the sigmoid turns into opacities.
         sh: spherical harmonics of the display colour; colour = max(0, 1/2 + sum_k sh[k] Y_k(direction)).
         features: any further numbers, composited like colours.
+        facts: what is known of the scene as a whole; it decides how the scene is traced.
 
     >>> import octasplat as osp
     >>> parameters = osp.GaussianTensors.of(osp.load("scene.ply"))
@@ -49,21 +51,24 @@ class GaussianTensors:
     opacity_logits: Float[Tensor, " n"]
     sh: Float[Tensor, "n k 3"]
     features: Float[Tensor, "n f"] | None = None
+    facts: SceneFacts = NOTHING_KNOWN
 
     @classmethod
     def of(cls, scene: Scene, *, requires_grad: bool = True) -> "GaussianTensors":
-        """Return leaves with the parameters of a scene, copied."""
+        """Return leaves with the parameters of a scene, copied; its channels do not come along."""
         arrays = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.sh)
-        return cls(*(torch.tensor(array, requires_grad=requires_grad) for array in arrays))
+        leaves = (torch.tensor(array, requires_grad=requires_grad) for array in arrays)
+        return cls(*leaves, facts=scene.facts)
 
     def tensors(self) -> list[Tensor]:
         """Return the tensors, as an optimiser takes them; no features where there are none."""
         found = (getattr(self, part.name) for part in fields(self))
-        return [tensor for tensor in found if tensor is not None]
+        return [part for part in found if isinstance(part, Tensor)]
 
     def scene(self) -> Scene:
         """Return the scene with these parameters, copied."""
-        return Scene(_gaussians(*(_array(tensor) for tensor in self.tensors()[:5])).copy())
+        gaussians = _gaussians(*(_array(tensor) for tensor in self.tensors()[:5]))
+        return Scene(gaussians.copy(), self.facts)
 
 
 @dataclass
@@ -167,8 +172,7 @@ def trace(
     """
     given = GaussianTensors.of(scene, requires_grad=False) if isinstance(scene, Scene) else scene
     if settings is None:
-        beyond = scene.facts.turned_beyond if isinstance(scene, Scene) else 0.0
-        settings = TraceSettings(turned_beyond=beyond)
+        settings = TraceSettings(turned_beyond=scene.facts.turned_beyond)
     lines = Rays.of(rays) if isinstance(rays, RenderCamera) else rays
     directions = lines.directions / lines.directions.norm(dim=-1, keepdim=True)
     features = given.features

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from octasplat.engine.events import Listener
 from octasplat.engine.operations.base import never
-from octasplat.operating import run_operation
+from octasplat.operating import names_checked, run_operation
 from octasplat.places import PathLike
 from octasplat.runs import OnStep, Run, reconstruct_into
 
@@ -70,6 +70,7 @@ class RenderArguments(TypedDict, total=False):
     threads: int
 
 
+@names_checked
 def reconstruct(
     source: PathLike,
     output: PathLike,
@@ -188,6 +189,7 @@ def reconstruct(
     )
 
 
+@names_checked
 def estimate(
     source: PathLike,
     *,
@@ -292,6 +294,7 @@ def estimate(
     )
 
 
+@names_checked
 def evaluate(
     source: PathLike,
     *,
@@ -344,6 +347,7 @@ def evaluate(
     )
 
 
+@names_checked
 def info(
     source: PathLike,
     output: PathLike | None = None,
@@ -383,11 +387,12 @@ def info(
     )
 
 
+@names_checked
 def surface(
     source: PathLike,
     output: PathLike,
     *,
-    unbounded: bool = False,
+    unbounded: bool | None = None,
     bounds: Sequence[float] | str | None = None,
     voxel: float | None = None,
     resolution: int | None = None,
@@ -398,8 +403,8 @@ def surface(
     min_alpha: float | None = None,
     min_weight: float | None = None,
     unseen: Literal["open", "solid"] | None = None,
-    backdrop: bool = False,
-    settle: bool = False,
+    backdrop: bool | None = None,
+    settle: bool | None = None,
     keep_components: int | None = None,
     min_component: float | None = None,
     fill_holes: Literal["all"] | float | None = None,
@@ -507,6 +512,7 @@ def surface(
     )
 
 
+@names_checked
 def material(
     source: PathLike,
     output: PathLike,
@@ -571,6 +577,7 @@ def material(
     )
 
 
+@names_checked
 def render(
     source: PathLike,
     output: PathLike,
@@ -711,6 +718,7 @@ def render(
     )
 
 
+@names_checked
 def relight(
     source: PathLike,
     output: PathLike,
@@ -855,6 +863,7 @@ def relight(
     )
 
 
+@names_checked
 def stage_init(
     source: PathLike,
     output: PathLike,
@@ -892,6 +901,7 @@ def stage_init(
     )
 
 
+@names_checked
 def export(
     source: PathLike,
     files: Sequence[PathLike],
@@ -974,6 +984,7 @@ def export(
     )
 
 
+@names_checked
 def import_(
     file: PathLike,
     output: PathLike,
@@ -1024,6 +1035,7 @@ def import_(
     )
 
 
+@names_checked
 def edit(
     source: PathLike,
     output: PathLike,
@@ -1098,6 +1110,7 @@ def edit(
     )
 
 
+@names_checked
 def deform(
     source: PathLike,
     output: PathLike,
@@ -1162,6 +1175,7 @@ def deform(
     )
 
 
+@names_checked
 def transform(
     source: PathLike,
     output: PathLike,
@@ -1218,6 +1232,7 @@ def transform(
     )
 
 
+@names_checked
 def crop(
     source: PathLike,
     output: PathLike,
@@ -1269,6 +1284,7 @@ def crop(
     )
 
 
+@names_checked
 def merge(
     source: PathLike,
     output: PathLike,
@@ -1307,6 +1323,7 @@ def merge(
     )
 
 
+@names_checked
 def clean(
     source: PathLike,
     output: PathLike | None = None,

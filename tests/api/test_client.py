@@ -119,3 +119,11 @@ def test_files_of_one_name_are_refused() -> None:
         pytest.raises(osp.OctasplatError, match="one name"),
     ):
         client.derive("job", "relight", files=["a/sky.hdr", "b/sky.hdr"])
+
+
+def test_a_file_that_is_not_there_is_told_before_anything_is_sent(tmp_path: Path) -> None:
+    with (
+        osp.Client("http://127.0.0.1:9", "token") as client,
+        pytest.raises(osp.ConfigError, match=r"sky\.hdr: there is no such file"),
+    ):
+        client.derive("job", "relight", files=[tmp_path / "sky.hdr"], environments=["sky.hdr"])

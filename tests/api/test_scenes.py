@@ -23,6 +23,37 @@ def test_arrays_are_views_of_the_scene(scene_file: Path) -> None:
     assert not np.allclose(scene.copy().means, before)
 
 
+def test_arrays_of_another_shape_are_refused(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    before = scene.copy()
+    for name in ("means", "quats", "scales", "opacities"):
+        with pytest.raises(osp.ConfigError, match=f"{name}: has the shape"):
+            setattr(scene, name, getattr(scene, name)[:1])
+        np.testing.assert_array_equal(getattr(scene, name), getattr(before, name))
+    with pytest.raises(osp.ConfigError, match="sh: has the shape"):
+        scene.sh = scene.sh[:, :2]
+    with pytest.raises(osp.ConfigError, match="quats: has the shape"):
+        osp.Scene.from_arrays(before.means, before.quats[:1], before.scales, before.opacities, before.sh)
+
+
+def test_harmonics_of_another_degree_can_be_assigned(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    constant = scene.sh[:, :1].copy()
+    scene.sh = scene.sh[:, :1]
+    assert scene.sh_degree == 0
+    np.testing.assert_array_equal(scene.sh, constant)
+
+
+def test_values_out_of_range_are_refused_and_opaque_ones_are_finite(scene_file: Path) -> None:
+    scene = osp.load(scene_file)
+    for name, value in (("scales", 0.0), ("opacities", 1.1), ("opacities", np.nan)):
+        with pytest.raises(osp.ConfigError, match=f"{name}: must be"):
+            setattr(scene, name, np.full_like(getattr(scene, name), value))
+    scene.opacities = np.linspace(0, 1, len(scene))
+    assert np.isfinite(scene.opacity_logits).all()
+    np.testing.assert_allclose(scene.opacities, np.linspace(0, 1, len(scene)), atol=1e-6)
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat", ".glb"])
 def test_scene_survives_every_format(scene_file: Path, tmp_path: Path, suffix: str) -> None:
     scene = osp.load(scene_file)

@@ -11,6 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "trace"))
 from trace_scenes import make_cloud, rays_inwards, relative_error
 
 import octasplat as osp
+from octasplat.engine.gaussians.scene_facts import SceneFacts
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.reference import ReferenceParameters, ReferenceResult, trace_reference
 
@@ -159,3 +160,14 @@ def test_one_ray_is_taken_by_its_number() -> None:
     for number in (45, -1):
         assert rays[number].directions.shape == (1, 3)
         torch.testing.assert_close(osp.trace(scene, rays[number]).rgb[0], everything.rgb[number])
+
+
+def test_what_is_known_of_a_scene_goes_along_with_its_tensors(scene_file: Path) -> None:
+    scene = osp.Scene(osp.load(scene_file).gaussians, SceneFacts(turned_beyond=0.5, near_world=0.1))
+    tensors = osp.GaussianTensors.of(scene)
+    assert tensors.scene().facts == scene.facts
+    camera = scene.camera(width=48, height=32)
+    expected, found = osp.trace(scene, camera), osp.trace(tensors, camera)
+    unturned = osp.trace(osp.Scene(scene.gaussians), camera)
+    assert not torch.equal(expected.normal, unturned.normal)  # so that it matters
+    assert torch.equal(found.normal, expected.normal)

@@ -2,6 +2,7 @@
 
 import inspect
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from write_verbs import PYTHON_NAMES, VERBS, source
 import octasplat as osp
 import octasplat.verbs
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.events import Event, StageProgress
 from octasplat.engine.operations.base import build
 from octasplat.engine.operations.registry import operation, operation_names
+from octasplat.operating import given_values
 
 
 def test_verbs_are_written_from_the_requests() -> None:
@@ -40,3 +43,66 @@ def test_refused_values_have_the_sentence_of_the_request(scene_file: Path, tmp_p
 def test_arrays_and_strings_are_taken_where_numbers_and_paths_are(scene_file: Path, tmp_path: Path) -> None:
     box = np.array([-2.0, -2, -2, 2, 2, 0])
     assert osp.crop(str(scene_file), str(tmp_path / "half.ply"), box=box).kept == 600
+
+
+def test_a_misspelt_option_is_refused_with_the_nearest_name(scene_file: Path, tmp_path: Path) -> None:
+    wrong = {"spere": (0, 0, 0, 1)}
+    with pytest.raises(osp.ConfigError, match="crop has no option 'spere'; the nearest is sphere") as found:
+        osp.crop(scene_file, tmp_path / "a.ply", **wrong)
+    assert isinstance(found.value, TypeError)
+    scene = osp.load(scene_file)
+    with pytest.raises(osp.ConfigError, match="the nearest is background"):
+        osp.render(scene, scene.camera(), **{"backgroud": "white"})
+
+
+def test_what_a_preset_switches_on_can_be_said_to_be_off() -> None:
+    request = operation("surface").request
+    values = {"source": "run", "output": "a.glb", "room": True, "settle": False, "backdrop": None}
+    found = build(request, given_values(request, values))
+    assert (found.settle, found.backdrop, found.unbounded) == (False, True, True)
+    parameter = inspect.signature(osp.surface).parameters["settle"]
+    assert parameter.default is None
+
+
+@pytest.mark.parametrize("verb", ["import_", "export", "surface", "crop"])
+def test_the_scene_that_is_read_is_not_overwritten(verb: str, scene_file: Path, finished_run: Path) -> None:
+    options = {"where": "opacity > 0.5"} if verb == "crop" else {}
+    for scene, output in ((scene_file, scene_file), (finished_run, finished_run / "scene.ply")):
+        before = output.read_bytes()
+        with pytest.raises(osp.ConfigError, match="would overwrite what the command reads"):
+            getattr(osp, verb)(scene, [output] if verb == "export" else output, **options)
+        assert output.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("verb", "options"),
+    [
+        ("crop", {"where": "opacity > 0.5"}),
+        ("clean", {}),
+        ("transform", {"scale": 2.0}),
+        ("material", {"set": {"roughness": 0.3}}),
+        ("import_", {}),
+        ("edit", {"meshes": ["mesh.ply"]}),
+        ("deform", {"proxy": "cage.obj", "deformed": ["bent.obj"]}),
+    ],
+)
+def test_work_that_is_asked_to_stop_writes_nothing(
+    verb: str, options: dict[str, Any], in_folder: Path
+) -> None:
+    osp.export("scene.ply", ["mesh.ply"], format="mesh-ply")
+    source = "shiny.ply" if verb == "material" else "scene.ply"
+    with pytest.raises(osp.Cancelled):
+        getattr(osp, verb)(source, "other.ply", should_stop=lambda: True, **options)
+    assert not Path("other.ply").exists()
+
+
+def test_a_sequence_tells_its_steps_and_stops_between_them(in_folder: Path) -> None:
+    events: list[Event] = []
+    bent = ["bent.obj", "cage.obj", "bent.obj"]
+    with pytest.raises(osp.Cancelled):
+        osp.deform(
+            "scene.ply", "%d.ply", proxy="cage.obj", deformed=bent, progress=events.append,
+            should_stop=lambda: len(events) == 2,
+        )  # fmt: skip
+    assert events == [StageProgress("edit", 1, 3), StageProgress("edit", 2, 3)]
+    assert Path("1.ply").exists() and not Path("2.ply").exists()

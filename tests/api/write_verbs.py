@@ -17,7 +17,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from verb_examples import EXAMPLES
 
-from octasplat.engine.fields import Positional
+from octasplat.engine.fields import Positional, is_negatable
 from octasplat.engine.operations.base import Operation
 from octasplat.engine.operations.registry import operations
 
@@ -37,7 +37,7 @@ from pydantic import BaseModel
 
 from octasplat.engine.events import Listener
 from octasplat.engine.operations.base import never
-from octasplat.operating import run_operation
+from octasplat.operating import names_checked, run_operation
 from octasplat.places import PathLike
 from octasplat.runs import OnStep, Run, reconstruct_into
 
@@ -119,7 +119,7 @@ def _parameters(fields: dict[str, FieldInfo]) -> Iterator[tuple[str, str, bool]]
         if info.is_required():
             yield name, f"{name}: {text}", places
             continue
-        if isinstance(info.default, bool):
+        if isinstance(info.default, bool) and not is_negatable(info):
             yield name, f"{name}: {text} = {info.default}", places
             continue
         if "None" not in text.split(" | ") and text != "Any":
@@ -154,7 +154,7 @@ def function(verb: "Operation[Any, Any]") -> str:
     if verb.name == "reconstruct":
         call = f"reconstruct_into({values}, on_step, progress, should_stop, threads)"
     return (
-        f'def {PYTHON_NAMES.get(verb.name, verb.name)}(\n    {signature},\n) -> "{result}":\n'
+        f'@names_checked\ndef {PYTHON_NAMES.get(verb.name, verb.name)}(\n    {signature},\n) -> "{result}":\n'
         f'    """{verb.title}\n\n    Args:\n{wrapped}\n\n    Raises:\n'
         "        OctasplatError: something cannot be read, done or written; the text says what.\n\n"
         f'{example}\n    """\n'

@@ -69,6 +69,11 @@ def test_a_moved_run_shows_its_scene_from_the_same_places(shiny_run, octasplat, 
     assert content["scene"] == json.loads((shiny_run / "config.json").read_text())["scene"].rpartition("/")[2]
     refused = octasplat("evaluate", tmp_path / "moved")
     assert refused.exit_code == 1 and "--scene FOLDER" in refused.stderr
+    photographs = json.loads((shiny_run / "config.json").read_text())["scene"]
+    for more in (("--scene", photographs), ("--on", photographs), ("--scene", photographs, "--all-views")):
+        refused = octasplat("evaluate", tmp_path / "moved", *more)
+        assert refused.exit_code == 1 and "same world" in refused.stderr, refused.output
+        assert not (tmp_path / "moved" / "metrics.json").exists()
 
 
 def test_a_map_of_directions_is_turned():

@@ -10,8 +10,9 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from octasplat.engine.config import ReconstructionConfig, RunSettings, merged
+from octasplat.engine.config import ReconstructionConfig, RunSettings
 from octasplat.engine.errors import ConfigError
+from octasplat.engine.nested_options import merged
 from octasplat.engine.operations.base import build
 from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, run_config
 from octasplat.engine.settings_catalog import settings as catalog

@@ -10,9 +10,12 @@ from pydantic import ValidationError
 
 from octasplat.engine.errors import Cancelled
 from octasplat.engine.events import CheckpointWritten, Event, ImagesKept, StageProgress
+from octasplat.engine.operations.registry import operation
+from octasplat.engine.operations.render import RenderRequest
 from octasplat.engine.photograph_sizes import Sizes
 from octasplat.engine.render.environment_map import write_environment
 from octasplat.engine.render.images import read_image
+from octasplat.engine.run_folder import run_viewpoints
 from octasplat.workers.client.submission import Derivation, with_camera_path
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.programs import run_operation
@@ -294,3 +297,20 @@ def test_pixels_of_each_mode_are_counted_before_the_work(tmp_path):
     (tmp_path / "path.json").write_text(json.dumps(PATH))
     sent = with_camera_path(Derivation("j", "render"), tmp_path / "path.json")
     assert pixels(dict(sent.options)) == ("camera_path", 2 * 32 * 24)
+
+
+def test_numbered_images_are_gone_on_with_for_the_same_views_only(run, octasplat, tmp_path):
+    frames, images = tmp_path / "%04d.png", []
+    names = [view.name for view in run_viewpoints(run.output).views][:4]
+    with pytest.raises(Cancelled):
+        operation("render").run(
+            RenderRequest(source=run.output, output=frames, photographs=names[:3]),
+            progress=images.append,
+            should_stop=lambda: len([event for event in images if isinstance(event, StageProgress)]) > 1,
+        )
+    assert (tmp_path / "0000.png").exists()
+    others = [word for name in names[1:] for word in ("--photograph", name)]
+    refused = octasplat("render", run.output, *others, "-o", frames, "--resume")
+    assert refused.exit_code == 1 and "another render" in refused.stderr
+    same = [word for name in names[:3] for word in ("--photograph", name)]
+    assert octasplat("render", run.output, *same, "-o", frames, "--resume").exit_code == 0

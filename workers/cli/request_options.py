@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from octasplat.engine.errors import Cancelled
-from octasplat.engine.fields import Positional, Spelling
+from octasplat.engine.fields import Positional, Spelling, is_negatable
 from octasplat.engine.operations.base import (
     ContradictoryRequest,
     Operation,
@@ -201,7 +201,8 @@ def _flags(name: str, info: FieldInfo) -> tuple[str, ...]:
         return flags
     flag = "--" + name.replace("_", "-")
     inner, _ = _without_none(info.annotation)
-    return (f"{flag}/--no-{name.replace('_', '-')}" if inner is bool and info.default is True else flag,)
+    has_opposite = inner is bool and (info.default is True or is_negatable(info))
+    return (f"{flag}/--no-{name.replace('_', '-')}" if has_opposite else flag,)
 
 
 def _help(info: FieldInfo, optional: bool) -> str:

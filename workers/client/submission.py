@@ -10,6 +10,7 @@ from octasplat.engine.errors import ConfigError, OctasplatError
 from octasplat.engine.events import Listener, Warned, ignore
 from octasplat.engine.light.companions import companions
 from octasplat.engine.light.stage_file import named_files, read_stage, with_files
+from octasplat.engine.nested_options import merged
 from octasplat.engine.render.path_document import read_path_document
 from octasplat.engine.stages import counted_stage
 from octasplat.workers.client.api import Api
@@ -90,7 +91,7 @@ class Derivation:
 
 
 def with_stage(what: Derivation, stage: Path) -> Derivation:
-    """The same with a stage and the files that it names.
+    """The same with a stage and the files that it names; options that say otherwise win.
 
     Files that lie elsewhere than in or below the stage's folder, or whose names a service does not take, are
     sent under other ones.
@@ -109,18 +110,20 @@ def with_stage(what: Derivation, stage: Path) -> Derivation:
     for sent, path in tuple(files.items()):
         for beside in companions(path):
             files[(PurePosixPath(sent).parent / beside).as_posix()] = path.parent / beside
-    options = {**what.options, "stage": with_files(read, names).model_dump(mode="json")}
-    return replace(what, options=options, files={**what.files, **files})
+    stage_options = {"stage": with_files(read, names).model_dump(mode="json")}
+    return replace(what, options=merged(stage_options, what.options), files={**what.files, **files})
 
 
 def with_camera_path(what: Derivation, path: Path) -> Derivation:
     """Return the same with the cameras of a path file, whose content goes into the options.
 
+    Options that say otherwise win, as another ``camera_path.fps``.
+
     Raises:
         ConfigError: the file cannot be read, or is no camera path.
     """
     document = read_path_document(path).model_dump(mode="json", exclude_none=True)
-    return replace(what, options={**what.options, "mode": "path", "camera_path": document})
+    return replace(what, options=merged({"mode": "path", "camera_path": document}, what.options))
 
 
 def with_environments(what: Derivation, maps: Sequence[Path]) -> Derivation:
@@ -148,11 +151,14 @@ def derive(api: Api, what: Derivation, listener: Listener = ignore) -> dict[str,
 
     Returns the job.
 
-
     Raises:
+        ConfigError: a file is not there.
         ServiceError: something is refused.
         Unreachable: the service does not answer.
     """
+    for path in what.files.values():
+        if not path.is_file():
+            raise ConfigError(f"{path}: there is no such file.")
     body: dict[str, Any] = {
         "kind": what.kind,
         "options": dict(what.options),

@@ -1,5 +1,6 @@
 """Commands that talk to a service: submit, jobs, status, logs, cancel, retry, download."""
 
+import copy
 import json
 import os
 import time
@@ -81,6 +82,7 @@ def submit(
     from octasplat.workers.cli.submitting import submit, submit_and_wait
     from octasplat.workers.client.submission import Submission
 
+    _check_output(output, wait=wait)
     options: ReconstructOptions = request_of(ReconstructOptions, given)
     options.config()  # what cannot be used is refused before anything is sent
     asked = options.model_dump(mode="json", exclude_unset=True)
@@ -158,6 +160,7 @@ def derive(
         with_stage,
     )
 
+    _check_output(output, wait=wait)
     files = [_file_given(text) for text in given["files"]]
     with connected(server) as api:
         source = None if job_id is None else _job(api, job_id)["id"]
@@ -207,7 +210,7 @@ def status(job_id: str, wait: bool, as_json: bool, server: str | None, quiet: bo
     with connected(server) as api:
         job = _job(api, job_id)
         if wait:
-            job = wait_for(api, job["id"], quiet=quiet)
+            job = wait_for(api, job["id"], quiet=quiet or as_json)
     if as_json:
         click.echo(json.dumps(job, indent=2))
         return
@@ -272,7 +275,7 @@ def retry(job_id: str, from_start: bool, server: str | None, **given: Any) -> No
     body: dict[str, Any] = {"from": "start" if from_start else "checkpoint"}
     with connected(server) as api:
         job = _job(api, job_id)
-        if options := _changes(given, training=job["kind"] == "reconstruct"):
+        if options := _changes(given, job):
             body["options"] = options
         job = api.post(f"/v1/jobs/{job['id']}/retry", body)
     click.echo(f"{job['id']}: {job['state']}")
@@ -297,12 +300,22 @@ def download(
         fetch(api, job["id"], output or Path(f"octasplat-{job['id'][-12:]}"), names, quiet=quiet)
 
 
-def _changes(given: dict[str, Any], *, training: bool) -> dict[str, Any]:
-    """What is to be otherwise in the options of a job, which is a training or not."""
+def _check_output(output: Path | None, *, wait: bool) -> None:
+    """Refuse a folder for results that nobody waits for."""
+    if output is not None and not wait:
+        raise click.UsageError("-o goes with --wait; octasplat download saves the results later.")
+
+
+def _changes(given: dict[str, Any], job: dict[str, Any]) -> dict[str, Any]:
+    """What is to be otherwise in the options of a job."""
     exports = export_names(given["exports"])
     options: dict[str, Any] = {} if exports is None else {"exports": list(exports)}
-    if not training:
-        return _assigned(options, given["assignments"])
+    if job["kind"] != "reconstruct":
+        # The service replaces an option as a whole, of which a name with dots is only a part.
+        sections = {assignment.partition("=")[0].partition(".") for assignment in given["assignments"]}
+        known = {name.strip(): job["options"].get(name.strip()) for name, dot, _ in sections if dot}
+        kept = {name: value for name, value in copy.deepcopy(known).items() if isinstance(value, dict)}
+        return _assigned(kept | options, given["assignments"])
     return options | ({"assignments": list(given["assignments"])} if given["assignments"] else {})
 
 

@@ -1,0 +1,21 @@
+"""Nested options as mappings, put over each other."""
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with the values of ``over``, section by section; another kind of section begins anew.
+
+    >>> merged({"rates": {"quat": 1, "mean": 2}}, {"rates": {"quat": 3}})
+    {'rates': {'quat': 3, 'mean': 2}}
+    """
+    result = dict(base)
+    for key, value in over.items():
+        old = result.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            is_same = "kind" not in old or value.get("kind", old["kind"]) == old["kind"]
+            result[key] = merged(old, value) if is_same else value
+        else:
+            result[key] = value
+    return result

@@ -1,0 +1,86 @@
+"""Options of the commands that talk to a service: what is asked for arrives, and nothing more is replaced."""
+
+import json
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+import pytest
+
+from octasplat.engine.events import StageFinished
+from octasplat.workers.client import submission
+from octasplat.workers.client.submission import Derivation, with_camera_path, with_stage
+
+JOB = {
+    "id": "4711", "kind": "render", "label": None, "state": "failed", "psnr": None, "error": None,
+    "options": {"frames": 9, "stage": {"meshes": [{"shape": "sphere"}], "integrator": {"samples": 2}}},
+}  # fmt: skip
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict]]:
+    """What is posted to a service with one job."""
+    posted: list[dict] = []
+
+    class Service(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self._answer()
+
+        def do_POST(self) -> None:
+            posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self._answer()
+
+        def _answer(self) -> None:
+            body = json.dumps(JOB).encode()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = HTTPServer(("127.0.0.1", 0), Service)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    monkeypatch.setenv("OCTASPLAT_SERVER", f"http://127.0.0.1:{server.server_port}")
+    monkeypatch.setenv("OCTASPLAT_TOKEN", "a-token")
+    yield posted
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_part_of_an_option_leaves_the_rest_of_it(octasplat, asked: list[dict]) -> None:
+    done = octasplat("retry", "4711", "--set", "stage.integrator.samples=16", "--set", "frames=3")
+    assert done.exit_code == 0, done.output
+    stage = {"meshes": [{"shape": "sphere"}], "integrator": {"samples": 16}}
+    assert asked[0]["options"] == {"frames": 3, "stage": stage}
+
+
+def test_assignments_win_over_the_files_of_a_stage_and_a_path(tmp_path) -> None:
+    stage = tmp_path / "stage.toml"
+    stage.write_text("[[meshes]]\nshape = 'sphere'\n[integrator]\nsamples = 2\n")
+    given = {"stage": {"integrator": {"samples": 16}}, "camera_path": {"fps": 7}}
+    read = with_stage(Derivation("4711", "render", given), stage).options["stage"]
+    assert read["integrator"]["samples"] == 16 and read["meshes"][0]["shape"] == "sphere"
+    pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    path = tmp_path / "path.json"
+    frame = {"camera_to_world": pose, "fov_y_degrees": 40}
+    path.write_text(json.dumps({"width": 32, "height": 24, "fps": 5, "frames": [frame]}))
+    options = with_camera_path(Derivation("4711", "render", given), path).options
+    assert options["camera_path"]["fps"] == 7 and options["camera_path"]["width"] == 32
+
+
+@pytest.mark.parametrize("command", [("submit", "photos"), ("derive", "render", "4711")])
+def test_a_folder_for_results_needs_somebody_who_waits(octasplat, asked: list[dict], command) -> None:
+    refused = octasplat(*command, "-o", "out")
+    assert refused.exit_code == 2 and "--wait" in refused.stderr
+    assert asked == []
+
+
+def test_json_of_a_job_is_all_that_is_printed(octasplat, asked: list[dict], monkeypatch) -> None:
+    def wait_for(_api, _job_id, listener, _on_note):
+        listener(StageFinished("render", 1.0))
+        return JOB
+
+    monkeypatch.setattr(submission, "wait_for", wait_for)
+    assert json.loads(octasplat("status", "4711", "--wait", "--json").stdout) == JOB
