@@ -167,16 +167,17 @@ def estimate_relight(options: RelightOptions, photographs: Sequence[Sizes], core
 
 
 def rendered_pixels(options: PictureOptions, photographs: Sequence[Sizes]) -> int:
-    """Pixels of all images together that a render makes at most."""
+    """Pixels of all images together that a render makes at most; a preview is one image."""
+    is_preview = isinstance(options, RenderOptions) and options.preview
     if options.mode == "path" and options.camera_path is not None:
         path = options.camera_path
-        return path.frame_count * path.width * path.height
+        return (1 if is_preview else path.frame_count) * path.width * path.height
     if options.mode != "views":
-        return options.frame_count * options.width_px * options.height_px
+        return (1 if is_preview else options.frame_count) * options.width_px * options.height_px
     shrunk = [_shrunk(sizes, options.max_side) for sizes in photographs]
     if options.photographs is not None:
         largest = max((sizes.width_px * sizes.height_px for sizes in shrunk), default=0)
-        return largest * len(options.photographs)
+        return largest * (1 if is_preview else len(options.photographs))
     return sum(sizes.width_px * sizes.height_px * sizes.count for sizes in shrunk)
 
 

@@ -173,8 +173,10 @@ def run(
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.operations.scenes import check_keeps_inputs, open_scene
 
-    for path in request.files:
-        exporter_for(path, request.format)  # complain before the long work
+    found = [exporter_for(path, request.format) for path in request.files]  # complain before the long work
+    if request.colour is not None and all(exporter.holds_harmonics for exporter in found):
+        told = "colour goes with formats of one colour for each Gaussian and is passed over."
+        progress(Warned(told))
     check_keeps_inputs(request.files, [request.source])
     count = len(request.files)
     gaussians = open_scene(request.source, progress)

@@ -151,6 +151,26 @@ class PictureOptions(Options):
             return self.camera_path.fps
         return self.fps or DEFAULT_FPS
 
+    def unused(self) -> tuple[str, ...]:
+        """Return a sentence for each option that was given and says nothing about such images."""
+        rules = {
+            "max_side": ("The longer side", "views of photographs", self.mode == "views"),
+            "seconds": ("The duration of a turn", "a turntable", self.mode == "turntable"),
+            "fov_y_degrees": (
+                "The field of view", "a turntable or a single camera", self.mode in ("turntable", "camera"),
+            ),
+            "fps": (
+                "The number of images per second",
+                "a video",
+                self.format == "mp4" or self.seconds is not None,
+            ),
+        }  # fmt: skip
+        return tuple(
+            f"{noun} ({name}) goes with {whose} and is passed over."
+            for name, (noun, whose, is_used) in rules.items()
+            if not is_used and getattr(self, name) is not None
+        )
+
     @model_validator(mode="after")
     def _cameras_fit(self) -> "PictureOptions":
         if self.mode == "views" and self.format == "mp4":

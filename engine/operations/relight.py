@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from octasplat.engine.events import Listener, ignore
+from octasplat.engine.events import Listener, Warned, ignore
 from octasplat.engine.fields import ADVANCED, InputFile, Spelling, Unit
 from octasplat.engine.operations.axes import Axis, light_up
 from octasplat.engine.operations.base import Operation, never
@@ -140,6 +140,8 @@ def run(
     from octasplat.engine.stages import stopping
 
     tell = stopping(progress, should_stop)
+    for told in request.unused():
+        tell(Warned(told))
     of_run = is_run(request.source)
     environments = read_environments(request.environments, request.clamp)
     source = read_render_source(request.source, tell, dataset=request.dataset, max_side=request.max_side)

@@ -173,6 +173,8 @@ def run(
 
     told = "Stopped; the preview is as fine as it was." if request.preview else None
     tell = stopping(progress, should_stop, told)
+    for unused in request.unused():
+        tell(Warned(unused))
     max_side = request.max_side or (PREVIEW_SIDE_PX if request.preview else None)
     source = read_render_source(
         request.source, tell, dataset=request.dataset, max_side=max_side, full_size=request.stage is not None

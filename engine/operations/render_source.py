@@ -90,9 +90,15 @@ def read_render_source(
         full_size: whether to read the cameras at the full size of the photographs, too, as stages need them.
 
     Raises:
+        ConfigError: cameras of photographs are asked for, of which a file knows nothing.
         OctasplatError: it cannot be read.
     """
     if not is_run(source):
+        if dataset is not None:
+            raise ConfigError(
+                f"{source}: is no folder of a run, so that {dataset} says nothing about it; leave that "
+                "folder out, or name the cameras in another way."
+            )
         gaussians, facts = open_scene(source, progress), read_facts(source)
         settings = TraceSettings(turned_beyond=facts.turned_beyond)
         return RenderSource(gaussians, settings, facts.near_world, trained_rad=facts.pixel_rad)

@@ -57,8 +57,9 @@ class GaussianTensors:
     def of(cls, scene: Scene, *, requires_grad: bool = True) -> "GaussianTensors":
         """Return leaves with the parameters of a scene, copied; its channels do not come along."""
         arrays = (scene.means, scene.quats, scene.log_scales, scene.opacity_logits, scene.sh)
-        leaves = (torch.tensor(array, requires_grad=requires_grad) for array in arrays)
-        return cls(*leaves, facts=scene.facts)
+        leaves = [torch.tensor(array, requires_grad=requires_grad) for array in arrays]
+        means, quats, log_scales, opacity_logits, sh = leaves
+        return cls(means, quats, log_scales, opacity_logits, sh, facts=scene.facts)
 
     def tensors(self) -> list[Tensor]:
         """Return the tensors, as an optimiser takes them; no features where there are none."""

@@ -149,3 +149,12 @@ def test_for_viewers_is_for_octagon_glb(run, octasplat, tmp_path):
     for extra in (("a.ply",), ("a.glb", "--opaque")):
         result = octasplat("export", run.output, tmp_path / extra[0], *extra[1:], "--for-viewers")
         assert result.exit_code == 2 and "--for-viewers" in result.output
+
+
+def test_a_colour_that_no_format_takes_is_told(run, octasplat, tmp_path):
+    told = "colour goes with formats of one colour"
+    done = octasplat("export", run.output, tmp_path / "a.spz", "--colour", "constant")
+    assert done.exit_code == 0 and told in done.stderr
+    both = (tmp_path / "b.spz", tmp_path / "b.glb")
+    done = octasplat("export", run.output, *both, "--colour", "constant", "--threads", 1)
+    assert done.exit_code == 0 and told not in done.output, done.output

@@ -314,3 +314,34 @@ def test_numbered_images_are_gone_on_with_for_the_same_views_only(run, octasplat
     assert refused.exit_code == 1 and "another render" in refused.stderr
     same = [word for name in names[:3] for word in ("--photograph", name)]
     assert octasplat("render", run.output, *same, "-o", frames, "--resume").exit_code == 0
+
+
+def test_options_that_say_nothing_about_the_cameras_are_told(run, octasplat, tmp_path):
+    one = ("--turntable", "--frames", 1, *SIZE_WORDS)
+    done = octasplat("render", run.output, *one, "--max-side", 16, "--fps", 5, "-o", tmp_path / "one.png")
+    assert done.exit_code == 0, done.output
+    assert "(max_side) goes with views of photographs" in done.stderr and "(fps) goes with" in done.stderr
+    done = octasplat("render", run.output, "--views", "held-out", "--fov", 20, "-o", tmp_path / "views")
+    assert done.exit_code == 0 and "(fov_y_degrees) goes with" in done.stderr, done.output
+    done = octasplat("render", run.output, *one, "--fov", 20, "-o", tmp_path / "two.png")
+    assert done.exit_code == 0 and "passed over" not in done.output
+
+
+def test_photographs_beside_a_file_are_refused(run, octasplat, tmp_path):
+    scene, picture = run.output / "scene.ply", tmp_path / "a.png"
+    commands = (
+        ("render", scene, "--camera", 0, 0, -4, "-o", picture),
+        ("info", scene),
+        ("stage", "init", scene, "-o", tmp_path / "stage.toml"),
+    )
+    for command in commands:
+        refused = octasplat(*command, "--dataset", run.scene)
+        assert refused.exit_code == 1 and "no folder of a run" in refused.stderr, refused.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_preview_asks_for_the_pixels_of_one_image():
+    kind = kind_named("render")
+    stage = {"frames": 9, **SIZE, "format": "png", "stage": STAGE}
+    pixels = [kind.demands(kind.resolve({**stage, "preview": on}), [])[0].amount for on in (False, True)]
+    assert pixels == [9 * 32 * 24, 32 * 24]

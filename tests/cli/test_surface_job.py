@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from octasplat.engine.operations.base import first_complaint
 from octasplat.engine.operations.surface import MATERIAL_DEFAULTS, ROOM, SurfaceRequest
+from octasplat.engine.photograph_sizes import Sizes
 from octasplat.workers.work.kinds import kind_named
 from octasplat.workers.work.programs import run_operation
 from octasplat.workers.work.task import Task
@@ -138,3 +139,15 @@ def test_what_contradicts_is_refused(options, told):
     with pytest.raises(ValidationError) as refused:
         SURFACE.resolve(options)
     assert told in first_complaint(refused.value)
+
+
+def test_maps_and_levels_of_a_surface_have_ceilings():
+    kind = kind_named("surface")
+    options = kind.resolve({"depth_side": 8000, "texture_side": 4096, "max_triangles": "5k,50k"})
+    amounts = {(found.path, found.of): found.amount for found in kind.demands(options, [Sizes(400, 300, 10)])}
+    assert amounts == {
+        ("depth_side", "side_px"): 8000,
+        ("texture_side", "side_px"): 4096,
+        ("depth_side", "render_pixels"): 10 * 8000 * 6000,
+        ("max_triangles", "exports"): 2,
+    }

@@ -20,4 +20,4 @@ class _ExportCommand(click.Command):
             formatter.write_dl(rows)
 
 
-export = operation_command(OPERATION, cls=_ExportCommand)
+export = operation_command(OPERATION, threads=True, cls=_ExportCommand)

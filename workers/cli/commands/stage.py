@@ -11,4 +11,4 @@ def stage() -> None:
     """Make stages for octasplat render --stage."""
 
 
-stage.add_command(operation_command(OPERATION), "init")
+stage.add_command(operation_command(OPERATION, threads=True), "init")

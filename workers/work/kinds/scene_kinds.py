@@ -68,7 +68,6 @@ class SceneChange(OperationKind):
     Args:
         operation: what it does.
         title: one line for people; None takes that of the operation.
-        title: one line for people; None takes that of the operation.
         first: result of the source job without which it cannot be asked for.
         sequence: option that names the meshes of which each makes a scene.
         keeps_world: whether the result stands where the photographs show it.

@@ -1,6 +1,6 @@
 """The kind ``surface``: a mesh of the scene of a reconstruction."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,6 +10,8 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.files import check_surface_path
 from octasplat.engine.operations.base import Options
 from octasplat.engine.operations.surface import OPERATION, SurfaceOptions
+from octasplat.engine.photograph_sizes import Sizes
+from octasplat.workers.work.kinds.demands import Demand
 from octasplat.workers.work.kinds.operation_kind import OperationKind
 from octasplat.workers.work.task import Task
 
@@ -66,6 +68,20 @@ class Surface(OperationKind):
         }
         return (*super().stages(options), *(name for name, is_asked in asked.items() if is_asked))
 
+    def demands(self, options: SurfaceJobOptions, sizes: Sequence[Sizes]) -> tuple[Demand, ...]:
+        """Return the sides of the maps, the pixels of all depth maps, one a photograph, and the files."""
+        side_px = options.depth_side
+        pixels = sum(
+            size.count * side_px * max(1, side_px * min(size.width_px, size.height_px) // _longer_px(size))
+            for size in sizes
+        )
+        return (
+            Demand("depth_side", "side_px", side_px),
+            Demand("texture_side", "side_px", options.texture_side or 0),
+            Demand("depth_side", "render_pixels", pixels),
+            Demand("max_triangles", "exports", max(1, len(options.levels))),
+        )
+
     def revised(self, before: Mapping[str, Any], changes: Mapping[str, Any]) -> Options:
         """Return the options of a job with changes; what its presets decided follows those of now."""
         presets = {name: before[name] for name in _PRESETS if name in before}
@@ -79,3 +95,7 @@ class Surface(OperationKind):
         if task.scene is not None and task.source == task.run:
             places["photographs"] = task.scene
         return places
+
+
+def _longer_px(size: Sizes) -> int:
+    return max(size.width_px, size.height_px)
