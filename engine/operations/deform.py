@@ -99,7 +99,7 @@ def run(
 
     source: Path = request.source
     paths = expanded(request.deformed)
-    frames = Frames(source, request.output, paths, [source, request.proxy, *paths])
+    frames = Frames(source, request.output, paths, [source, request.proxy, *paths], request.report)
     gaussians = open_scene(source, progress)
     rest = read_mesh(request.proxy)
     corners = deformation_corners(gaussians)
@@ -114,7 +114,7 @@ def run(
         notes += [*_told(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
         frames.tell(number, progress)
-    frames.write_report(request.report, [{"deformed": str(path)} for path in paths], map(asdict, reports))
+    frames.write_report([{"deformed": str(path)} for path in paths], map(asdict, reports))
     return DeformResult(
         files=frames.files,
         folder=frames.folder,

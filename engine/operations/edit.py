@@ -75,7 +75,7 @@ def run(
     source: Path = request.source
     meshes = expanded(request.meshes)
     recovery: MeshRecovery = request
-    frames = Frames(source, request.output, meshes, [source, *meshes])
+    frames = Frames(source, request.output, meshes, [source, *meshes], request.report)
     gaussians = open_scene(source, progress)
     note = edit_note("edit", options_of(EditOptions, request))
     reports, notes = [], []
@@ -89,7 +89,7 @@ def run(
         notes += [*_told(path, report), frames.write(number, result, progress, note)]
         reports.append(report)
         frames.tell(number, progress)
-    frames.write_report(request.report, [{"mesh": str(path)} for path in meshes], map(asdict, reports))
+    frames.write_report([{"mesh": str(path)} for path in meshes], map(asdict, reports))
     return EditResult(files=frames.files, folder=frames.folder, notes=tuple(notes), reports=tuple(reports))
 
 

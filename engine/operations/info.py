@@ -127,21 +127,25 @@ def run(
     """Look at a scene; see :class:`octasplat.engine.operations.base.Run`.
 
     Raises:
-        ConfigError: the cameras of the photographs share no centre or no up direction.
+        ConfigError: the cameras of the photographs share no centre or no up direction, or a file to write is
+            the scene.
         SceneFileError: the scene cannot be read.
         OutputError: there is no scene yet, or a file cannot be written.
     """
     from octasplat.engine.operations.render_source import open_stage_scene
     from octasplat.engine.operations.scene_inspection import find_facts
+    from octasplat.engine.operations.scenes import check_keeps_inputs
     from octasplat.engine.render.images import write_png
     from octasplat.engine.writing import write_json
 
     source = request.source
+    files = tuple(path for path in (request.output, request.picture) if path is not None)
+    check_keeps_inputs(files, [source])
     opened = open_stage_scene(source, progress, dataset=request.dataset, threads=threads)
     found = find_facts(opened, None if request.up is None else axis_named(request.up))
     x, y, z = found.up_world.tolist()
     result = InfoResult(
-        files=tuple(path for path in (request.output, request.picture) if path is not None),
+        files=files,
         folder=None if request.output is None else request.output.parent,
         source=source,
         size_bytes=source.stat().st_size if source.is_file() else None,

@@ -182,6 +182,7 @@ def run_config(request: ReconstructRequest) -> "ReconstructionConfig":
     from octasplat.engine.config import read_config
 
     given = request.model_fields_set - {"source", "output", "resume", "exports"}
+    given -= {name for name in ("train", "assignments") if not getattr(request, name)}
     if not request.resume or given or not (request.output / _CONFIG).exists():
         return request.config()
     config = read_config(request.output / _CONFIG)

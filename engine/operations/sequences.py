@@ -1,5 +1,6 @@
 """Sequences: many meshes that are read one after another, and a scene that is written for each."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -8,15 +9,21 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, StageProgress
 from octasplat.engine.files import read_facts
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.operations.scenes import becomes_run, check_target, write_changed, write_scene
+from octasplat.engine.operations.scenes import (
+    becomes_run,
+    check_keeps_inputs,
+    check_target,
+    write_changed,
+    write_scene,
+)
 from octasplat.engine.writing import write_json
 
 
 def targets_for(output: Path, sources: Sequence[Path], inputs: Sequence[Path]) -> tuple[Path, ...]:
     """Return the file to write for each source: ``output`` for one, numbered files for several.
 
-    Several need a pattern such as ``out/%04d.ply``, a folder (names as those of the sources), or a plain name
-    to which ``_0000`` and so on is added.
+    Several need a pattern such as ``out/%04d.ply``, a folder (names as those of the sources, with a number
+    where several have one stem), or a plain name to which ``_0000`` and so on is added.
 
     Raises:
         ConfigError: a target is one of ``inputs``, or two targets are the same.
@@ -34,7 +41,11 @@ def targets_for(output: Path, sources: Sequence[Path], inputs: Sequence[Path]) -
             output.with_name(f"{output.stem}_{number:04d}{output.suffix}") for number in range(len(sources))
         ]
     else:
-        targets = [output / f"{source.stem}.ply" for source in sources]
+        uses = Counter(source.stem.casefold() for source in sources)
+        targets = [
+            output / (f"{stem}_{number:04d}.ply" if uses[stem.casefold()] > 1 else f"{stem}.ply")
+            for number, stem in enumerate(source.stem for source in sources)
+        ]
     for target in targets:
         check_target(target, inputs)
     if len(set(targets)) < len(targets):
@@ -51,6 +62,7 @@ class Frames:
             :func:`octasplat.engine.operations.scenes.becomes_run`.
         meshes: those that each make a scene.
         inputs: all that is read.
+        report: where the counts go, if anybody asks for them.
 
     Attributes:
         files: those that were written.
@@ -62,7 +74,14 @@ class Frames:
         SceneFileError: no format takes the name.
     """
 
-    def __init__(self, source: Path, output: Path, meshes: Sequence[Path], inputs: Sequence[Path]) -> None:
+    def __init__(
+        self,
+        source: Path,
+        output: Path,
+        meshes: Sequence[Path],
+        inputs: Sequence[Path],
+        report: Path | None = None,
+    ) -> None:
         self._source = source
         self._is_run = len(meshes) == 1 and becomes_run(source, output)
         if self._is_run:
@@ -70,6 +89,11 @@ class Frames:
             self._targets: tuple[Path, ...] = (output,)
         else:
             self._targets = targets_for(output, meshes, inputs)
+        self._report = report
+        if report is not None:
+            check_keeps_inputs([report], inputs)
+            if report.resolve() in {target.resolve() for target in self._targets}:
+                raise ConfigError(f"{report}: would overwrite a result; choose another name for the report.")
         self.files: tuple[Path, ...] = ()
         self.folder: Path | None = None
 
@@ -92,13 +116,10 @@ class Frames:
             progress(StageProgress("edit", number + 1, len(self._targets)))
 
     def write_report(
-        self,
-        path: Path | None,
-        meshes: Sequence[Mapping[str, object]],
-        reports: Iterable[Mapping[str, object]],
+        self, meshes: Sequence[Mapping[str, object]], reports: Iterable[Mapping[str, object]]
     ) -> None:
         """Write the counts of all meshes, if anybody asks for them."""
-        if path is None:
+        if self._report is None:
             return
         rows = zip(meshes, self._targets, reports, strict=True)
-        write_json(path, [{**mesh, "output": str(target), **report} for mesh, target, report in rows])
+        write_json(self._report, [{**mesh, "output": str(target), **report} for mesh, target, report in rows])

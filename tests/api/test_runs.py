@@ -148,3 +148,8 @@ def test_viewer_of_a_run_knows_its_cameras(finished_run: Path) -> None:
     fov = cameras["views"][0]["fov_y_degrees"]
     centre = osp.Camera.looking_at((0, 0, -1), (0, 0, 0), 48, 36, fov_y_degrees=fov)
     assert np.isfinite(centre.fy_px) and 10 < fov < 120
+
+
+def test_empty_settings_are_none_where_a_run_goes_on(photographs: Path, finished_run: Path) -> None:
+    run = osp.reconstruct(photographs, finished_run, resume=True, train={}, assignments=[])
+    assert run.is_finished

@@ -1,6 +1,7 @@
 """The functions of verbs are those that their requests say."""
 
 import inspect
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -106,3 +107,25 @@ def test_a_sequence_tells_its_steps_and_stops_between_them(in_folder: Path) -> N
         )  # fmt: skip
     assert events == [StageProgress("edit", 1, 3), StageProgress("edit", 2, 3)]
     assert Path("1.ply").exists() and not Path("2.ply").exists()
+
+
+def test_meshes_of_one_stem_have_scenes_of_their_own(in_folder: Path) -> None:
+    for folder in ("a", "b"):
+        Path(folder).mkdir()
+        osp.export("scene.ply", [f"{folder}/mesh.ply"], format="mesh-ply")
+    shutil.copy("a/mesh.ply", "other.ply")
+    meshes = ["a/mesh.ply", "other.ply", "b/mesh.ply"]
+    files = osp.edit("scene.ply", "scenes", meshes=meshes).files
+    assert [path.name for path in files] == ["mesh_0000.ply", "other.ply", "mesh_0002.ply"]
+    assert all(path.exists() for path in files)
+
+
+def test_reports_overwrite_no_input(in_folder: Path) -> None:
+    osp.export("scene.ply", ["mesh.ply"], format="mesh-ply")
+    before = Path("scene.ply").read_bytes(), Path("mesh.ply").read_bytes()
+    for report in ("mesh.ply", "scene.ply", "edited.ply"):
+        with pytest.raises(osp.ConfigError, match="would overwrite"):
+            osp.edit("scene.ply", "edited.ply", meshes=["mesh.ply"], report=report)
+    with pytest.raises(osp.ConfigError, match="would overwrite"):
+        osp.info("scene.ply", output="scene.ply")
+    assert before == (Path("scene.ply").read_bytes(), Path("mesh.ply").read_bytes())
