@@ -15,7 +15,7 @@ from octasplat.engine.fields import Group, Positional, Spelling
 from octasplat.engine.files.options import ExportChoices, ExportOptions, OctagonQ
 from octasplat.engine.files.registry import Exporter, exporter_for
 from octasplat.engine.operations.axes import Axis
-from octasplat.engine.operations.base import Operation, Options, Result, SourceRequest, never
+from octasplat.engine.operations.base import Operation, Options, Result, SourceRequest, never, stop_if
 
 if TYPE_CHECKING:
     from octasplat.engine.gaussians.model import FlatGaussians
@@ -187,11 +187,12 @@ def run(
             progress(Warned(text))
 
     def step(done: int) -> None:
-        if should_stop():
+        if done < count and should_stop():  # after the last file there is nothing to stop
             raise Cancelled("The export was stopped.")
         if count > 1:  # one file needs no counting
             progress(StageProgress("export", done, count))
 
+    stop_if(should_stop)
     forms = _Forms(request, gaussians, lambda: step(0), progress, threads)
     files, failed = export_files(request.files, forms.of, on_done=step, format=request.format)
     if failed is not None:

@@ -78,6 +78,21 @@ class RelightOptions(PictureOptions):
         """Whether there is one image, whatever the scene."""
         return super().is_single and len(self.environments) == 1
 
+    @property
+    def rays_across(self) -> int:
+        """Rays across a pixel of split-sum."""
+        return math.isqrt(self.samples_per_pixel)
+
+    def unused(self) -> tuple[str, ...]:
+        """Return a sentence for what was given and says nothing about such images."""
+        told = super().unused()
+        if self.by == "split-sum" and self.rays_across**2 != self.samples_per_pixel:
+            told += (
+                f"Of {self.samples_per_pixel} samples split-sum takes {self.rays_across**2}, as many across "
+                "a pixel as down.",
+            )
+        return told
+
 
 class RelightRequest(RelightOptions, PictureRequest):
     """Show a scene with materials in other light: the folder of a run, or a file of Gaussians.
@@ -192,13 +207,14 @@ def _relighter(
     from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
     from octasplat.engine.light.stage import Integrator
 
-    samples = request.samples_per_pixel
     if request.by == "split-sum":
         return SplitSumRelighter(
             source.gaussians, source.settings, learnt, extent_world=source.extent_world,
-            side=1 if samples < 4 else math.isqrt(samples), threads=threads,
+            side=request.rays_across, threads=threads,
         )  # fmt: skip
-    integrator = Integrator(samples=samples, max_depth=request.depth, roulette_depth=request.depth)
+    integrator = Integrator(
+        samples=request.samples_per_pixel, max_depth=request.depth, roulette_depth=request.depth
+    )
     return PathRelighter(source.gaussians, source.settings, integrator, threads=threads)
 
 

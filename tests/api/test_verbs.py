@@ -12,7 +12,7 @@ from write_verbs import PYTHON_NAMES, VERBS, source
 import octasplat as osp
 import octasplat.verbs
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.events import Event, StageProgress
+from octasplat.engine.events import Event, StageProgress, Warned
 from octasplat.engine.operations.base import build
 from octasplat.engine.operations.registry import operation, operation_names
 from octasplat.operating import given_values
@@ -83,6 +83,7 @@ def test_the_scene_that_is_read_is_not_overwritten(verb: str, scene_file: Path, 
         ("transform", {"scale": 2.0}),
         ("material", {"set": {"roughness": 0.3}}),
         ("import_", {}),
+        ("export", {}),
         ("edit", {"meshes": ["mesh.ply"]}),
         ("deform", {"proxy": "cage.obj", "deformed": ["bent.obj"]}),
     ],
@@ -93,7 +94,8 @@ def test_work_that_is_asked_to_stop_writes_nothing(
     osp.export("scene.ply", ["mesh.ply"], format="mesh-ply")
     source = "shiny.ply" if verb == "material" else "scene.ply"
     with pytest.raises(osp.Cancelled):
-        getattr(osp, verb)(source, "other.ply", should_stop=lambda: True, **options)
+        output = ["other.ply"] if verb == "export" else "other.ply"
+        getattr(osp, verb)(source, output, should_stop=lambda: True, **options)
     assert not Path("other.ply").exists()
 
 
@@ -129,3 +131,19 @@ def test_reports_overwrite_no_input(in_folder: Path) -> None:
     with pytest.raises(osp.ConfigError, match="would overwrite"):
         osp.info("scene.ply", output="scene.ply")
     assert before == (Path("scene.ply").read_bytes(), Path("mesh.ply").read_bytes())
+
+
+def test_an_export_that_is_whole_is_not_said_to_be_stopped(in_folder: Path) -> None:
+    asked = iter((False, True))
+    osp.export("scene.ply", ["other.ply"], should_stop=lambda: next(asked))
+    assert Path("other.ply").exists()
+
+
+def test_split_sum_tells_how_many_samples_it_takes(in_folder: Path) -> None:
+    told: list[Event] = []
+    one = {"mode": "turntable", "frames": 1, "width_px": 16, "height_px": 16, "progress": told.append}
+    osp.relight("shiny.ply", "a.png", environments=["studio.hdr"], samples=5, **one)
+    assert any(isinstance(event, Warned) and "Of 5 samples" in event.message for event in told)
+    told.clear()
+    osp.relight("shiny.ply", "b.png", environments=["studio.hdr"], samples=9, **one)
+    assert not any(isinstance(event, Warned) for event in told)
