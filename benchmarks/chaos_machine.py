@@ -100,10 +100,14 @@ class Machine:
         with self.log.open("ab") as output:
             self.process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=output)
         deadline = time.monotonic() + seconds
-        while not (self.data / "serve.json").exists():
+        # A blow at what is not found would be none, so that all of it must be there.
+        while not ((self.data / "serve.json").exists() and self._is_whole()):
             if self.process.poll() is not None or time.monotonic() > deadline:
                 raise RuntimeError(f"octasplat serve does not start:\n{self.log.read_text()[-4000:]}")
             time.sleep(0.05)
+
+    def _is_whole(self) -> bool:
+        return all(part() for part in (self.front_end, self.worker, self.database))
 
     def stop(self, seconds: float = 120) -> int:
         """Ask everything to end; returns the exit code."""
@@ -136,9 +140,13 @@ class Machine:
         """The worker that takes jobs."""
         return self.below("--queues cpu")
 
+    def kept(self) -> list[psutil.Process]:
+        """Everything that is started again when it ends: the front end and all workers."""
+        return [*self.front_end(), *self.below("octasplat worker --queues")]
+
     def front_end(self) -> list[psutil.Process]:
         """The front end."""
-        return self.below("-m service")
+        return self.below("octasplat.service.serving")
 
     def database(self) -> list[psutil.Process]:
         """The database's first process and those that it has started, in this order."""

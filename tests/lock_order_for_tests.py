@@ -1,7 +1,9 @@
 """Makes a database refuse locks that are taken in another order than that of ``workers/records/locks.py``.
 
 Functions of the names of Postgres's own stand before these in the search path of the database, so that every
-lock that a process or a trigger takes in a test is seen, whichever code it comes from.
+lock that a process or a trigger takes in a test is seen, whichever code it comes from. That rows of jobs are
+about to be locked is seen in ``set_config``, which bounds the transaction of whoever locks one
+(``workers/records/locks.py``), and by a trigger of the table.
 """
 
 import psycopg
@@ -56,6 +58,37 @@ BEGIN
     END IF;
 END;
 $$;
+-- Rows of jobs are about to be locked: none of a dataset is locked by then, if none of a job was before.
+CREATE FUNCTION lock_order.check_jobs() RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    IF pg_catalog.current_setting('lock_order.jobs', true) = 'locked' THEN
+        RETURN;
+    END IF;
+    IF EXISTS (SELECT FROM pg_catalog.pg_locks WHERE pid = pg_catalog.pg_backend_pid()
+            AND locktype = 'relation' AND relation = 'public.datasets'::regclass
+            AND mode IN ('RowShareLock', 'RowExclusiveLock')) THEN
+        RAISE EXCEPTION 'order of locks: rows of jobs are waited for while rows of datasets are locked';
+    END IF;
+    PERFORM pg_catalog.set_config('lock_order.jobs', 'locked', true);
+END;
+$$;
+CREATE FUNCTION lock_order.set_config(name text, value text, is_local boolean) RETURNS text
+LANGUAGE plpgsql AS $$
+BEGIN
+    IF name = 'idle_in_transaction_session_timeout' AND is_local THEN
+        PERFORM lock_order.check_jobs();
+    END IF;
+    RETURN pg_catalog.set_config(name, value, is_local);
+END;
+$$;
+CREATE FUNCTION lock_order.before_jobs() RETURNS trigger LANGUAGE plpgsql AS $$
+BEGIN
+    PERFORM lock_order.check_jobs();
+    RETURN NULL;
+END;
+$$;
+CREATE TRIGGER lock_order BEFORE UPDATE OR DELETE ON public.jobs
+    FOR EACH STATEMENT EXECUTE FUNCTION lock_order.before_jobs();
 """
 
 

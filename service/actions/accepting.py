@@ -79,7 +79,8 @@ async def accept_job(
         async def make() -> uuid.UUID:
             return await _make_job(connection, service, who, asked)
 
-        named = fingerprint("job", new.model_dump(mode="json"))
+        # Without what was not asked for: a version that knows more may get the repetition.
+        named = fingerprint("job", new.model_dump(mode="json", exclude_defaults=True))
         job_id, _ = await once(connection, who, key, named, make)
         return await job_view(connection, service, await owned_job(connection, who, job_id))
 

@@ -167,8 +167,12 @@ async def put_archive(service: Service, who: Principal, dataset_id: uuid.UUID, u
     async with service.pool.connection() as connection:
         dataset = await open_dataset(connection, who, dataset_id)
         left = await bytes_left(connection, dataset.owner, service.settings.quota)
+        known = await rows.files_of(connection, dataset_id)
     if dataset.holds == "files":
         raise Problem(409, "holds-files", "Files that options name are sent one by one, not as an archive.")
+    if left is not None:
+        # What it replaces goes, all of it where the archive is sent again; the exact count comes at the end.
+        left += sum(file.size_bytes for file in known)
 
     def receive() -> Awaitable[ReceivedArchive]:
         return receive_archive(
@@ -221,9 +225,9 @@ async def _enter(
     service: Service, dataset: Dataset, note: Note, received: Sequence[ReceivedFile]
 ) -> list[DatasetFile]:
     """Enter what is stored into the dataset, or none of it."""
-    service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received))
     new = [rows.NewFile(f.path, f.blob.sha256, f.blob.size_bytes, f.facts) for f in received]
     async with note.naming({file.sha256 for file in new}) as connection:
         files = await rows.put_files(connection, dataset.id, new)
         await check_bytes(connection, dataset.owner, service.settings.quota)
+    service.metrics.upload_bytes.inc(sum(file.blob.size_bytes for file in received))
     return files

@@ -251,3 +251,27 @@ def test_a_check_that_was_broken_off_is_gone_on_with(serve: Callable[..., Front]
             assert dataset is not None
             dataset["state"] = "checking"  # by a front end that was killed
         assert upload_files(api, {"a.obj": tmp_path / "a.obj"})["state"] == "committed"
+
+
+def test_a_file_that_is_gone_already_need_not_be_removed(serve: Callable[..., Front], tmp_path: Path) -> None:
+    """As when the service ended after it removed the file and before it said so."""
+    (tmp_path / "a").write_bytes(b"x")
+    there, removals = {"a", "b"}, [0]
+
+    def answer(method: str, path: str, _headers: dict[str, str], _body: bytes) -> Answer:
+        name = path.rpartition("/")[2]
+        if method == "DELETE":
+            removals[0] += 1
+            if name in there:
+                there.remove(name)
+                return 503, {"Content-Type": "application/problem+json"}, b"{}"
+            return as_json({"detail": "There is no such file."}, 404)
+        if path.startswith("/v1/datasets/d/files?"):
+            digest = hashlib.sha256(b"x").hexdigest()
+            return as_json({"files": [{"path": n, "sha256": digest} for n in sorted(there)], "next": None})
+        return as_json({"id": "d", "state": "committed" if path.endswith("/commit") else "open"})
+
+    front = serve(answer)
+    with Api(front.address) as api:
+        assert upload_files(api, {"a": tmp_path / "a"})["state"] == "committed"
+    assert removals == [2] and there == {"a"}

@@ -1,11 +1,13 @@
 """A job in a queue that no worker takes does not wait for ever."""
 
 import asyncio
+from functools import partial
 
 from octasplat.workers.queue.attempts import claim
 from octasplat.workers.queue.jobs import NewJob, create_job, get_job
 from octasplat.workers.queue.limits import end_abandoned
 from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
+from octasplat.workers.queue.rescue import Suspects
 from octasplat.workers.records.database import open_pool
 from octasplat.workers.records.ids import new_id
 from octasplat.workers.records.workers import see_worker
@@ -18,7 +20,7 @@ def test_only_what_nobody_takes_is_given_up(conninfo: str) -> None:
         async with open_pool(conninfo, max_size=4) as pool:
 
             async def give_up(hours: float = 1) -> list[str]:
-                ended = await end_abandoned(pool, SLIPS, stale_seconds=20, hours=hours)
+                ended = await end_abandoned(pool, SLIPS, stale_seconds=20, hours=hours, suspects=Suspects(0))
                 return [name for name, job in jobs.items() if job.id in ended]
 
             async with pool.connection() as connection:
@@ -50,5 +52,26 @@ def test_only_what_nobody_takes_is_given_up(conninfo: str) -> None:
                     "UPDATE jobs SET heartbeat_at = now() - interval '30 minutes' WHERE state = 'running'"
                 )
             assert await give_up() == ["served"]
+
+    asyncio.run(what())
+
+
+def test_workers_may_come_back_after_all_was_switched_off(conninfo: str) -> None:
+    async def what() -> None:
+        async with open_pool(conninfo, max_size=4) as pool:
+            async with pool.connection() as connection:
+                served = await create_job(connection, SLIPS, NewJob("me", "toy", {}, "cpu"))
+                absent = await create_job(connection, SLIPS, NewJob("me", "toy", {}, "lagre"))
+                await connection.execute("UPDATE jobs SET queued_at = now() - interval '4 days'")
+            suspects = Suspects(0.3)
+            end = partial(end_abandoned, pool, SLIPS, stale_seconds=20, hours=72, suspects=suspects)
+            assert await end() == []  # the first look, before any worker has said that it lives
+            async with pool.connection() as connection:
+                await see_worker(connection, new_id(), name="w", queues=["cpu"], slots=1, facts={})
+            await asyncio.sleep(0.4)
+            assert await end() == [absent.id]
+            async with pool.connection() as connection:
+                job = await get_job(connection, served.id)
+            assert job is not None and job.state == "queued"
 
     asyncio.run(what())

@@ -9,11 +9,11 @@ import psycopg
 import pytest
 
 from octasplat.workers.queue.attempts import Attempt, Result, claim
-from octasplat.workers.queue.jobs import NewJob, create_job, get_job
+from octasplat.workers.queue.jobs import NewJob, change_job, create_job, get_job
 from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
 from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
 from octasplat.workers.queue.storing import mark, marking, storing, unmark
-from octasplat.workers.records.database import Pool, open_pool, tried_again
+from octasplat.workers.records.database import Connection, Pool, open_pool, tried_again
 from octasplat.workers.records.datasets import begin_check, create_dataset, get_dataset, open_lost_checks
 from octasplat.workers.records.journal import events_after, log_after
 from octasplat.workers.records.locks import lock_owner, lock_store
@@ -110,6 +110,21 @@ def test_a_jump_of_the_clock_takes_no_job_away(conninfo: str) -> None:
         living, lost = await begun(pool), await begun(pool)
         async with pool.connection() as connection:  # as by a clock that jumped
             await connection.execute("UPDATE jobs SET heartbeat_at = heartbeat_at - interval '1 hour'")
+        suspects = Suspects(0.3)
+        assert await rescue_lost_jobs(pool, SLIPS, 5, suspects) == 0
+        await living.beat()
+        await asyncio.sleep(0.4)
+        assert await rescue_lost_jobs(pool, SLIPS, 5, suspects) == 1
+        assert [(await now(pool, a)).state for a in (living, lost)] == ["running", "queued"]
+
+    run(conninfo, what)
+
+
+def test_a_worker_lost_before_the_clock_was_set_back_is_missed_all_the_same(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        living, lost = await begun(pool), await begun(pool)
+        async with pool.connection() as connection:
+            await connection.execute("UPDATE jobs SET heartbeat_at = heartbeat_at + interval '1 hour'")
         suspects = Suspects(0.3)
         assert await rescue_lost_jobs(pool, SLIPS, 5, suspects) == 0
         await living.beat()
@@ -238,6 +253,30 @@ def test_the_order_of_locks_is_checked_here(conninfo: str) -> None:
             async with pool.connection() as connection:
                 await lock_owner(connection, "me")
                 await lock_store(connection, shared=False)
+
+    run(conninfo, what)
+
+
+def test_jobs_are_locked_before_datasets(conninfo: str) -> None:
+    async def what(pool: Pool) -> None:
+        attempt = await begun(pool)
+        job_id = attempt.job.id
+        async with pool.connection() as connection:
+            dataset = await create_dataset(connection, "me", "d")
+        takes: tuple[Callable[[Connection], Awaitable[object]], ...] = (
+            lambda c: get_job(c, job_id, lock=True),
+            lambda c: c.execute("UPDATE jobs SET label = 'x' WHERE id = %s", [job_id]),
+            lambda c: change_job(c, job_id, label="y", pinned=False),
+        )
+        for take in takes:
+            with pytest.raises(psycopg.errors.RaiseException, match="order of locks: rows of jobs"):
+                async with pool.connection() as connection:
+                    await get_dataset(connection, dataset.id, lock=True)
+                    await take(connection)
+        async with pool.connection() as connection:
+            await get_job(connection, job_id, lock=True)
+            await get_dataset(connection, dataset.id, lock=True)
+            await connection.execute("UPDATE jobs SET label = 'x' WHERE id = %s", [job_id])
 
     run(conninfo, what)
 

@@ -9,17 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import psycopg
 import pytest
 from service_bench import claimed, committed_dataset, running, stored
 
 sys.path.append(str(Path(__file__).parents[1] / "intake"))
 from model_builder import photograph
 from test_uploads import repr_digest
+from zip_builder import Member, build
 
 from octasplat.engine.errors import ConfigError
+from octasplat.service.actions.accepting import accept_job
+from octasplat.service.auth import Principal
+from octasplat.service.schemas.jobs import NewJob
 from octasplat.service.settings import ServiceSettings
 from octasplat.service.state import Service
 from octasplat.workers.queue.attempts import Result
+from octasplat.workers.queue.jobs import get_job
+from octasplat.workers.records import datasets as rows
 from octasplat.workers.settings import load_settings
 
 TOY = {"kind": "toy", "options": {"steps": 1}}
@@ -143,6 +150,64 @@ def test_content_that_one_has_already_is_no_more_by_a_second_name(talk: Callable
         assert answer.status_code == 413
 
     talk(conversation, quota_bytes=len(content) + 4)
+
+
+def test_an_archive_may_be_sent_again_within_the_quota(talk: Callable[..., None]) -> None:
+    """As by a client that did not hear the answer."""
+    photographs = [photograph(400 + number, 300) for number in range(3)]
+    archive = build(Member("images/a.png", photographs[0]), Member("images/b.png", photographs[1]))
+
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
+        answers = [await http.put(f"{dataset}/archive", content=archive) for _ in range(2)]
+        assert [answer.status_code for answer in answers] == [200, 200], answers[1].text
+        further = build(
+            Member("images/c.png", photograph(41, 40)), Member("images/d.png", photograph(51, 40))
+        )
+        assert (await http.put(f"{dataset}/archive", content=further)).status_code in (413, 422)
+        assert len((await http.get(f"{dataset}/files")).json()["files"]) == 2
+
+    talk(conversation, quota_bytes=len(photographs[0]) + len(photographs[1]) + 500)
+
+
+def test_an_upload_whose_transaction_is_tried_again_is_counted_once(
+    talk: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content, left = photograph(), [2]
+    put_files = rows.put_files
+
+    async def deadlocked(*given: Any) -> Any:
+        if left[0]:
+            left[0] -= 1
+            raise psycopg.errors.DeadlockDetected
+        return await put_files(*given)
+
+    monkeypatch.setattr(rows, "put_files", deadlocked)
+
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = (await http.post("/v1/datasets", json={"name": "d"})).headers["Location"]
+        assert (await http.put(f"{dataset}/files/images/a.png", content=content)).status_code == 201
+        assert left == [0] and service.metrics.upload_bytes._value.get() == len(content)
+
+    talk(conversation)
+
+
+def test_a_request_that_is_repeated_to_the_next_version_is_the_same(talk: Callable[..., None]) -> None:
+    class LaterJob(NewJob):
+        further: str | None = None
+
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = await committed_dataset(service)
+        asked = {**TOY, "dataset_id": dataset}
+        first = await http.post("/v1/jobs", json=asked, headers={"Idempotency-Key": "k"})
+        async with service.pool.connection() as connection:
+            job = await get_job(connection, uuid.UUID(first.json()["id"]))
+        assert job is not None
+        who = Principal(job.owner, frozenset({"read", "write"}))
+        again = await accept_job(service, who, LaterJob.model_validate(asked), key="k")
+        assert str(again.id) == first.json()["id"]
+
+    talk(conversation)
 
 
 def test_the_stream_of_a_job_that_is_deleted_ends(

@@ -15,12 +15,24 @@ from octasplat.workers.queue.attempts import Attempt, Result, claim
 from octasplat.workers.queue.jobs import NewJob, artifacts_of, change_job, create_job, get_job, retry_job
 from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
 from octasplat.workers.records.database import Connection, Pool, open_pool
-from octasplat.workers.records.datasets import change_dataset, create_dataset, get_dataset, put_file
+from octasplat.workers.records.datasets import (
+    begin_check,
+    change_dataset,
+    create_dataset,
+    get_dataset,
+    put_file,
+)
 from octasplat.workers.records.rows import Job
 from octasplat.workers.store.local import LocalStorage
 from octasplat.workers.store.trees import Manifest, TreeFile, publish_manifest
 from octasplat.workers.upkeep.collecting import collect
-from octasplat.workers.upkeep.retention import Forgotten, Retention, forget_expired, set_expiries
+from octasplat.workers.upkeep.retention import (
+    Forgotten,
+    Retention,
+    forget_expired,
+    forget_old_things,
+    set_expiries,
+)
 
 DAY, LONG_AGO = 86_400.0, 10 * 86_400.0
 KEEP = Retention(jobs_hours=100, jobs_hours_by_kind={"render": 1, "export": 0}, datasets_hours=50)
@@ -284,3 +296,34 @@ def test_json_null_checkpoints_do_no_harm(within: Any) -> None:
         assert (await cursor.fetchone()) == {"n": 0}
 
     within(story)
+
+
+def test_each_expired_job_goes_in_a_transaction_of_its_own(conninfo: str) -> None:
+    """As a worker does it: no row is kept locked while the next owner's lock is waited for."""
+
+    async def what() -> None:
+        async with open_pool(conninfo) as pool:
+            async with pool.connection() as connection:
+                jobs = [await create_job(connection, SLIPS, NewJob(who, "x", {}, "cpu")) for who in "abcc"]
+                checked = await create_dataset(connection, "a", "checked")
+                old = [await create_dataset(connection, who, "old") for who in "ab"]
+                await begin_check(connection, checked.id)
+            for job in jobs:
+                assert job.slip is not None
+                attempt = await claim(pool, job.id, job.slip, "w")
+                assert attempt is not None
+                await attempt.fail({"type": "x", "message": "x"})
+            async with pool.connection() as connection:
+                past = "now() - interval '1 hour'"
+                await connection.execute(f"UPDATE jobs SET expires_at = {past}".encode())
+                await connection.execute(f"UPDATE datasets SET used_at = {past}".encode())
+                query = f"UPDATE datasets SET expires_at = {past} WHERE id = ANY(%s)"
+                await connection.execute(query.encode(), [[dataset.id for dataset in old]])
+            await forget_old_things(pool, KEEP, 1.0)
+            async with pool.connection() as connection:
+                assert [await get_job(connection, job.id) for job in jobs] == [None] * 4
+                assert [await get_dataset(connection, dataset.id) for dataset in old] == [None] * 2
+                left = await get_dataset(connection, checked.id)
+            assert left is not None and left.state == "open"
+
+    asyncio.run(what())

@@ -155,7 +155,11 @@ def _send_missing(
     there = {f["path"]: f for f in api.pages(f"/v1/datasets/{dataset_id}/files", "files", limit=5000)}
     wanted = {file.name for file in files}
     for path in there.keys() - wanted:
-        api.request("DELETE", _address(dataset_id, path))
+        try:
+            api.request("DELETE", _address(dataset_id, path))
+        except ServiceError as error:
+            if error.status != 404:  # an earlier try, whose answer was lost, has removed it
+                raise
     counter = _Counter(sum(file.size_bytes for file in files), progress)
 
     def send(file: LocalFile) -> None:

@@ -15,12 +15,9 @@ from octasplat.workers.records.database import Connection, naming
 from octasplat.workers.records.errors import Conflict, Missing
 from octasplat.workers.records.ids import new_id
 from octasplat.workers.records.journal import add_event
-from octasplat.workers.records.locks import lock_owner
+from octasplat.workers.records.locks import about_to_lock_jobs, lock_owner
 from octasplat.workers.records.rows import Artifact, Job
 from octasplat.workers.records.texts import as_json, as_json_or_null
-
-LOCK_SECONDS = 10
-"""A transaction that has locked a job and falls silent for so long is undone; its process is gone."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +65,8 @@ async def create_job(connection: Connection, slips: Slips, new: NewJob) -> Job:
 async def get_job(connection: Connection, job_id: uuid.UUID, *, lock: bool = False) -> Job | None:
     """The job of that id, or None; with ``lock`` nobody else changes it until the transaction ends."""
     query = "SELECT {} FROM jobs WHERE id = %s FOR UPDATE" if lock else "SELECT {} FROM jobs WHERE id = %s"
-    if lock:  # for all it knows the database would wait hours for a host that vanished
-        limit = "SELECT set_config('idle_in_transaction_session_timeout', %s, true)"
-        await connection.execute(limit, [f"{LOCK_SECONDS}s"])
+    if lock:
+        await about_to_lock_jobs(connection)
     async with connection.cursor(row_factory=class_row(Job)) as cursor:
         await cursor.execute(naming(query, Job), [job_id])
         return await cursor.fetchone()

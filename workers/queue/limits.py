@@ -9,6 +9,7 @@ from psycopg.rows import class_row
 from octasplat.workers.queue.attempts import end_job
 from octasplat.workers.queue.jobs import get_job
 from octasplat.workers.queue.port import Slips
+from octasplat.workers.queue.rescue import Suspects
 from octasplat.workers.records.database import Connection, Pool, naming
 from octasplat.workers.records.rows import TERMINAL, Job
 
@@ -34,8 +35,18 @@ async def seconds_spent(connection: Connection, job: Job) -> float:
     return float(row["seconds"]) if row else 0.0
 
 
-async def end_abandoned(pool: Pool, slips: Slips, *, stale_seconds: float, hours: float) -> list[uuid.UUID]:
+async def end_abandoned(
+    pool: Pool, slips: Slips, *, stale_seconds: float, hours: float, suspects: Suspects
+) -> list[uuid.UUID]:
     """Fail jobs that have waited for ``hours`` in a queue that no worker has taken for as long.
+
+    Args:
+        pool: connections.
+        slips: the queue.
+        stale_seconds: after how long a worker counts as gone.
+        hours: how long they may wait; 0 lets them.
+        suspects: those of the last time. Where all of the service was switched off, or slept, its workers
+            come back a moment after whoever calls this.
 
     Returns:
         The jobs.
@@ -61,7 +72,7 @@ async def end_abandoned(pool: Pool, slips: Slips, *, stale_seconds: float, hours
             ),
             {"limit": 3600 * hours, "stale": stale_seconds},
         )
-        found = await cursor.fetchall()
+        found = suspects.lost(await cursor.fetchall())
     ended = []
     for job in found:
         async with pool.connection() as connection, connection.transaction():

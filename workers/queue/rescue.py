@@ -12,6 +12,7 @@ from octasplat.workers.queue.attempts import rescue
 from octasplat.workers.queue.jobs import get_job, queue_again
 from octasplat.workers.queue.port import Slips
 from octasplat.workers.records.database import Pool, naming
+from octasplat.workers.records.locks import about_to_lock_jobs
 from octasplat.workers.records.rows import Job
 
 logger = logging.getLogger(__name__)
@@ -21,7 +22,8 @@ class Suspects:
     """Attempts that were not heard of for long by the database's clock, and for how long that is known here.
 
     That clock may jump, as on a laptop that slept, and then nobody was heard of for long. So only those are
-    lost that are still not heard of a while later, by a clock that does not jump.
+    lost that are still not heard of a while later, by a clock that does not jump. After a jump back the last
+    word of a lost worker lies in the future; it is silent too.
 
     Args:
         wait_seconds: how long that is; by then every worker that lives was heard of.
@@ -55,17 +57,19 @@ async def rescue_lost_jobs(pool: Pool, slips: Slips, stale_seconds: float, suspe
     """
     async with pool.connection() as connection:
         async with connection.transaction(), connection.cursor(row_factory=class_row(Job)) as cursor:
+            await about_to_lock_jobs(connection)
             await cursor.execute(
                 naming(
                     """
                 SELECT {} FROM jobs
                 WHERE state IN ('running', 'canceling')
-                  AND heartbeat_at < now() - make_interval(secs => %s)
+                  AND NOT heartbeat_at BETWEEN now() - make_interval(secs => %(stale)s)
+                    AND now() + make_interval(secs => %(stale)s)
                 ORDER BY id FOR UPDATE SKIP LOCKED
                 """,
                     Job,
                 ),
-                [stale_seconds],
+                {"stale": stale_seconds},
             )
             lost = suspects.lost(await cursor.fetchall())
             for job in lost:

@@ -98,7 +98,7 @@ def _wait_for_turn(connection: psycopg.Connection) -> None:
         time.sleep(_LOOK_SECONDS)
 
 
-def _apply(connection: psycopg.Connection, step: Step) -> None:
+def apply_step(connection: psycopg.Connection, step: Step) -> None:
     """Apply a step. Its locks are asked for again and again for a short time each.
 
     Whoever waits for the lock of a table holds up everybody who comes after it, so that none is waited for
@@ -178,7 +178,7 @@ def _apply_missing(connection: psycopg.Connection, only: Collection[str] | None)
     for step in steps:
         left_out = only is not None and step.component == OURS and step.name not in only
         if (step.component, step.name) not in applied and not left_out:
-            _apply(connection, step)
+            apply_step(connection, step)
             yield step.name
     connection.execute(
         """

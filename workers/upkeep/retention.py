@@ -11,11 +11,14 @@ from dataclasses import dataclass
 from psycopg import sql
 
 from octasplat.workers.queue.jobs import delete_job, get_job
-from octasplat.workers.records.database import Connection
-from octasplat.workers.records.datasets import get_dataset
+from octasplat.workers.records.audit import forget_old_entries
+from octasplat.workers.records.database import Connection, Pool
+from octasplat.workers.records.datasets import get_dataset, open_lost_checks
 from octasplat.workers.records.errors import Conflict
-from octasplat.workers.records.locks import lock_owner
+from octasplat.workers.records.locks import about_to_lock_jobs, lock_owner
+from octasplat.workers.records.sessions import forget_old_sessions
 from octasplat.workers.settings import Retention
+from octasplat.workers.upkeep.webhooks.outbox import forget_old
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +35,31 @@ class Forgotten:
 
     jobs: int
     datasets: int
+
+
+async def forget_old_things(pool: Pool, retention: Retention, audit_hours: float) -> None:
+    """Let go of what is older than it is to be kept, and open what a lost process has closed.
+
+    Each step is a transaction of its own: rows that one has locked are not kept from others while the next
+    one waits for the lock of an owner.
+
+    Args:
+        pool: connections.
+        retention: how long jobs and datasets are kept.
+        audit_hours: how long entries of the audit are kept.
+    """
+    async with pool.connection() as connection:
+        if opened := await open_lost_checks(connection):
+            logger.warning("%d datasets were closed by checks that were lost, and are open again", opened)
+    async with pool.connection() as connection:
+        await set_expiries(connection, retention)
+    async with pool.connection() as connection:
+        await forget_expired(connection)
+    for forget in (forget_old, forget_old_keys, forget_old_sessions):
+        async with pool.connection() as connection:
+            await forget(connection)
+    async with pool.connection() as connection:
+        await forget_old_entries(connection, audit_hours)
 
 
 async def set_expiries(connection: Connection, retention: Retention) -> None:
@@ -145,8 +173,9 @@ async def thin_progress(connection: Connection, keep: int = KEPT_PROGRESS) -> in
 
 async def _expired(connection: Connection, table: str) -> list[uuid.UUID]:
     query = sql.SQL("SELECT id FROM {} WHERE expires_at < now() AND NOT pinned ORDER BY expires_at LIMIT %s")
-    cursor = await connection.execute(query.format(sql.Identifier(table)), [_AT_ONCE])
-    return [row["id"] for row in await cursor.fetchall()]
+    async with connection.transaction():  # which ends here, so that each is forgotten in one of its own
+        cursor = await connection.execute(query.format(sql.Identifier(table)), [_AT_ONCE])
+        return [row["id"] for row in await cursor.fetchall()]
 
 
 async def _forget_job(connection: Connection, job_id: uuid.UUID) -> bool:
@@ -156,6 +185,7 @@ async def _forget_job(connection: Connection, job_id: uuid.UUID) -> bool:
             if job is None:
                 return False
             await lock_owner(connection, job.owner)
+            await about_to_lock_jobs(connection)
             cursor = await connection.execute(
                 "SELECT owner FROM jobs WHERE id = %s AND expires_at < now() AND NOT pinned FOR UPDATE",
                 [job_id],

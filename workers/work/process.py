@@ -31,12 +31,9 @@ from octasplat.workers.queue.fairness import choose
 from octasplat.workers.queue.limits import end_abandoned
 from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
 from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
-from octasplat.workers.records.audit import forget_old_entries
 from octasplat.workers.records.database import Pool, open_pool
-from octasplat.workers.records.datasets import open_lost_checks
 from octasplat.workers.records.ids import new_id
 from octasplat.workers.records.migrate import wait_for_tables
-from octasplat.workers.records.sessions import forget_old_sessions
 from octasplat.workers.records.workers import forget_lost_workers, forget_worker, see_worker
 from octasplat.workers.settings import WorkerSettings, worker_connections
 from octasplat.workers.store.errors import StorageError
@@ -44,8 +41,7 @@ from octasplat.workers.store.local import LocalStorage
 from octasplat.workers.store.opening import open_storage
 from octasplat.workers.store.room import Room
 from octasplat.workers.upkeep.collecting import collect
-from octasplat.workers.upkeep.retention import forget_expired, forget_old_keys, set_expiries, thin_progress
-from octasplat.workers.upkeep.webhooks.outbox import forget_old
+from octasplat.workers.upkeep.retention import forget_old_things, thin_progress
 from octasplat.workers.upkeep.webhooks.sending import Sender
 from octasplat.workers.work.chores import Chore, ChoreFailed, keep_doing
 from octasplat.workers.work.contact import DATABASE_ERRORS
@@ -66,6 +62,8 @@ STORE_SWEEP_SECONDS = 3600.0
 THIN_SECONDS = 600.0
 ABANDONED_SECONDS = 86_400.0
 ROOM_LOOK_SECONDS = 5.0
+WORKERS_BACK_SECONDS = 600.0
+"""A queue is taken for abandoned when it has been seen without a worker for so long, however old its jobs."""
 LEFT_POLLS = 3
 """A job that is left to workers of another version is kept from all for so many looks at the queue ..."""
 LEFT_SECONDS = 15.0
@@ -165,6 +163,7 @@ class _Worker:
         self._left: Counter[uuid.UUID] = Counter()
         # A worker that lives is heard of in between, also where all of this machine stood still.
         self._suspects = Suspects(1.5 * settings.heartbeat_seconds + settings.poll_seconds)
+        self._abandoned = Suspects(WORKERS_BACK_SECONDS)
         self._sender = Sender(pool, settings.webhook_hosts)
 
     async def run(self) -> int:
@@ -332,20 +331,13 @@ class _Worker:
 
     async def _forget(self) -> None:
         """Let go of what is older than it is to be kept."""
-        async with self._pool.connection() as connection:
-            if opened := await open_lost_checks(connection):
-                logger.warning("%d datasets were closed by checks that were lost, and are open again", opened)
-            await set_expiries(connection, self._settings.retention)
-            await forget_expired(connection)
-            await forget_old(connection)
-            await forget_old_keys(connection)
-            await forget_old_sessions(connection)
-            await forget_old_entries(connection, self._settings.keep_audit_hours)
+        await forget_old_things(self._pool, self._settings.retention, self._settings.keep_audit_hours)
         for job_id in await end_abandoned(
             self._pool,
             self._around.slips,
             stale_seconds=self._settings.stale_seconds,
             hours=self._settings.absent_queue_hours,
+            suspects=self._abandoned,
         ):
             logger.warning("job %s waited too long in a queue that no worker takes", job_id)
 
