@@ -1,6 +1,7 @@
 """For all tests: array shapes are checked at run time, and the photographed scenes are found."""
 
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before OpenMP is loaded, as the command line does
 
 ROOT = Path(__file__).resolve().parent.parent
+# The memory of written files is that of the tests, not of whoever runs them.
+os.environ["OCTASPLAT_WRITTEN"] = str(Path(tempfile.mkdtemp(prefix="octasplat-tests-")) / "written.sqlite")
 
 
 def checked_modules() -> list[str]:

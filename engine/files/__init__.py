@@ -4,7 +4,13 @@ The rest of the engine knows the functions that are named here, and no format.
 """
 
 from octasplat.engine.files.channel_columns import ChannelChoice
-from octasplat.engine.files.exporting import check_surface_path, export_losses, export_scene, write_surface
+from octasplat.engine.files.exporting import (
+    check_surface_path,
+    export_losses,
+    export_scene,
+    surface_files,
+    write_surface,
+)
 from octasplat.engine.files.mesh import Mesh
 from octasplat.engine.files.options import ExportOptions
 from octasplat.engine.files.reading import read_facts, read_mesh, read_scene
@@ -44,6 +50,7 @@ __all__ = [
     "read_mesh",
     "read_scene",
     "register",
+    "surface_files",
     "writable_formats",
     "write_surface",
 ]

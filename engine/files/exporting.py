@@ -72,6 +72,16 @@ def check_surface_path(path: Path, *, textured: bool, lit: bool = False) -> None
     _surface_writer(path, textured, lit)
 
 
+def surface_files(path: Path, *, textured: bool) -> tuple[Path, ...]:
+    """Return every file that a surface is written to, ``path`` first.
+
+    Raises:
+        ConfigError: the suffix is unknown, or cannot hold a texture.
+    """
+    writer = _surface_writer(path, textured, False)
+    return (path, *(writer.beside(path) if textured else ()))
+
+
 def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     """Write ``mesh`` as GLB, PLY or OBJ, as its suffix says, and return every file written, ``path`` first.
 

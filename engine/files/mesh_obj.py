@@ -327,7 +327,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
         OSError: a file cannot be written.
     """
     soup = OctagonSoup(gaussians, path, options)
-    material, texture = path.with_suffix(".mtl"), path.with_name(f"{path.stem}_alpha.png")
+    material, texture = _octagon_files(path)
     with replacing(texture) as temporary:
         temporary.write_bytes(grey_png(options.texture_size, options.q))
     write_text(material, f"{_material(MATERIAL)}map_d {texture.name}\n")
@@ -374,7 +374,7 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     """
     head, files = "# octasplat surface\n", [path]
     if mesh.texture_srgb is not None:
-        material, image = path.with_suffix(".mtl"), path.with_suffix(".png")
+        material, image = _surface_files(path)
         with replacing(image) as temporary:
             temporary.write_bytes(png_bytes(mesh.texture_srgb))
         write_text(material, f"{_material('surface')}map_Kd {image.name}\n")
@@ -395,6 +395,16 @@ def write_surface(mesh: TriangleMesh, path: Path) -> tuple[Path, ...]:
     return tuple(files)
 
 
+def _octagon_files(path: Path) -> tuple[Path, Path]:
+    """Return the files of the material and the texture of octagons."""
+    return path.with_suffix(".mtl"), path.with_name(f"{path.stem}_alpha.png")
+
+
+def _surface_files(path: Path) -> tuple[Path, Path]:
+    """Return the files of the material and the texture of a surface."""
+    return path.with_suffix(".mtl"), path.with_suffix(".png")
+
+
 def _write_lines(write: Callable[[str], object], line: str, rows: np.ndarray) -> None:
     for start in range(0, len(rows), LINES_AT_ONCE):
         part = rows[start : start + LINES_AT_ONCE]
@@ -402,7 +412,13 @@ def _write_lines(write: Callable[[str], object], line: str, rows: np.ndarray) ->
 
 
 register(
-    Exporter("obj", ("*.obj",), "octagon mesh as OBJ with vertex colours, without opacity", write_octagons)
+    Exporter(
+        "obj",
+        ("*.obj",),
+        "octagon mesh as OBJ with vertex colours, without opacity",
+        write_octagons,
+        beside=_octagon_files,
+    )
 )
 register(MeshReader("obj", ("*.obj",), read, read_looks))
-register(SurfaceWriter("obj", ("*.obj",), write_surface, textured=True))
+register(SurfaceWriter("obj", ("*.obj",), write_surface, textured=True, beside=_surface_files))

@@ -20,6 +20,12 @@ from octasplat.engine.surface.mesh import TriangleMesh
 
 HEAD_BYTES = 4096
 
+
+def no_files(_path: Path) -> tuple[Path, ...]:
+    """Return no files: nothing is written beside the one that is named."""
+    return ()
+
+
 SceneReader = Callable[[Path], GaussianCloud]
 SceneWriter = Callable[[FlatGaussians, Path, ExportOptions], tuple[Path, ...]]
 
@@ -56,6 +62,7 @@ class Exporter(Entry):
         lacking: what is missing on this machine to write it, to be read after the file's name, or None.
         holds_channels: whether it writes named channels, too.
         holds_harmonics: whether colours may change with the direction.
+        beside: names the files that are written beside the path, if there are any.
     """
 
     noun: ClassVar[str] = "export"
@@ -64,6 +71,7 @@ class Exporter(Entry):
     lacking: Callable[[], str | None] = lambda: None
     holds_channels: bool = False
     holds_harmonics: bool = False
+    beside: Callable[[Path], tuple[Path, ...]] = no_files
 
 
 @dataclass(frozen=True)
@@ -92,12 +100,14 @@ class SurfaceWriter(Entry):
         write: writes the surface and returns every file written, the path itself first.
         textured: whether it can hold a texture.
         lit: whether it can hold materials.
+        beside: names the files that are written beside the path for a texture, if there are any.
     """
 
     noun: ClassVar[str] = "surface"
     write: Callable[[TriangleMesh, Path], tuple[Path, ...]]
     textured: bool
     lit: bool = False
+    beside: Callable[[Path], tuple[Path, ...]] = no_files
 
 
 _TABLE = FormatTable(__name__.rpartition(".")[0])

@@ -24,7 +24,17 @@ class Request(Options):
     """Base of requests: the options of a verb, the input that it reads and the output that it writes."""
 
 
-class SourceRequest(Request):
+class WritingRequest(Request):
+    """Base of requests that write files where their users say; see ``written_files`` for what is replaced."""
+
+    overwrite: bool = Field(
+        False,
+        description="Replace files that are there already, too, which are not of an earlier run of this "
+        "command or were changed since. What is read is never replaced.",
+    )
+
+
+class SourceRequest(WritingRequest):
     """Base of requests that read a scene."""
 
     source: Source = Field(description="The scene to read: a file of any format, or the folder of a run.")
@@ -216,6 +226,7 @@ __all__ = [
     "SceneRequest",
     "ScenesWritten",
     "SourceRequest",
+    "WritingRequest",
     "build",
     "complaint",
     "first_complaint",

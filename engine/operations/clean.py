@@ -95,7 +95,7 @@ def run(
 
     source: Path = request.source
     if request.output is not None:
-        check_changed(source, request.output)
+        check_changed("clean", request, request.output)
     gaussians = open_scene(source, progress)
     share = request.near_share
     zones = run_near_zones(source, share) if share > 0 and is_run(source) else None

@@ -65,7 +65,7 @@ def run(
     from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
 
     source: Path = request.source
-    check_changed(source, request.output)
+    check_changed("crop", request, request.output)
     gaussians = open_scene(source, progress)
     keep = chosen_by(gaussians, request)
     if not keep.any():

@@ -99,7 +99,7 @@ def run(
 
     source: Path = request.source
     paths = expanded(request.deformed)
-    frames = Frames(source, request.output, paths, [source, request.proxy, *paths], request.report)
+    frames = Frames("deform", request, paths, [request.proxy])
     gaussians = open_scene(source, progress)
     rest = read_mesh(request.proxy)
     corners = deformation_corners(gaussians)

@@ -75,7 +75,7 @@ def run(
     source: Path = request.source
     meshes = expanded(request.meshes)
     recovery: MeshRecovery = request
-    frames = Frames(source, request.output, meshes, [source, *meshes], request.report)
+    frames = Frames("edit", request, meshes)
     gaussians = open_scene(source, progress)
     note = edit_note("edit", options_of(EditOptions, request))
     reports, notes = [], []

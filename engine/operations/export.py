@@ -171,13 +171,16 @@ def run(
     from octasplat.engine.files import export_losses
     from octasplat.engine.files.several import export_files
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scenes import check_keeps_inputs, open_scene
+    from octasplat.engine.operations.scenes import check_scenes, open_scene
+    from octasplat.engine.operations.written_files import remember_written
 
-    found = [exporter_for(path, request.format) for path in request.files]  # complain before the long work
+    check_scenes(
+        "export", request.files, [request.source], overwrite=request.overwrite, format=request.format
+    )
+    found = [exporter_for(path, request.format) for path in request.files]
     if request.colour is not None and all(exporter.holds_harmonics for exporter in found):
         told = "colour goes with formats of one colour for each Gaussian and is passed over."
         progress(Warned(told))
-    check_keeps_inputs(request.files, [request.source])
     count = len(request.files)
     gaussians = open_scene(request.source, progress)
     if request.materials:
@@ -196,6 +199,7 @@ def run(
     forms = _Forms(request, gaussians, lambda: step(0), progress, threads)
     files, failed = export_files(request.files, forms.of, on_done=step, format=request.format)
     if failed is not None:
+        remember_written("export", files)  # for the same command, once the others can be written
         raise ExportFailed(failed)
     return ExportResult(files=files)
 

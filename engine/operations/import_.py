@@ -10,7 +10,7 @@ from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import InputFile, Positional, Spelling
 from octasplat.engine.files.channel_columns import ChannelChoice
 from octasplat.engine.gaussians.flattening import ImportReport
-from octasplat.engine.operations.base import Operation, Options, Request, Result, never, stop_if
+from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never, stop_if
 
 
 def read_channels(value: object) -> object:
@@ -46,7 +46,7 @@ class ImportOptions(Options):
     )
 
 
-class ImportRequest(ImportOptions, Request):
+class ImportRequest(ImportOptions, WritingRequest):
     """Read IN, a scene of Gaussians in any known format, and write OUT.ply in the layout of 3DGS.
 
     Formats: 3DGS PLY, compressed PLY (PlayCanvas, SuperSplat), .splat, .spz, .sog or the folder of one, and
@@ -111,10 +111,10 @@ def run(
     """
     from octasplat.engine.files import read_facts, read_scene
     from octasplat.engine.files.gaussian_ply import write_gaussian_ply
-    from octasplat.engine.operations.scenes import check_keeps_inputs, tell_import_losses
+    from octasplat.engine.operations.scenes import check_scenes, tell_import_losses
 
     source: Path = request.file
-    check_keeps_inputs([request.output], [source])
+    check_scenes("import", [request.output], [source], overwrite=request.overwrite)
     gaussians, report = read_scene(
         source,
         request.format,

@@ -13,7 +13,7 @@ from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES, QUANTILES, HitF
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Source, Spelling
 from octasplat.engine.operations.axes import Axis, axis_named
-from octasplat.engine.operations.base import Operation, Options, Request, Result, never, stop_if
+from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never, stop_if
 
 _BAR = 24
 
@@ -24,7 +24,7 @@ class InfoOptions(Options):
     up: Axis | None = Field(None, description="The axis of a file that points up.  [default: -y]")
 
 
-class InfoRequest(InfoOptions, Request):
+class InfoRequest(InfoOptions, WritingRequest):
     """Tell what is in IN, the folder of a run or a file of Gaussians in any splat format.
 
     Counts, bounds, the direction that is up, harmonics, opacities, sizes, memory, and how many Gaussians a
@@ -134,13 +134,13 @@ def run(
     """
     from octasplat.engine.operations.render_source import open_stage_scene
     from octasplat.engine.operations.scene_inspection import find_facts
-    from octasplat.engine.operations.scenes import check_keeps_inputs
+    from octasplat.engine.operations.written_files import check_targets
     from octasplat.engine.render.images import write_png
     from octasplat.engine.writing import write_json
 
     source = request.source
     files = tuple(path for path in (request.output, request.picture) if path is not None)
-    check_keeps_inputs(files, [source])
+    check_targets("info", files, [source, request.dataset], overwrite=request.overwrite)
     opened = open_stage_scene(source, progress, dataset=request.dataset, threads=threads)
     found = find_facts(opened, None if request.up is None else axis_named(request.up))
     x, y, z = found.up_world.tolist()

@@ -76,7 +76,7 @@ def run(
     from octasplat.engine.run_folder import SCENE, is_run
 
     source, output = request.source, request.output
-    check_changed(source, output)
+    check_changed("material", request, output, [request.mesh, *request.masks])
     gaussians = open_scene(source, progress)
     require_materials(gaussians, source / SCENE if is_run(source) else source)
     chosen = chosen_by(gaussians, request.model_copy(update={"inverse": False}))

@@ -76,7 +76,7 @@ def run(
 
     first: Path = request.source
     sources = (first, *request.scenes)
-    check_changed(first, request.output, request.scenes)
+    check_changed("merge", request, request.output, request.scenes)
     scenes = [open_scene(source, progress) for source in sources]
     every = dict.fromkeys(name for scene in scenes for name in scene.channels)
     for source, scene in zip(sources, scenes, strict=True):

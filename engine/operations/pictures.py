@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.fields import ADVANCED, DatasetFolder, Output, Source, Spelling, Unit
 from octasplat.engine.operations.axes import Axis
-from octasplat.engine.operations.base import Options, Request
+from octasplat.engine.operations.base import Options, WritingRequest
 from octasplat.engine.render.names import IMAGE_SUFFIXES, names_by_number
 from octasplat.engine.render.path_document import (
     MAX_FRAMES,
@@ -199,7 +199,7 @@ class PictureOptions(Options):
         return self
 
 
-class PictureRequest(PictureOptions, Request):
+class PictureRequest(PictureOptions, WritingRequest):
     """A render with the scene that is read and the place where pictures are written.
 
     Where they are not given, the format is that of the output's name, and the mode that of the cameras that

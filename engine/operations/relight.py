@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from octasplat.engine.light.relighting import Relighter
     from octasplat.engine.operations.render_source import RenderSource
     from octasplat.engine.render.jobs import Shot
+    from octasplat.engine.scene import Viewpoints
     from octasplat.engine.shading.material_settings import MaterialSettings
 
 SPLIT_SUM_RAYS = 4
@@ -147,10 +148,13 @@ def run(
     from octasplat.engine.config import read_config
     from octasplat.engine.gaussians.materials import require_materials
     from octasplat.engine.light.relit_pictures import RelitPaint, lit_shots, read_environments
-    from octasplat.engine.operations.render_source import read_render_source, requested_cameras
+    from octasplat.engine.operations.render_source import (
+        picture_output,
+        read_render_source,
+        requested_cameras,
+    )
     from octasplat.engine.render.identity import identity_of
     from octasplat.engine.render.jobs import camera_shots
-    from octasplat.engine.render.output import RenderOutput, Resumption
     from octasplat.engine.run_folder import CONFIG, SCENE, is_run
     from octasplat.engine.stages import stopping
 
@@ -164,18 +168,14 @@ def run(
     learnt = read_config(request.source / CONFIG).train.materials if of_run else None
     up = light_up(request.source, request.up)
     cameras = None if request.on is not None else requested_cameras(request, source)
-    shots = _views(request, source) if cameras is None else camera_shots(cameras)
+    views, shots = _views(request, source) if cameras is None else (None, camera_shots(cameras))
     lightings = lit_shots(list(environments), shots, request.rotation_degrees, spin=request.spin)
-    resumption = Resumption(request.resume, request.or_anew, request.frames_folder)
-    output = RenderOutput(request.output, request.frame_rate, request.format == "exr", resumption)
-    output.check_count(len(lightings))
+    output = picture_output("relight", request, tuple(lightings), [request.on, *request.environments])
     background = request.background or source.background
-    # Where the views of photographs are is said by the rays of the first and last of them.
-    ends = [shots[k].rays() for k in (0, -1)]
     kept = output.kept_images(
         identity_of(
             "relight", source.gaussians, source.settings, list(environments), list(environments.values()), up,
-            cameras, len(shots), [(rays.origin_world, rays.directions_world) for rays in ends], request.by,
+            cameras, views, source.near_world, len(shots), request.by,
             request.samples_per_pixel, request.depth, request.rotation_degrees, request.spin, background,
             request.format, *output.numbered(shots),
         )
@@ -186,18 +186,22 @@ def run(
     return RelightResult(files=files, folder=output.folder, images=len(lightings))
 
 
-def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Shot, ...]":
+def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Viewpoints, tuple[Shot, ...]]":
+    """Return the views of photographs that are asked for, and the cameras of all photographs among them."""
     import numpy as np
 
     from octasplat.engine.operations.render_source import requested_views
     from octasplat.engine.render.jobs import view_shots
-    from octasplat.engine.scene import load_scene
+    from octasplat.engine.scene import Viewpoints, load_scene
 
     if request.on is None:
-        return requested_views(request, source)
+        shots = requested_views(request, source)
+        assert source.viewpoints is not None, "views were asked for"
+        return Viewpoints(source.viewpoints.views, source.viewpoints.cameras), shots
     max_side = request.max_side or source.max_side
     others = load_scene(request.on, max_side=max_side, least_views=1, for_training=False)
-    return view_shots(others, np.arange(len(others.views)), source.near_world)
+    shots = view_shots(others, np.arange(len(others.views)), source.near_world)
+    return Viewpoints(others.views, others.cameras), shots
 
 
 def _relighter(

@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from octasplat.engine.events import Listener, Warned, ignore
 from octasplat.engine.fields import ADVANCED, Spelling
 from octasplat.engine.light.stage import Stage
-from octasplat.engine.light.stage_file import read_stage
+from octasplat.engine.light.stage_file import named_files, read_stage
 from octasplat.engine.operations.base import Operation, Result, never
 from octasplat.engine.operations.pictures import PictureOptions, PictureRequest, check_layers
 
@@ -163,12 +163,12 @@ def run(
         Cancelled: it was asked to stop.
     """
     from octasplat.engine.operations.render_source import (
+        picture_output,
         read_render_source,
         requested_cameras,
         requested_views,
     )
     from octasplat.engine.render.jobs import camera_shots
-    from octasplat.engine.render.output import RenderOutput, Resumption
     from octasplat.engine.stages import stopping
 
     told = "Stopped; the preview is as fine as it was." if request.preview else None
@@ -181,12 +181,18 @@ def run(
     )
     cameras = requested_cameras(request, source)
     shots = requested_views(request, source) if cameras is None else camera_shots(cameras)
-    resumption = Resumption(request.resume, request.or_anew, request.frames_folder)
-    output = RenderOutput(request.output, request.frame_rate, request.format == "exr", resumption)
-    output.check_count(1 if request.preview else len(shots))
+    written = shots[:1] if request.preview else shots
+    output = picture_output("render", request, written, [request.stage_file, *_stage_files(request)])
     render = _render_plain if request.stage is None else _render_on_stage
     files = render(request, source, cameras, shots, output, tell, threads)
-    return RenderResult(files=files, folder=output.folder, images=1 if request.preview else len(shots))
+    return RenderResult(files=files, folder=output.folder, images=len(written))
+
+
+def _stage_files(request: RenderRequest) -> list[Path]:
+    """Return the files that the stage brings."""
+    if request.stage is None:
+        return []
+    return [request.stage_folder / name for _, name in named_files(request.stage)]
 
 
 def _render_plain(

@@ -1,5 +1,6 @@
 """The scene that a render shows, with what a run knows beside it, and the cameras that are asked for."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from octasplat.engine.light.stage_scene import StageScene
 from octasplat.engine.operations.axes import axis_named
 from octasplat.engine.operations.pictures import PictureRequest
 from octasplat.engine.operations.scenes import open_scene
+from octasplat.engine.operations.written_files import check_targets
 from octasplat.engine.relative_paths import normalised
 from octasplat.engine.render.cameras import RenderCamera
 from octasplat.engine.render.jobs import Shot, gaussian_turntable, view_shots
@@ -26,6 +28,7 @@ from octasplat.engine.render.orbit import (
     orbit_cameras,
     single_camera,
 )
+from octasplat.engine.render.output import RenderOutput, Resumption
 from octasplat.engine.render.path_file import path_cameras
 from octasplat.engine.render.renderer import background_colour
 from octasplat.engine.run_folder import CONFIG, SCENE, is_run, run_background, run_near_world, run_viewpoints
@@ -181,6 +184,30 @@ def requested_views(request: PictureRequest, source: RenderSource) -> tuple[Shot
     if len(indices) == 0:
         raise OutputError("The run held out no views; ask for the views train or all.")
     return view_shots(viewpoints, indices, source.near_world)
+
+
+def picture_output(
+    verb: str, request: PictureRequest, shots: Sequence[Shot], inputs: Sequence[Path | None]
+) -> RenderOutput:
+    """Return where pictures go, after a check that none replaces what is read or what is somebody else's.
+
+    Args:
+        verb: what makes the pictures.
+        request: names the output and what is read for all pictures.
+        shots: all pictures.
+        inputs: what else is read.
+
+    Raises:
+        ConfigError: one image is named for several shots, or a file is read.
+        OutputError: a file is there and not by the verb.
+    """
+    resumption = Resumption(request.resume, request.or_anew or request.overwrite, request.frames_folder)
+    output = RenderOutput(request.output, request.frame_rate, request.format == "exr", resumption)
+    output.check_count(len(shots))
+    reads = [request.source, request.dataset, request.path_file, *inputs]
+    overwrite = request.overwrite or output.has_begun  # which a series does only after this check
+    check_targets(verb, output.files_of(shots), reads, overwrite=overwrite)
+    return output
 
 
 def stage_scene(

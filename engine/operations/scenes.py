@@ -9,7 +9,6 @@ from jaxtyping import Float
 from pydantic import BaseModel
 
 from octasplat.engine.edit.changed_run import check_new_run, write_changed_run
-from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, Noted, Warned
 from octasplat.engine.fields import map_named_files
 from octasplat.engine.files import (
@@ -23,7 +22,9 @@ from octasplat.engine.files import (
 from octasplat.engine.gaussians.flattening import ImportReport
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.scene_facts import SceneFacts
-from octasplat.engine.run_folder import SCENE, is_run, not_exported
+from octasplat.engine.operations.base import SourceRequest
+from octasplat.engine.operations.written_files import check_targets
+from octasplat.engine.run_folder import is_run, not_exported
 
 
 def open_scene(path: Path, progress: Listener, *, drop_invalid: bool = False) -> FlatGaussians:
@@ -63,27 +64,32 @@ def tell_import_losses(path: Path, report: ImportReport, progress: Listener) -> 
         progress(Noted(f"{path}: {note}"))
 
 
-def check_target(output: Path, inputs: Sequence[Path]) -> None:
-    """Check before long work that a scene can be written there.
+def check_scenes(
+    verb: str,
+    outputs: Sequence[Path],
+    inputs: Sequence[Path | None],
+    *,
+    overwrite: bool,
+    others: Sequence[Path] = (),
+    format: str | None = None,
+) -> None:
+    """Check before long work that scenes can be written.
+
+    Args:
+        verb: what writes them.
+        outputs: the files of the scenes.
+        inputs: what is read.
+        overwrite: whether files are replaced that the verb did not write.
+        others: other files that are written.
+        format: name of the format, if the files' names do not say it.
 
     Raises:
-        ConfigError: ``output`` is one of ``inputs``.
-        SceneFileError: no format takes the name.
+        ConfigError: one of them is read.
+        OutputError: one of them is there and not by the verb.
+        SceneFileError: no format takes a name.
     """
-    exporter_for(output)
-    check_keeps_inputs([output], inputs)
-
-
-def check_keeps_inputs(outputs: Sequence[Path], inputs: Sequence[Path]) -> None:
-    """Check before long work that no file to write is one that is read; of a run that is its scene.
-
-    Raises:
-        ConfigError: one is.
-    """
-    read = {(path / SCENE if is_run(path) else path).resolve() for path in inputs if path.exists()}
-    for output in outputs:
-        if output.resolve() in read:
-            raise ConfigError(f"{output}: would overwrite what the command reads; choose another name.")
+    beside = [path for output in outputs for path in exporter_for(output, format).beside(output)]
+    check_targets(verb, [*outputs, *beside, *others], inputs, overwrite=overwrite)
 
 
 def write_scene(
@@ -114,23 +120,26 @@ def becomes_run(source: Path, output: Path) -> bool:
     return is_run(source) and not output.suffix
 
 
-def check_changed(source: Path, output: Path, inputs: Sequence[Path] = ()) -> None:
+def check_changed(
+    verb: str, request: SourceRequest, output: Path, inputs: Sequence[Path | None] = ()
+) -> None:
     """Check before long work that a changed scene can be written to ``output``, a file or a run's folder.
 
     Args:
-        source: the scene that is changed.
+        verb: what changes it.
+        request: names the scene that is changed.
         output: where the other one goes.
         inputs: what else is read.
 
     Raises:
         ConfigError: ``output`` is one of the inputs.
-        OutputError: the folder is taken.
+        OutputError: the folder is taken, or the file there and not by the verb.
         SceneFileError: no format takes the name.
     """
-    if becomes_run(source, output):
+    if becomes_run(request.source, output):
         check_new_run(output)
     else:
-        check_target(output, [source, *inputs])
+        check_scenes(verb, [output], [request.source, *inputs], overwrite=request.overwrite)
 
 
 @dataclass(frozen=True)

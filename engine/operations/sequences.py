@@ -9,25 +9,20 @@ from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, StageProgress
 from octasplat.engine.files import read_facts
 from octasplat.engine.gaussians.model import FlatGaussians
-from octasplat.engine.operations.scenes import (
-    becomes_run,
-    check_keeps_inputs,
-    check_target,
-    write_changed,
-    write_scene,
-)
+from octasplat.engine.operations.scenes import becomes_run, check_scenes, write_changed, write_scene
+from octasplat.engine.operations.sequence_request import SequenceRequest
+from octasplat.engine.operations.written_files import check_targets
 from octasplat.engine.writing import write_json
 
 
-def targets_for(output: Path, sources: Sequence[Path], inputs: Sequence[Path]) -> tuple[Path, ...]:
+def targets_for(output: Path, sources: Sequence[Path]) -> tuple[Path, ...]:
     """Return the file to write for each source: ``output`` for one, numbered files for several.
 
     Several need a pattern such as ``out/%04d.ply``, a folder (names as those of the sources, with a number
     where several have one stem), or a plain name to which ``_0000`` and so on is added.
 
     Raises:
-        ConfigError: a target is one of ``inputs``, or two targets are the same.
-        SceneFileError: no format takes the name.
+        ConfigError: two targets are the same.
     """
     if "%" in output.name:
         try:
@@ -46,8 +41,6 @@ def targets_for(output: Path, sources: Sequence[Path], inputs: Sequence[Path]) -
             output / (f"{stem}_{number:04d}.ply" if uses[stem.casefold()] > 1 else f"{stem}.ply")
             for number, stem in enumerate(source.stem for source in sources)
         ]
-    for target in targets:
-        check_target(target, inputs)
     if len(set(targets)) < len(targets):
         raise ConfigError(f"{output}: gives two results the same name; write a pattern such as %04d.ply.")
     return tuple(targets)
@@ -57,43 +50,41 @@ class Frames:
     """The scenes that are written for the meshes of a sequence, or the one scene of one mesh.
 
     Args:
-        source: the scene that is changed.
-        output: where to; see :func:`targets_for`, and for one mesh
+        verb: what writes them.
+        request: names the scene that is changed and the output; see :func:`targets_for`, and for one mesh
             :func:`octasplat.engine.operations.scenes.becomes_run`.
         meshes: those that each make a scene.
-        inputs: all that is read.
-        report: where the counts go, if anybody asks for them.
+        inputs: what else is read.
 
     Attributes:
         files: those that were written.
         folder: of the run that was written; None for files.
 
     Raises:
-        ConfigError: a scene would overwrite an input, or two have the same name.
-        OutputError: the folder is taken.
+        ConfigError: a scene or the report would overwrite an input, or two scenes have the same name.
+        OutputError: the folder is taken, or a file there and not by the verb.
         SceneFileError: no format takes the name.
     """
 
     def __init__(
-        self,
-        source: Path,
-        output: Path,
-        meshes: Sequence[Path],
-        inputs: Sequence[Path],
-        report: Path | None = None,
+        self, verb: str, request: SequenceRequest, meshes: Sequence[Path], inputs: Sequence[Path] = ()
     ) -> None:
+        source, output = request.source, request.output
+        reads, reports = [source, *meshes, *inputs], [] if request.report is None else [request.report]
         self._source = source
         self._is_run = len(meshes) == 1 and becomes_run(source, output)
         if self._is_run:
             check_new_run(output)
             self._targets: tuple[Path, ...] = (output,)
+            check_targets(verb, reports, reads, overwrite=request.overwrite)
         else:
-            self._targets = targets_for(output, meshes, inputs)
-        self._report = report
-        if report is not None:
-            check_keeps_inputs([report], inputs)
-            if report.resolve() in {target.resolve() for target in self._targets}:
-                raise ConfigError(f"{report}: would overwrite a result; choose another name for the report.")
+            self._targets = targets_for(output, meshes)
+            if {path.resolve() for path in reports} & {target.resolve() for target in self._targets}:
+                raise ConfigError(
+                    f"{request.report}: would overwrite a result; choose another name for the report."
+                )
+            check_scenes(verb, self._targets, reads, overwrite=request.overwrite, others=reports)
+        self._report = request.report
         self.files: tuple[Path, ...] = ()
         self.folder: Path | None = None
 
@@ -121,5 +112,7 @@ class Frames:
         """Write the counts of all meshes, if anybody asks for them."""
         if self._report is None:
             return
+        if not self._is_run:
+            self.files = (*self.files, self._report)
         rows = zip(meshes, self._targets, reports, strict=True)
         write_json(self._report, [{**mesh, "output": str(target), **report} for mesh, target, report in rows])

@@ -9,7 +9,7 @@ from octasplat.engine.errors import OutputError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Output, Source
 from octasplat.engine.operations.axes import Axis, axis_named
-from octasplat.engine.operations.base import Operation, Options, Request, Result, never, stop_if
+from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never, stop_if
 from octasplat.engine.operations.pictures import Point
 
 
@@ -21,7 +21,7 @@ class StageInitOptions(Options):
     )
 
 
-class StageInitRequest(StageInitOptions, Request):
+class StageInitRequest(StageInitOptions, WritingRequest):
     """Write a stage that fits a scene, the folder of a run or a file of Gaussians, to start from.
 
     It knows what is up, has a glass ball on what seems to be the floor, and a light from where the scene's
@@ -69,10 +69,10 @@ def run(
     from octasplat.engine.light.stage_file import write_first_stage
     from octasplat.engine.light.stage_scene import first_stage_facts
     from octasplat.engine.operations.render_source import open_stage_scene
+    from octasplat.engine.operations.written_files import check_targets
 
     output: Path = request.output
-    if output.exists():
-        raise OutputError(f"{output} is there already; name another file, or remove it.")
+    check_targets("stage-init", [output], [request.source, request.dataset], overwrite=request.overwrite)
     scene = open_stage_scene(request.source, progress, dataset=request.dataset, threads=threads)
     facts = first_stage_facts(scene, None if request.up is None else axis_named(request.up))
     stop_if(should_stop)

@@ -19,7 +19,7 @@ from octasplat.engine.errors import OutputError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Output, Source, Spelling
 from octasplat.engine.operations.axes import Axis, light_up
-from octasplat.engine.operations.base import Operation, Options, Request, Result, never
+from octasplat.engine.operations.base import Operation, Options, Result, WritingRequest, never
 from octasplat.engine.surface.options import ExtractionOptions
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class SurfaceOptions(ExtractionOptions, Options):
         return {text: _triangles(text) for text in self.max_triangles}
 
 
-class SurfaceRequest(SurfaceOptions, Request):
+class SurfaceRequest(SurfaceOptions, WritingRequest):
     """Mesh IN, the folder of a run or a file of Gaussians, into one surface of coloured triangles.
 
     Depth is rendered from where the photographs were taken; for a file without photographs, from cameras all
@@ -221,10 +221,11 @@ def run(
         SceneFileError: the scene cannot be read, or the mesh not be written.
         Cancelled: stopped as asked; nothing was written.
     """
-    from octasplat.engine.files import check_surface_path, write_surface
+    from octasplat.engine.files import check_surface_path, surface_files, write_surface
     from octasplat.engine.gaussians.materials import require_materials
-    from octasplat.engine.operations.scenes import check_keeps_inputs, open_scene
+    from octasplat.engine.operations.scenes import open_scene
     from octasplat.engine.operations.surface_inputs import camera_views
+    from octasplat.engine.operations.written_files import check_targets
     from octasplat.engine.run_folder import SCENE, is_run
     from octasplat.engine.shading.environment_frame import environment_frame
     from octasplat.engine.surface.extract import extract_levels
@@ -232,8 +233,14 @@ def run(
     from octasplat.engine.trace.make import make_tracer
 
     source, output = request.source, request.output
-    check_surface_path(output, textured=request.texture_side is not None, lit=request.materials)
-    check_keeps_inputs(request.outputs, [source])
+    is_textured = request.texture_side is not None
+    check_surface_path(output, textured=is_textured, lit=request.materials)
+    check_targets(
+        "surface",
+        [path for place in request.outputs for path in surface_files(place, textured=is_textured)],
+        [source, request.dataset, request.photographs],
+        overwrite=request.overwrite,
+    )
     if is_run(source) and not (source / SCENE).exists():
         raise OutputError(
             f"{source} holds no {SCENE} yet; finish the run with octasplat reconstruct --resume."

@@ -119,7 +119,7 @@ def run(
     from octasplat.engine.operations.scenes import check_changed, edit_note, open_scene, write_changed
 
     source: Path = request.source
-    check_changed(source, request.output, [] if request.matrix is None else [request.matrix])
+    check_changed("transform", request, request.output, [request.matrix])
     matrix = request.world_map()
     moved = transform(open_scene(source, progress), matrix)
     stop_if(should_stop)

@@ -21,7 +21,8 @@ class KeptImages:
         folder: of the images and of the record.
         identity: of everything that decides what the images show; those of another are never taken.
         resume: go on with what is there.
-        or_anew: forget an unfinished series of another identity rather than refuse to go on.
+        or_anew: forget an unfinished series that is of another identity, or is not to be gone on with, rather
+            than refuse.
         record: name of the record, where several series share a folder.
 
     Raises:
@@ -80,12 +81,13 @@ class KeptImages:
         # A kill may have cut the last line short; its image is rendered again.
         whole = [line for line in lines if line.endswith("\n")]
         if len(whole) < 2:
-            self.record.unlink()
-            return {}
+            return self._forget()
         if not resume:
+            if or_anew:
+                return self._forget()
             raise ConfigError(
                 f"{self.folder} holds images of a render that was stopped ({len(whole) - 1} are done); add "
-                f"--resume to go on with it, or remove {self.record} to begin anew."
+                "--resume to go on with it, or --overwrite to begin anew."
             )
         try:
             rows = [json.loads(line) for line in whole]
@@ -94,17 +96,25 @@ class KeptImages:
             raise ConfigError(f"{self.record} is damaged; remove it to begin anew.") from None
         if identity != self._identity:
             if or_anew:
-                self.record.unlink()
-                return {}
+                return self._forget()
             raise ConfigError(
                 f"{self.folder} holds images of another render (its scene, stage, cameras or version "
-                f"differ); remove {self.record} to begin anew."
+                "differ); say --overwrite to begin anew."
             )
         if len(lines) > len(whole):
             write_text(self.record, "".join(whole))
-        for partial in self.folder.rglob(".*.partial.*"):  # of a process that was killed
-            partial.unlink(missing_ok=True)
+        self._remove_partial()
         return digests
+
+    def _forget(self) -> dict[str, str]:
+        self.record.unlink()
+        self._remove_partial()
+        return {}
+
+    def _remove_partial(self) -> None:
+        """Remove files that a process which was killed did not write to their ends."""
+        for partial in self.folder.rglob(".*.partial.*"):
+            partial.unlink(missing_ok=True)
 
 
 def _sha256(path: Path) -> str:

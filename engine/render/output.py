@@ -9,7 +9,7 @@ from octasplat.engine.events import ImagesKept, Listener
 from octasplat.engine.render.jobs import Paint, Shot
 from octasplat.engine.render.kept import RECORD, KeptImages
 from octasplat.engine.render.names import IMAGE_SUFFIXES, names_by_number
-from octasplat.engine.render.series import render_film, render_series
+from octasplat.engine.render.series import film_files, render_film, render_series
 from octasplat.engine.stages import counted_stage
 
 
@@ -79,18 +79,35 @@ class RenderOutput:
         """Return the names of the shots where files have numbers only: what those stand for; else nothing."""
         return ([shot.name for shot in shots],) if self.is_named_image else ()
 
+    def files_of(self, shots: Sequence[Shot]) -> tuple[Path, ...]:
+        """Return all files that are written for shots: images, or a film and its frames."""
+        if self.is_film:
+            return (self.path, *film_files(self._frames_folder, len(shots)))
+        return tuple(self.file_of(number, shot) for number, shot in enumerate(shots))
+
+    @property
+    def _frames_folder(self) -> Path:
+        return self.resumption.frames_folder or self.path.with_name(f"{self.path.name}.frames")
+
     def kept_images(self, identity: str) -> KeptImages:
         """Return what there is already of images that look as ``identity`` says.
 
         Raises:
             ConfigError: there are images of another render, or of one that is not to be gone on with.
         """
-        how, folder, record = self.resumption, self.path, RECORD
+        how, record = self.resumption, self._record
+        return KeptImages(record.parent, identity, resume=how.resume, or_anew=how.or_anew, record=record.name)
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether an unfinished series lies there."""
+        return self._record.exists()
+
+    @property
+    def _record(self) -> Path:
         if self.is_named_image:
-            folder, record = self.path.parent, f"{self.path.name}.{RECORD}"
-        if self.is_film:
-            folder = how.frames_folder or self.path.with_name(f"{self.path.name}.frames")
-        return KeptImages(folder, identity, resume=how.resume, or_anew=how.or_anew, record=record)
+            return self.path.with_name(f"{self.path.name}.{RECORD}")
+        return (self._frames_folder if self.is_film else self.path) / RECORD
 
     def write(
         self, shots: tuple[Shot, ...], paint: Paint, kept: KeptImages, progress: Listener

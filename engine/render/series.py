@@ -1,6 +1,5 @@
 """Series of images, to files of their own or to a film: one way for scenes alone and for those on a stage."""
 
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -49,6 +48,11 @@ def render_series(
     return paths
 
 
+def film_files(folder: Path, count: int) -> tuple[Path, ...]:
+    """Return the files of a film's frames, and of the film among them while it is written."""
+    return (*(folder / f"{number:06d}.png" for number in range(count)), folder / FILM)
+
+
 def render_film(
     shots: Sequence[Shot],
     film: Path,
@@ -61,29 +65,31 @@ def render_film(
     """Render shots of one image size as the frames of a film.
 
     The frames are kept as PNG files, which lose nothing that the film has, in the folder of ``kept``, until
-    the film is whole; then the folder goes.
+    the film is whole; then they go, and the folder unless it holds something else.
 
     Raises:
         OutputError: a file cannot be written.
     """
+    *frames, unfinished = film_files(kept.folder, len(shots))
 
     def frame(number: int, _shot: Shot) -> Path:
-        return kept.folder / f"{number:06d}.png"
+        return frames[number]
 
     first = shots[0].rays()
-    unfinished = kept.folder / FILM
     try:
         with VideoWriter(unfinished, fps, first.width_px, first.height_px) as video:
             for path in _rendered(shots, frame, paint, kept, progress, on_kept):
                 video.write(_display_values(path))
         film.parent.mkdir(parents=True, exist_ok=True)
         unfinished.replace(film)
+        for path in frames:
+            path.unlink(missing_ok=True)
+        kept.finish()
     except OSError as error:
         raise OutputError(f"Cannot write the video {film}: {error.strerror or error}.") from error
     finally:
-        with suppress(OSError):  # where nothing was done yet, nothing stays
+        with suppress(OSError):  # where nothing was done yet, or all is, nothing stays
             kept.folder.rmdir()
-    shutil.rmtree(kept.folder)
 
 
 def _rendered(

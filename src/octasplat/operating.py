@@ -15,6 +15,7 @@ from octasplat.engine.fields import is_negatable
 from octasplat.engine.nearest_names import nearest_name
 from octasplat.engine.operations.base import build
 from octasplat.engine.operations.registry import operation
+from octasplat.engine.operations.written_files import remember_written
 from octasplat.notebook import default_listener
 
 P = ParamSpec("P")
@@ -67,9 +68,11 @@ def run_operation(
     """
     verb = operation(name)
     request = build(verb.request, given_values(verb.request, values))
-    return verb.run(
+    result = verb.run(
         request, progress=progress or default_listener(), should_stop=should_stop, threads=threads
     )
+    remember_written(name, result.files)
+    return result
 
 
 def given_values(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:

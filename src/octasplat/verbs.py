@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 class RenderArguments(TypedDict, total=False):
     """What :func:`render` takes by name."""
 
+    overwrite: bool
     mode: Literal["turntable", "views", "path", "camera"] | None
     views: Literal["held-out", "train", "all"] | None
     photographs: Sequence[str] | None
@@ -352,6 +353,7 @@ def info(
     source: PathLike,
     output: PathLike | None = None,
     *,
+    overwrite: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
     picture: PathLike | None = None,
@@ -364,6 +366,8 @@ def info(
     Args:
         source: The scene to look at: the folder of a run, or a file of any format.
         output: Write everything as JSON, too.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         up: The axis of a file that points up. [default: -y]
         dataset: Take the cameras of the photographs in this folder. [default: those the run keeps]
         picture: Write a small picture of the scene, too.
@@ -380,7 +384,14 @@ def info(
     """
     return run_operation(
         "info",
-        {"up": up, "source": source, "dataset": dataset, "picture": picture, "output": output},
+        {
+            "overwrite": overwrite,
+            "up": up,
+            "source": source,
+            "dataset": dataset,
+            "picture": picture,
+            "output": output,
+        },
         progress,
         should_stop,
         threads,
@@ -392,6 +403,7 @@ def surface(
     source: PathLike,
     output: PathLike,
     *,
+    overwrite: bool = False,
     unbounded: bool | None = None,
     bounds: Sequence[float] | str | None = None,
     voxel: float | None = None,
@@ -426,6 +438,8 @@ def surface(
     Args:
         source: The scene to mesh: the folder of a run, or a file of any format.
         output: A .glb, .ply or .obj file.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         unbounded: Reach to the horizon, with ever coarser voxels, instead of meshing a box.
         bounds: The box to mesh, in scene units; octasplat info tells where the scene lies. [default:
             what is seen of the space that the cameras surround]
@@ -478,6 +492,7 @@ def surface(
     return run_operation(
         "surface",
         {
+            "overwrite": overwrite,
             "unbounded": unbounded,
             "bounds": bounds,
             "voxel": voxel,
@@ -517,6 +532,7 @@ def material(
     source: PathLike,
     output: PathLike,
     *,
+    overwrite: bool = False,
     set: BaseModel | Mapping[str, Any] | str | None = None,
     scale: BaseModel | Mapping[str, Any] | str | None = None,
     where: str | None = None,
@@ -534,6 +550,8 @@ def material(
     Args:
         source: The scene to read: a file of any format, or the folder of a run.
         output: A folder for all of the run with its new scene, or a file for the scene alone.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         set: Values to set: albedo=R,G,B (linear, 0 to 1), albedo=#rrggbb (display), metallic=0..1 or
             roughness=0..1.
         scale: Factors to multiply albedo, metallic or roughness by; the result is at most 1.
@@ -560,6 +578,7 @@ def material(
     return run_operation(
         "material",
         {
+            "overwrite": overwrite,
             "source": source,
             "output": output,
             "set": set,
@@ -582,6 +601,7 @@ def render(
     source: PathLike,
     output: PathLike,
     *,
+    overwrite: bool = False,
     mode: Literal["turntable", "views", "path", "camera"] | None = None,
     views: Literal["held-out", "train", "all"] | None = None,
     photographs: Sequence[str] | None = None,
@@ -620,6 +640,8 @@ def render(
     Args:
         source: The scene to render: the folder of a run, or a file of any format.
         output: A folder, a pattern such as frames/%04d.png (or .exr), or a video such as turn.mp4.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         mode: The cameras: one turn round the scene, the views of the photographs, a camera path, or a
             single camera.
         views: Render the views of the photographs: those held out, those trained on, or all. Only of a
@@ -680,6 +702,7 @@ def render(
     return run_operation(
         "render",
         {
+            "overwrite": overwrite,
             "mode": mode,
             "views": views,
             "photographs": photographs,
@@ -724,6 +747,7 @@ def relight(
     output: PathLike,
     *,
     environments: Sequence[PathLike],
+    overwrite: bool = False,
     mode: Literal["turntable", "views", "path", "camera"] | None = None,
     views: Literal["held-out", "train", "all"] | None = None,
     photographs: Sequence[str] | None = None,
@@ -764,6 +788,8 @@ def relight(
         source: The scene to render: the folder of a run, or a file of any format.
         output: A folder, a pattern such as frames/%04d.png (or .exr), or a video such as turn.mp4.
         environments: Equirectangular HDR or EXR image of the light; several are done one after another.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         mode: The cameras: one turn round the scene, the views of the photographs, a camera path, or a
             single camera.
         views: Render the views of the photographs: those held out, those trained on, or all. Only of a
@@ -823,6 +849,7 @@ def relight(
     return run_operation(
         "relight",
         {
+            "overwrite": overwrite,
             "mode": mode,
             "views": views,
             "photographs": photographs,
@@ -868,6 +895,7 @@ def stage_init(
     source: PathLike,
     output: PathLike,
     *,
+    overwrite: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     dataset: PathLike | None = None,
     progress: Listener | None = None,
@@ -879,6 +907,8 @@ def stage_init(
     Args:
         source: The scene: the folder of a run, or a file of any format.
         output: The TOML file to write.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         up: The axis of a file that points up; a run knows its own. [default: -y]
         dataset: Take the cameras of the photographs in this folder. [default: those that the run keeps]
         progress: told each event; by default they are logged, or shown in a notebook.
@@ -894,7 +924,7 @@ def stage_init(
     """
     return run_operation(
         "stage-init",
-        {"up": up, "source": source, "output": output, "dataset": dataset},
+        {"overwrite": overwrite, "up": up, "source": source, "output": output, "dataset": dataset},
         progress,
         should_stop,
         threads,
@@ -906,6 +936,7 @@ def export(
     source: PathLike,
     files: Sequence[PathLike],
     *,
+    overwrite: bool = False,
     min_opacity: float | None = None,
     sh_pad_degree: int | None = None,
     spz_version: Literal[3, 4] | None = None,
@@ -928,6 +959,8 @@ def export(
     Args:
         source: The scene to read: a file of any format, or the folder of a run.
         files: Files to write; their names say the formats.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         min_opacity: Leave fainter Gaussians out. Default: 0.0.
         sh_pad_degree: Gaussian PLY: pad the spherical harmonics with zeros up to this degree.
         spz_version: SPZ: 3 (gzip), which every viewer reads, or 4 (Zstandard). Default: 3.
@@ -962,6 +995,7 @@ def export(
     return run_operation(
         "export",
         {
+            "overwrite": overwrite,
             "source": source,
             "min_opacity": min_opacity,
             "sh_pad_degree": sh_pad_degree,
@@ -989,6 +1023,7 @@ def import_(
     file: PathLike,
     output: PathLike,
     *,
+    overwrite: bool = False,
     format: str | None = None,
     drop_invalid: bool = False,
     sh_degree: int | None = None,
@@ -1002,6 +1037,8 @@ def import_(
     Args:
         file: The scene to read, a file of any known format.
         output: The scene to write.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         format: The format, if the file does not show it.
         drop_invalid: Leave out Gaussians with values that are not finite numbers.
         sh_degree: Keep the spherical harmonics up to this degree only.
@@ -1022,6 +1059,7 @@ def import_(
     return run_operation(
         "import",
         {
+            "overwrite": overwrite,
             "file": file,
             "format": format,
             "drop_invalid": drop_invalid,
@@ -1041,6 +1079,7 @@ def edit(
     output: PathLike,
     *,
     meshes: Sequence[PathLike],
+    overwrite: bool = False,
     report: PathLike | None = None,
     method: Literal["least-squares", "three-point"] | None = None,
     damaged: Literal["repair", "drop"] | None = None,
@@ -1062,6 +1101,8 @@ def edit(
             such as out/%04d.ply, or a folder.
         meshes: The edited mesh (.ply, .obj or .glb); several, or here a quoted pattern such as
             'frames/*.ply', are a sequence.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         report: Write all counts there.
         method: How a frame follows from the corners of its octagon: least-squares over all of them, or
             three-point, the rule of the paper from corners 0, 2 and 6, which drops shear. Default:
@@ -1092,6 +1133,7 @@ def edit(
     return run_operation(
         "edit",
         {
+            "overwrite": overwrite,
             "source": source,
             "output": output,
             "report": report,
@@ -1117,6 +1159,7 @@ def deform(
     *,
     proxy: PathLike,
     deformed: Sequence[PathLike],
+    overwrite: bool = False,
     report: PathLike | None = None,
     method: Literal["nearest", "mvc"] | None = None,
     reach: float | None = None,
@@ -1136,6 +1179,8 @@ def deform(
         proxy: The mesh at rest (.ply, .obj or .glb), lying on or around what is to move.
         deformed: The same mesh deformed; several, or here a quoted pattern such as 'frames/*.obj', are
             a sequence.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         report: Write all counts there.
         method: nearest: follow the triangles close by; mvc: mean-value coordinates of a closed cage.
             Default: nearest.
@@ -1159,6 +1204,7 @@ def deform(
     return run_operation(
         "deform",
         {
+            "overwrite": overwrite,
             "source": source,
             "output": output,
             "report": report,
@@ -1180,6 +1226,7 @@ def transform(
     source: PathLike,
     output: PathLike,
     *,
+    overwrite: bool = False,
     matrix: PathLike | None = None,
     up: Sequence[Literal["x", "-x", "y", "-y", "z", "-z"]] | None = None,
     scale: float | None = None,
@@ -1196,6 +1243,8 @@ def transform(
         source: The scene to read: a file of any format, or the folder of a run.
         output: The scene to write; the suffix says in which format. Of a run, a name without suffix
             writes a folder that is a run again, with what of it stays valid.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         matrix: A text file with an affine 4 x 4 or 3 x 4 matrix, row by row, that maps old points to
             new ones.
         up: Turn the axis that points up to another: -y z from COLMAP's usual frame to Blender's.
@@ -1217,6 +1266,7 @@ def transform(
     return run_operation(
         "transform",
         {
+            "overwrite": overwrite,
             "source": source,
             "output": output,
             "matrix": matrix,
@@ -1237,6 +1287,7 @@ def crop(
     source: PathLike,
     output: PathLike,
     *,
+    overwrite: bool = False,
     where: str | None = None,
     box: Sequence[float] | None = None,
     sphere: Sequence[float] | None = None,
@@ -1251,6 +1302,8 @@ def crop(
         source: The scene to read: a file of any format, or the folder of a run.
         output: The scene to write; the suffix says in which format. Of a run, a name without suffix
             writes a folder that is a run again, with what of it stays valid.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         where: Comparisons joined by and, or, not that hold for them, of x, y, z, opacity and channels
             such as metallic, roughness and albedo.r: 'metallic > 0.5 and z < 0'.
         box: Two corners of a box that their centres lie in, smallest coordinates first.
@@ -1271,6 +1324,7 @@ def crop(
     return run_operation(
         "crop",
         {
+            "overwrite": overwrite,
             "source": source,
             "output": output,
             "where": where,
@@ -1290,6 +1344,7 @@ def merge(
     output: PathLike,
     scenes: Sequence[PathLike] | None = None,
     *,
+    overwrite: bool = False,
     sh_degree: int | None = None,
     progress: Listener | None = None,
     should_stop: Callable[[], bool] = never,
@@ -1302,6 +1357,8 @@ def merge(
         output: The scene to write; the suffix says in which format. Of a run, a name without suffix
             writes a folder that is a run again, with what of it stays valid.
         scenes: The other scenes: files of any format, each in the same frame.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         sh_degree: Degree of the colours' harmonics. [default: the highest among the scenes]
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``Cancelled``.
@@ -1316,7 +1373,13 @@ def merge(
     """
     return run_operation(
         "merge",
-        {"source": source, "output": output, "scenes": scenes, "sh_degree": sh_degree},
+        {
+            "overwrite": overwrite,
+            "source": source,
+            "output": output,
+            "scenes": scenes,
+            "sh_degree": sh_degree,
+        },
         progress,
         should_stop,
         threads,
@@ -1328,6 +1391,7 @@ def clean(
     source: PathLike,
     output: PathLike | None = None,
     *,
+    overwrite: bool = False,
     min_opacity: float | None = None,
     min_scale: float | None = None,
     max_scale: float | None = None,
@@ -1347,6 +1411,8 @@ def clean(
         source: The scene to read: a file of any format, or the folder of a run.
         output: The scene to write; the suffix says in which format. Of a run, a name without suffix
             writes a folder that is a run again, with what of it stays valid.
+        overwrite: Replace files that are there already, too, which are not of an earlier run of this
+            command or were changed since. What is read is never replaced.
         min_opacity: Remove fainter ones; below 0.01 they cannot be seen. Default: 0.01.
         min_scale: Remove those whose larger standard deviation is smaller, in the scene's units.
             Default: 0.0.
@@ -1374,6 +1440,7 @@ def clean(
     return run_operation(
         "clean",
         {
+            "overwrite": overwrite,
             "source": source,
             "min_opacity": min_opacity,
             "min_scale": min_scale,

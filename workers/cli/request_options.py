@@ -21,6 +21,7 @@ from octasplat.engine.operations.base import (
     build,
     never,
 )
+from octasplat.engine.operations.written_files import remember_written
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import Stopped, orderly_termination, stop_on_signals
@@ -121,6 +122,7 @@ def run_operation(
     else:
         with orderly_termination(), show_progress(quiet=quiet) as progress:
             result = operation.run(request, progress=progress, should_stop=never, threads=threads)
+    remember_written(operation.name, result.files)
     if not quiet:
         for line in result.lines():
             click.echo(line)

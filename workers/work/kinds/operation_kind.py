@@ -74,7 +74,10 @@ class OperationKind(JobKind[Any]):
         """
         options = self.resolve(task.options)
         values = map_named_files(options, lambda path: task.files / check_name(path.as_posix()))
-        known = {name: value for name, value in values.items() if name in self.operation.request.model_fields}
+        fields = self.operation.request.model_fields
+        known = {name: value for name, value in values.items() if name in fields}
+        if "overwrite" in fields:  # the folder is the job's own, with what its earlier attempts have left
+            known["overwrite"] = True
         request: Request = self.operation.request.model_validate({**known, **self.places(task, options)})
         return request
 
