@@ -54,10 +54,10 @@ def test_other_photographs_between_the_first_and_the_last_are_another_render(shi
 
 @pytest.mark.parametrize("verb", ["render", "relight"])
 def test_another_camera_between_the_first_and_the_last_is_another_render(shiny_run, tmp_path, verb):
-    def path(x: float) -> dict[str, Any]:
-        places = [(0, 0, -4), (x, 0, -4), (1, 0, -4)]
-        frames = [{"position": place, "look_at": (0, 0, 0)} for place in places]
-        return {"width": 32, "height": 24, "fov_y_degrees": 50, "frames": frames}
+    def path(middle: float) -> dict[str, Any]:
+        poses = [[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, -4], [0, 0, 0, 1]] for x in (0, middle, 1)]
+        frames = [{"camera_to_world": pose, "fov_y_degrees": 50} for pose in poses]
+        return {"width": 32, "height": 24, "frames": frames}
 
     module, one = request_of(verb, shiny_run, tmp_path / "out", camera_path=path(0.5))
     _, other = request_of(verb, shiny_run, tmp_path / "out", camera_path=path(0.6))
