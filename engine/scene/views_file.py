@@ -28,6 +28,8 @@ _Pixels = Annotated[int, Field(ge=1)]
 _NAMED = 3
 _SAME_POSE = 1e-5
 """Poses this much apart, as a share of the scene's extent, are one: programs write so many digits."""
+_ADJUSTED = 0.1
+"""Poses within this share of the extent and this angle in radians may have been adjusted in one world."""
 
 
 @dataclass(frozen=True)
@@ -160,28 +162,33 @@ class ViewsRecord(_Frozen):
         """Return whether ``other`` has photographs of the same names, and all of them in the same poses."""
         others = {view.name: view for view in other.views}
         shared = [(view, others[view.name]) for view in self.views if view.name in others]
-        return bool(shared) and all(self._is_of_one_pose(one, two) for one, two in shared)
+        return bool(shared) and all(
+            np.allclose(one.rotation_cam_from_world, two.rotation_cam_from_world, atol=_SAME_POSE)
+            and np.allclose(
+                one.translation_cam_from_world,
+                two.translation_cam_from_world,
+                rtol=_SAME_POSE,
+                atol=_SAME_POSE * self.extent_world,
+            )
+            for one, two in shared
+        )
 
     def is_of_another_world(self, other: "ViewsRecord") -> bool:
-        """Return whether most of the photographs that ``other`` shares stand in other poses there.
+        """Return whether most of the photographs that ``other`` shares stand elsewhere there.
 
-        Single ones may: those that were placed anew for a run stand elsewhere in the model of their folder.
+        Single ones may, as those that a run placed anew; and all may a little, as where it adjusted lenses.
         """
         others = {(view.name, view.photograph_sha256): view for view in other.views}
         names = ((view, (view.name, view.photograph_sha256)) for view in self.views)
         shared = [(view, others[name]) for view, name in names if name in others]
-        moved = sum(not self._is_of_one_pose(one, two) for one, two in shared)
-        return 2 * moved > len(shared)
+        return 2 * sum(self._stands_elsewhere(one, two) for one, two in shared) > len(shared)
 
-    def _is_of_one_pose(self, one: _View, two: _View) -> bool:
-        return np.allclose(
-            one.rotation_cam_from_world, two.rotation_cam_from_world, atol=_SAME_POSE
-        ) and np.allclose(
-            one.translation_cam_from_world,
-            two.translation_cam_from_world,
-            rtol=_SAME_POSE,
-            atol=_SAME_POSE * self.extent_world,
-        )
+    def _stands_elsewhere(self, one: _View, two: _View) -> bool:
+        turns = [np.array(view.rotation_cam_from_world) for view in (one, two)]
+        shifts = [np.array(view.translation_cam_from_world) for view in (one, two)]
+        first, second = (-turn.T @ shift for turn, shift in zip(turns, shifts, strict=True))
+        apart = float(np.linalg.norm(first - second))
+        return apart > _ADJUSTED * self.extent_world or float(np.abs(turns[0] - turns[1]).max()) > _ADJUSTED
 
     def _aspects(self, view: _View) -> dict[str, object]:
         """What is compared of a view, by its name."""

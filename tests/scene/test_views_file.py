@@ -49,3 +49,15 @@ def test_names_below_the_photographs_are_read(tmp_path: Path, name: str) -> None
 def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(ConfigError, match=r"views\.json cannot be read .*no path below"):
         read_views(views_json(tmp_path / "views.json", name))
+
+
+def test_views_that_were_moved_are_of_another_world_and_adjusted_ones_are_not(tmp_path: Path) -> None:
+    record = read_views(views_json(tmp_path / "views.json", "a.jpg"))
+    eye, still = np.eye(3), np.zeros(3)
+    slightly = np.array([[np.cos(0.02), -np.sin(0.02), 0], [np.sin(0.02), np.cos(0.02), 0], [0, 0, 1]])
+    assert not record.is_of_another_world(record)
+    assert not record.is_of_another_world(record.moved(1.0, slightly, np.array([0.02, 0, 0])))
+    assert record.is_of_another_world(record.moved(1.0, eye, np.array([0.5, 0, 0])))
+    assert record.is_of_another_world(record.moved(1.0, slightly @ eye[[1, 2, 0]], still))
+    others = read_views(views_json(tmp_path / "views.json", "b.jpg"))
+    assert not record.is_of_another_world(others.moved(1.0, eye, np.array([0.5, 0, 0])))
