@@ -128,12 +128,13 @@ async def commit_dataset(service: Service, who: Principal, dataset_id: uuid.UUID
 
 async def _check(service: Service, dataset_id: uuid.UUID) -> Dataset:
     async with service.pool.connection() as connection:
-        before = await rows.begin_check(connection, dataset_id)
+        check = await rows.begin_check(connection, dataset_id)
+        before = check.dataset
         if before.state == "committed":
             return before
         files = await rows.files_of(connection, dataset_id)
     summary: DatasetSummary | dict[str, Any] | None = None
-    renewing = asyncio.create_task(_renew_check(service, dataset_id))
+    renewing = asyncio.create_task(_renew_check(service, check))
     try:
         known = [_for_intake(f) for f in files]
         if before.holds == "files":
@@ -144,29 +145,29 @@ async def _check(service: Service, dataset_id: uuid.UUID) -> Dataset:
     finally:
         renewing.cancel()
         # Whatever happens, the dataset must not stay closed.
-        dataset = await asyncio.shield(_end_check(service, dataset_id, summary))
+        dataset = await asyncio.shield(_end_check(service, check, summary))
     if dataset.state != "committed":
         raise Conflict("The dataset was opened while it was checked; commit it again.")
     return dataset
 
 
-async def _renew_check(service: Service, dataset_id: uuid.UUID) -> None:
+async def _renew_check(service: Service, check: rows.Check) -> None:
     """Say now and then that the check is under way; without that others take it for lost."""
     while True:
         await asyncio.sleep(rows.CHECK_LOST_SECONDS / 6)
         with suppress(psycopg.Error, PoolTimeout):
             async with service.pool.connection() as connection:
-                await rows.renew_check(connection, dataset_id)
+                await rows.renew_check(connection, check)
 
 
 async def _end_check(
-    service: Service, dataset_id: uuid.UUID, summary: DatasetSummary | dict[str, Any] | None
+    service: Service, check: rows.Check, summary: DatasetSummary | dict[str, Any] | None
 ) -> Dataset:
     """Say what the check found, again and again while the database is away."""
     wait, deadline = 0.2, time.monotonic() + END_CHECK_SECONDS
     while True:
         try:
-            return await _say_check(service, dataset_id, summary)
+            return await _say_check(service, check, summary)
         except (psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout):
             if time.monotonic() > deadline:
                 raise  # whoever looks after lost checks opens it
@@ -175,17 +176,17 @@ async def _end_check(
 
 
 async def _say_check(
-    service: Service, dataset_id: uuid.UUID, summary: DatasetSummary | dict[str, Any] | None
+    service: Service, check: rows.Check, summary: DatasetSummary | dict[str, Any] | None
 ) -> Dataset:
     async with service.pool.connection() as connection:
         if summary is None:
-            return await rows.end_check(connection, dataset_id, sound=False)
+            return await rows.end_check(connection, check, sound=False)
         if isinstance(summary, dict):
-            return await rows.end_check(connection, dataset_id, sound=True, facts=summary)
+            return await rows.end_check(connection, check, sound=True, facts=summary)
         facts: dict[str, Any] = asdict(summary)
         photographs, has_poses = facts.pop("photographs"), facts.pop("has_model")
         return await rows.end_check(
-            connection, dataset_id, sound=True, has_poses=has_poses, photographs=photographs, facts=facts
+            connection, check, sound=True, has_poses=has_poses, photographs=photographs, facts=facts
         )
 
 

@@ -14,7 +14,15 @@ from octasplat.workers.queue.procrastinate_slips import ProcrastinateSlips
 from octasplat.workers.queue.rescue import Suspects, rescue_lost_jobs
 from octasplat.workers.queue.storing import mark, marking, storing, unmark
 from octasplat.workers.records.database import Connection, Pool, open_pool, tried_again
-from octasplat.workers.records.datasets import begin_check, create_dataset, get_dataset, open_lost_checks
+from octasplat.workers.records.datasets import (
+    begin_check,
+    create_dataset,
+    end_check,
+    get_dataset,
+    open_lost_checks,
+    put_file,
+    renew_check,
+)
 from octasplat.workers.records.journal import events_after, log_after
 from octasplat.workers.records.locks import lock_owner, lock_store
 from octasplat.workers.records.rows import Job
@@ -292,5 +300,30 @@ def test_a_check_that_nobody_goes_on_with_is_opened(conninfo: str) -> None:
             assert await open_lost_checks(connection) == 1
             found = [await get_dataset(connection, dataset_id) for dataset_id in ids]
         assert [dataset.state for dataset in found if dataset] == ["open", "checking"]
+
+    run(conninfo, what)
+
+
+def test_a_check_that_was_silent_for_long_says_nothing_of_later_files(conninfo: str) -> None:
+    """Its process was frozen; meanwhile the dataset was opened, changed, and is being checked again."""
+
+    async def what(pool: Pool) -> None:
+        async with pool.connection() as connection:
+            dataset_id = (await create_dataset(connection, "me", "d")).id
+        async with pool.connection() as connection:
+            frozen = await begin_check(connection, dataset_id)
+            await renew_check(connection, frozen)
+            await connection.execute("UPDATE datasets SET used_at = now() - interval '10 minutes'")
+            assert await open_lost_checks(connection) == 1
+        async with pool.connection() as connection:
+            await put_file(connection, dataset_id, "images/a.jpg", "b" * 64, 2)
+            later = await begin_check(connection, dataset_id)
+        async with pool.connection() as connection:
+            await renew_check(connection, frozen)
+            dataset = await end_check(connection, frozen, sound=True, photographs=1)
+            assert dataset.state == "checking" and dataset.photographs == 0
+            await renew_check(connection, later)
+            dataset = await end_check(connection, later, sound=True, photographs=2)
+            assert dataset.state == "committed" and dataset.photographs == 2
 
     run(conninfo, what)

@@ -3,6 +3,7 @@
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any
 
 from psycopg.rows import class_row, dict_row
@@ -203,7 +204,21 @@ async def photograph_sizes(connection: Connection, dataset_id: uuid.UUID) -> lis
     return [Sizes(row["width"], row["height"], row["n"]) for row in await cursor.fetchall()]
 
 
-async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
+@dataclass(frozen=True)
+class Check:
+    """A validation under way.
+
+    Attributes:
+        dataset: as it was when it began; one that is committed needs none.
+        said_at: when it was said to go on. The row holds one of these times for as long as the dataset is
+            this validation's: one that was silent for long, as its process was frozen, is over.
+    """
+
+    dataset: Dataset
+    said_at: list[datetime] = field(default_factory=list)
+
+
+async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Check:
     """Close an open dataset for the time of its validation.
 
     Raises:
@@ -216,18 +231,23 @@ async def begin_check(connection: Connection, dataset_id: uuid.UUID) -> Dataset:
             raise Missing("dataset")
         if dataset.state == "checking" and not await _check_was_lost(connection, dataset_id):
             raise Conflict("The dataset is being checked already; ask again in a moment.")
+        check = Check(dataset)
         if dataset.state != "committed":
+            check.said_at.append(await _clock(connection))
             await connection.execute(
-                "UPDATE datasets SET state = 'checking', used_at = now(), expires_at = NULL WHERE id = %s",
-                [dataset_id],
+                "UPDATE datasets SET state = 'checking', used_at = %s, expires_at = NULL WHERE id = %s",
+                [check.said_at[-1], dataset_id],
             )
-        return dataset
+        return check
 
 
-async def renew_check(connection: Connection, dataset_id: uuid.UUID) -> None:
+async def renew_check(connection: Connection, check: Check) -> None:
     """Say that a dataset is still being validated."""
+    before = list(check.said_at)
+    check.said_at.append(await _clock(connection))  # known before it is written, as the answer may be lost
     await connection.execute(
-        "UPDATE datasets SET used_at = now() WHERE id = %s AND state = 'checking'", [dataset_id]
+        "UPDATE datasets SET used_at = %s WHERE id = %s AND state = 'checking' AND used_at = ANY(%s)",
+        [check.said_at[-1], check.dataset.id, before],
     )
 
 
@@ -247,7 +267,7 @@ async def open_lost_checks(connection: Connection) -> int:
 
 async def end_check(
     connection: Connection,
-    dataset_id: uuid.UUID,
+    check: Check,
     *,
     sound: bool,
     has_poses: bool = False,
@@ -255,6 +275,8 @@ async def end_check(
     facts: Mapping[str, Any] | None = None,
 ) -> Dataset:
     """Commit a dataset that was found sound, or open it again for better files.
+
+    Nothing changes where the dataset is not this validation's any more; the row says so.
 
     Raises:
         Missing: there is no such dataset any more.
@@ -264,17 +286,18 @@ async def end_check(
         UPDATE datasets SET state = CASE WHEN %(sound)s THEN 'committed' ELSE 'open' END,
             committed_at = CASE WHEN %(sound)s THEN now() END, has_poses = %(poses)s,
             photographs = %(photographs)s, facts = %(facts)s
-        WHERE id = %(id)s AND state = 'checking'
+        WHERE id = %(id)s AND state = 'checking' AND used_at = ANY(%(said_at)s)
         """,
         {
+            "said_at": check.said_at,
             "sound": sound,
             "poses": has_poses,
             "photographs": photographs,
             "facts": as_json(dict(facts or {})),
-            "id": dataset_id,
+            "id": check.dataset.id,
         },
     )
-    dataset = await get_dataset(connection, dataset_id)
+    dataset = await get_dataset(connection, check.dataset.id)
     if dataset is None:
         raise Missing("dataset")
     return dataset
@@ -319,6 +342,14 @@ async def delete_dataset(connection: Connection, dataset_id: uuid.UUID) -> None:
         if row and row["n"]:
             raise Conflict(f"{row['n']} jobs were made from this dataset; delete them first.")
         await connection.execute("DELETE FROM datasets WHERE id = %s", [dataset_id])
+
+
+async def _clock(connection: Connection) -> datetime:
+    """The time by the database's clock."""
+    row = await (await connection.execute("SELECT clock_timestamp() AS at")).fetchone()
+    assert row is not None
+    at: datetime = row["at"]
+    return at
 
 
 async def _check_was_lost(connection: Connection, dataset_id: uuid.UUID) -> bool:
