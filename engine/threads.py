@@ -27,6 +27,13 @@ def use_threads(threads: int) -> int:
     return count
 
 
+def threads_in_use() -> int:
+    """Return how many threads kernels take when this thread calls them, as :func:`use_threads` has set it."""
+    import numba
+
+    return int(numba.get_num_threads())
+
+
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
     """Keep torch to the calling thread, where several photographs are worked on side by side already."""

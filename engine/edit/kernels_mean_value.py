@@ -9,10 +9,11 @@ import math
 
 import llvmlite.ir as ir
 import numpy as np
-from numba import njit, prange, types
+from numba import prange, types
 from numba.extending import intrinsic
 from numpy.polynomial import Chebyshev, Polynomial
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels_simd import DOUBLE8, LANES, Lanes, broadcast
 
 GROUPS_AT_ONCE = 16
@@ -220,7 +221,7 @@ def add_solid_angle(typingctx, corners, total):
     return signature, codegen
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def _gather(points, first, vertices, near, rows, seen):
     """Eight points from ``first`` on (the last one again where there are fewer), and the vertices from there.
 
@@ -237,7 +238,7 @@ def _gather(points, first, vertices, near, rows, seen):
     return met
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def winding_numbers(points, vertices, triangles, result):
     """How often a closed mesh winds round each point: the sum of its triangles' solid angles over 4 pi."""
     chunks = -(-len(points) // (GROUPS_AT_ONCE * LANES))
@@ -245,7 +246,7 @@ def winding_numbers(points, vertices, triangles, result):
         _wind(points, vertices, triangles, chunk * GROUPS_AT_ONCE * LANES, result)
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def _wind(points, vertices, triangles, start, result):
     rows, total = np.empty((POINT_ROWS, LANES)), np.empty((1, LANES))
     seen = np.empty((len(vertices) * VERTEX_ROWS, LANES))
@@ -262,7 +263,7 @@ def _wind(points, vertices, triangles, start, result):
             result[first + lane] = np.int64(np.rint(total[0, lane] / TURN))
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def mean_value_weights(points, vertices, triangles, edges, opposite, size, weights):
     """Mean-value coordinates of points in a closed triangle mesh (Ju, Schaefer, Warren 2005).
 
@@ -277,7 +278,7 @@ def mean_value_weights(points, vertices, triangles, edges, opposite, size, weigh
         _weigh(points, vertices, triangles, edges, opposite, 1e-9 * size, start, weights)
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def _weigh(points, vertices, triangles, edges, opposite, near, start, weights):
     count = len(vertices)
     rows = np.empty((POINT_ROWS, LANES))
@@ -315,7 +316,7 @@ def _weigh(points, vertices, triangles, edges, opposite, near, start, weights):
                 weights[first + lane, j] = sums[j, lane] / totals[lane]
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def _settle(point, vertices, triangles, near, row):
     """Coordinates of a point that is one of the vertices, or else lies on a triangle: the first one's."""
     row[:] = 0.0

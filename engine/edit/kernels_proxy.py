@@ -3,10 +3,12 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from octasplat.engine.compilation import kernel
 
 
-@njit(cache=True)
+@kernel()
 def point_triangle_distance(point, a, b, c):
     """Distance of a point from a triangle (the regions of Ericson, Real-Time Collision Detection, 5.1.5)."""
     ab0, ab1, ab2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -44,7 +46,7 @@ def point_triangle_distance(point, a, b, c):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def triangle_weights(points, corners, candidates, sample_distances, falloff, chosen, weights, distances):
     """Nearest triangles of each point among ``candidates`` and smooth weights for them.
 
@@ -93,7 +95,7 @@ def triangle_weights(points, corners, candidates, sample_distances, falloff, cho
         distances[i] = least
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def blend(points, starts, triangles, weights, derivatives, centres, moved_centres, result):
     """Result = mean over the triangles t of each point, by their weights, of F_t (x - c_t) + c'_t.
 

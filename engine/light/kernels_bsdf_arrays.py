@@ -3,14 +3,15 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.light.kernels_bsdf import LEAST_ALPHA, fresnel_dielectric, opaque_sample, opaque_value
 from octasplat.engine.light.kernels_random import SCALE, reversed_bits
 from octasplat.engine.shading.kernels_microfacets import ggx_masking, sample_visible_normal
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def integrate_albedo(ior, samples, table):
     """Share of light from each direction that one bounce off facets sends back, into ``table``.
 
@@ -38,7 +39,7 @@ def integrate_albedo(ior, samples, table):
             table[j, i] = total / samples
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def opaque_values(
     o, i, colours, metallic, roughness, ior, ground_kind, kept, mirror, coat, coat_mean, f, pdf
 ):
@@ -50,7 +51,7 @@ def opaque_values(
         )  # fmt: skip
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def opaque_samples(o, colours, metallic, roughness, coat, numbers, i):
     """:func:`opaque_sample` of rows of arguments; ``numbers`` are three uniform ones a row."""
     for n in prange(len(o)):
@@ -60,7 +61,7 @@ def opaque_samples(o, colours, metallic, roughness, coat, numbers, i):
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def fresnel_values(cosines, eta, reflected, cos_t):
     """:func:`fresnel_dielectric` of rows of cosines."""
     for n in range(len(cosines)):

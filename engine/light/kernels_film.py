@@ -1,9 +1,9 @@
 """Sums over the paths of each pixel."""
 
-from octasplat.engine.trace.kernels_native import lean
+from octasplat.engine.compilation import kernel
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def add_up(values, factors, each, pixels, sums):
     """Add to the rows ``pixels`` of ``sums`` those of ``values``, ``each`` a pixel, times ``factors``.
 

@@ -2,14 +2,14 @@
 
 import numpy as np
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.light.arrays import BLOCK
 from octasplat.engine.light.kernels_path import add_lit, meet_surfaces, start_paths
 from octasplat.engine.light.kernels_shadows import let_through
-from octasplat.engine.trace.kernels_native import lean
 from octasplat.engine.trace.kernels_triangles import closest_hits
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def follow_paths(
     count, scratch, view, rules, first_pixel, per_pixel, first_sample, order, near, no_end, paths, active,
     distances, faces, barycentrics, queries, surfaces, materials, lights, environment, shadows, share,

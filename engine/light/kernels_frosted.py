@@ -10,8 +10,9 @@ functions of their arguments.
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.light.kernels_bsdf import LEAST_ALPHA, fresnel_dielectric
 from octasplat.engine.light.kernels_random import SCALE, reversed_bits
 from octasplat.engine.shading.kernels_microfacets import ggx_density, ggx_masking, sample_visible_normal
@@ -65,7 +66,7 @@ def frosted_sample(o_x, o_y, o_z, eta, alpha, choice, u, v):
     return (along * h_x - o_x / eta, along * h_y - o_y / eta, down) if down < 0.0 else (0.0, 0.0, 0.0)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def integrate_frosted(eta, samples, table):
     """Share of light from each direction that one bounce off or through facets keeps, into ``table``.
 
@@ -93,14 +94,14 @@ def integrate_frosted(eta, samples, table):
             table[j, i] = total / samples
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def frosted_values(o, i, eta, alpha, values, pdf):
     """:func:`frosted_value` of rows of directions."""
     for n in prange(len(o)):
         values[n], pdf[n] = frosted_value(o[n, 0], o[n, 1], o[n, 2], i[n, 0], i[n, 1], i[n, 2], eta, alpha)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def frosted_samples(o, eta, alpha, numbers, i):
     """:func:`frosted_sample` of rows of directions; ``numbers`` are three uniform ones a row."""
     for n in prange(len(o)):

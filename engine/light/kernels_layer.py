@@ -14,6 +14,7 @@ composited as such, into one layer of premultiplied colour g and transmittance T
 
 import math
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.light.arrays import PAIRS_OF_SURFACE
 from octasplat.engine.light.kernels_lights import FAR, adding_share, pick_light, sample_light
 from octasplat.engine.light.kernels_path import ENDED, PAIRS_OF_CAMERA, add_radiance, beyond
@@ -44,7 +45,7 @@ def decode(display):
     return ((display + 0.055) / 1.055) ** 2.4
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def meet_layers(
     first, last, scratch, paths, active, depth, distances, faces,
     rgb, transmittance, depth_median, depth_sum, normals, features,
@@ -148,7 +149,7 @@ def meet_layers(
             paths.alive[p], faces[k] = False, ENDED
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def add_layer_light(first, last, scratch, paths, active, lit, lost, free, through_casters, through_others):
     """Add what shadow rays of layers brought.
 

@@ -7,8 +7,7 @@ asked most.
 
 import math
 
-from numba import njit
-
+from octasplat.engine.compilation import kernel
 from octasplat.engine.light.kernels_bsdf import around
 from octasplat.engine.light.kernels_texture import texture_value
 from octasplat.engine.trace.kernels_native import lean
@@ -337,7 +336,7 @@ def sample_environment(lights, u, v):
     return d_x, d_y, d_z, pdf
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def environment_values(lights, directions, radiance, density):
     """Radiance and density of rows of directions."""
     for n in range(len(directions)):
@@ -346,7 +345,7 @@ def environment_values(lights, directions, radiance, density):
         density[n] = environment_density(lights, d[0], d[1], d[2])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def light_samples(lights, points, numbers, directions, distances, radiance, density, lights_asked):
     """:func:`pick_light` and :func:`sample_light` at rows of points with three uniform numbers each.
 

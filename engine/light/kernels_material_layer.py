@@ -7,6 +7,7 @@ and else goes on to what is behind; so no light is counted twice, and rays of al
 
 import math
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.light.kernels_bsdf import BURLEY
 from octasplat.engine.light.kernels_layer import NOTHING
 from octasplat.engine.light.kernels_path import ENDED
@@ -35,7 +36,7 @@ def _draw(paths, p, pair, numbers):
         numbers[place, 0, 0], numbers[place, 1, 0] = uniform_pair(key, sample, pair + place)
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def meet_materials(
     first, last, scratch, paths, active, depth, faces, rgb, transmittance, depth_median, depth_sum, normals,
     features, materials, lights, rules, spent_below, shadows,
@@ -104,7 +105,7 @@ def meet_materials(
         )  # fmt: skip
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def start_at_points(first, last, scratch, at, pixels, samples, rules, materials, lights, paths, shadows):
     """Paths that begin at points of surfaces, as if the camera's rays had met them there."""
     numbers = scratch.numbers

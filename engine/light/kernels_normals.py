@@ -3,10 +3,11 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from octasplat.engine.compilation import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def smooth_normals(corners, order, starts, least_cosine, normals):
     """Mean normal, weighted by angle, of the faces round a corner that are turned from its own by little.
 

@@ -7,6 +7,7 @@ several threads can share the work.
 
 import math
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.light.arrays import BLOCK, PAIRS_OF_SURFACE
 from octasplat.engine.light.kernels_bsdf import around, fresnel_dielectric
 from octasplat.engine.light.kernels_frosted import LEAST_FROST, frosted_sample, frosted_value
@@ -69,7 +70,7 @@ def _camera_numbers(scratch, rules, first_pixel, per_pixel, first_sample, order,
     fill_pairs(scratch.keys, scratch.samples, count, 0, scratch.numbers[:PAIRS_OF_CAMERA])
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def start_paths(first, last, scratch, view, rules, first_pixel, per_pixel, first_sample, order, paths):
     """Paths of pixels ``order[first_pixel]`` and on, ``per_pixel`` to each, numbered from ``first_sample``.
 
@@ -326,7 +327,7 @@ def _frosted_glass(
         leave(paths, p, front_x, front_y, front_z, w_x, w_y, w_z, pdf)
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def meet_surfaces(
     first,
     last,
@@ -440,7 +441,7 @@ def meet_surfaces(
         )  # fmt: skip
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def add_lit(first, last, scratch, paths, active, lit, share):
     """Add what shadow rays brought: ``lit`` times the share of it that got through."""
     for k in range(first, last):

@@ -7,8 +7,8 @@ cannot matter.
 """
 
 import numpy as np
-from numba import njit
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.trace.kernels_native import lean
 
 SCALE = 2.0**-32
@@ -85,7 +85,7 @@ def uniform_pair(key, sample, pair):
     return min(first * SCALE, BELOW_ONE), min(second * SCALE, BELOW_ONE)
 
 
-@njit(cache=True)
+@kernel()
 def fill_uniform(seed, pixels, samples, pair, out):
     """The numbers of many (pixel, sample), for tests and for what draws them outside of the kernels."""
     for i in range(len(pixels)):

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.light.arrays import BLOCK
 from octasplat.engine.light.kernels_bsdf import fresnel_dielectric
 from octasplat.engine.light.kernels_frosted import LEAST_FROST
@@ -89,7 +90,7 @@ def _through_glass(queries, surfaces, materials, shadows, first, scratch, count,
             break
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def let_through(first, last, scratch, queries, surfaces, materials, shadows, through_frost, share):
     """The share of light that meshes let through on each ray, in each channel: 0 or 1, but for glass.
 

@@ -3,11 +3,12 @@
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
+from octasplat.engine.compilation import kernel
 
-@numba.njit(cache=True, nogil=True)
+
+@kernel()
 def gather_rays(
     view: Any,
     y: Any,
@@ -74,7 +75,7 @@ def gather_rays(
     return -1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def gather_pixels(
     view: Any,
     y: Any,

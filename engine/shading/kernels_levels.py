@@ -7,15 +7,16 @@ wide as it is high. Directions here are in the map's own frame: right, up, forwa
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.shading.kernels_microfacets import ggx_density
 
 LEAST_SQUARE = 1e-6
 """Nearer than this to a pole, a longitude has no slope."""
 
 
-@njit(error_model="numpy", inline="always")
+@device_function(error_model="numpy", inline="always")
 def texel_direction(row, column, height):
     """The middle of a texel."""
     polar = math.pi * (row + 0.5) / height
@@ -24,7 +25,7 @@ def texel_direction(row, column, height):
     return ring * math.sin(longitude), math.cos(polar), ring * math.cos(longitude)
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def lobe_weight(cosine, alpha):
     """What a rough mirror that looks along its normal takes from a direction of that cosine to it.
 
@@ -37,7 +38,7 @@ def lobe_weight(cosine, alpha):
     return ggx_density(math.sqrt(0.5 * (1.0 + cosine)), alpha) * cosine
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def lobe_rows(height, source_height, alpha, least, starts, columns, weights, counting):
     """Each texel of a level as a weighted mean of texels of a map, in compressed sparse rows.
 
@@ -95,7 +96,7 @@ def lobe_rows(height, source_height, alpha, least, starts, columns, weights, cou
             starts[number + 1] += starts[number]
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def sparse_product(starts, columns, weights, values, out):
     """``out`` = the sparse rows times ``values``, three channels; each sum in the order of its row."""
     for row in prange(len(starts) - 1):
@@ -108,7 +109,7 @@ def sparse_product(starts, columns, weights, values, out):
         out[row, 0], out[row, 1], out[row, 2] = red, green, blue
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def look_up(texels, offset, height, x, y, z):
     """Bilinear value of a level at a unit direction.
 

@@ -1,12 +1,13 @@
 """Colours of a map of all directions, and gradients back to its texels."""
 
-from numba import njit, prange
+from numba import prange
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.shading.kernels_levels import look_up
 from octasplat.engine.shading.kernels_split_sum import mix
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def _place(texels, height, frame, d):
     """Where a world direction lies in the map, see :func:`look_up`."""
     right = frame[0, 0] * d[0] + frame[0, 1] * d[1] + frame[0, 2] * d[2]
@@ -15,7 +16,7 @@ def _place(texels, height, frame, d):
     return look_up(texels, 0, height, right, up, forward)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def map_colours(texels, height, frame, directions_world, colours):
     """Bilinear colours of a map of ``height`` rows; ``frame`` is its right, up and forward as rows."""
     for r in prange(len(directions_world)):
@@ -24,7 +25,7 @@ def map_colours(texels, height, frame, directions_world, colours):
             colours[r, k] = mix(texels, a, b, c, d, x, y, k)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def add_to_texels(texels, height, frame, directions_world, by_colours, sums):
     """Add gradients by the colours to those by the texels, in the order of the rays: always the same sums."""
     for r in range(len(directions_world)):

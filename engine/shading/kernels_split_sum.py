@@ -6,8 +6,9 @@ formula.
 
 import math
 
-from numba import njit, prange
+from numba import prange
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.shading.kernels_levels import look_up
 from octasplat.engine.shading.kernels_microfacets import ggx_masking, sample_visible_normal, schlick_weight
 
@@ -17,7 +18,7 @@ LEAST_COSINE = 1e-3
 F0 = 0.04
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def integrate_table(samples, table):
     """Scale and bias of F0 that one bounce off GGX facets of a white environment sends back.
 
@@ -49,7 +50,7 @@ def integrate_table(samples, table):
         table[row, column, 0], table[row, column, 1] = scale / samples, bias / samples
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def table_slopes(table, cosine, roughness):
     """Both values of the table, and their slopes by cosine and by roughness."""
     rows, columns = table.shape[:2]
@@ -68,7 +69,7 @@ def table_slopes(table, cosine, roughness):
     return scale, bias, by_cos0, by_cos1, by_rough0, by_rough1
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def mix(texels, a, b, c, d, x, y, channel):
     """Bilinear value of four texels."""
     top = texels[a, channel] * (1.0 - x) + texels[b, channel] * x
@@ -76,14 +77,14 @@ def mix(texels, a, b, c, d, x, y, channel):
     return top * (1.0 - y) + bottom * y
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def mix_slopes(texels, a, b, c, d, x, y, channel):
     """Slopes of that by the two fractions."""
     p, q, r, s = texels[a, channel], texels[b, channel], texels[c, channel], texels[d, channel]
     return (q - p) * (1.0 - y) + (s - r) * y, (r - p) * (1.0 - x) + (s - q) * x
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def level_of(roughnesses, roughness):
     """The level below a roughness, how far it is to the next, and the slope of that."""
     last = len(roughnesses) - 1
@@ -96,7 +97,7 @@ def level_of(roughnesses, roughness):
     return last - 1, 1.0, 0.0
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def shade_pixel(p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb):
     """Linear colour of one pixel."""
     texels, offsets, heights, roughnesses = light.texels, light.offsets, light.heights, light.roughnesses
@@ -122,7 +123,7 @@ def shade_pixel(p, material, normal, direction, visibility, indirect, ambient, b
         rgb[p, channel] = (f0 * scale + bias) * seen + (1.0 - metallic) * albedo * lit
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def shade_pixels(
     material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb
 ):  # fmt: skip
@@ -131,7 +132,7 @@ def shade_pixels(
         shade_pixel(p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, rgb)
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def look_back(texels, taps, weights, p, place, offset, height, x, y, z, share):
     """Write the four texels of a look-up and their weights times ``share``; the nine of :func:`look_up`."""
     found = look_up(texels, offset, height, x, y, z)
@@ -144,7 +145,7 @@ def look_back(texels, taps, weights, p, place, offset, height, x, y, z, share):
     return found
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def direction_slope(texels, found, channel):
     """Slope of a looked-up value by the direction."""
     a, b, c, d, u, v, column_x, column_z, row_y = found
@@ -152,7 +153,7 @@ def direction_slope(texels, found, channel):
     return by_u * column_x, by_v * row_y, by_u * column_z
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def reverse_pixel(
     p, material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur, by_rgb, out
 ):
@@ -233,7 +234,7 @@ def reverse_pixel(
     out.visibility[p], out.ambient[p] = by_visibility, by_ambient
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def reverse_pixels(
     material, normal, direction, visibility, indirect, ambient, bounced, light, table, blur, by_rgb, out
 ):
@@ -245,7 +246,7 @@ def reverse_pixels(
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def add_to_texels(taps, weights, specular, diffuse, by_texels):
     """Add each pixel's shares to the texels that it asked, pixel after pixel."""
     for p in range(len(taps)):

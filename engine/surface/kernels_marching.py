@@ -1,7 +1,9 @@
 """Marching cubes over blocks of voxels; vertices are shared across blocks by the edges they lie on."""
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from octasplat.engine.compilation import device_function, kernel
 
 BLOCK = 8
 SIDE = BLOCK + 1
@@ -9,7 +11,7 @@ SIDE = BLOCK + 1
 CELLS = SIDE**3
 
 
-@njit
+@device_function()
 def neighbour(table, blocks, b, x, y, z):
     """Row of the block that holds voxel (x, y, z) counted from block ``b``, and the voxel's place in it."""
     bx, by, bz = blocks[b, 0] + x // BLOCK, blocks[b, 1] + y // BLOCK, blocks[b, 2] + z // BLOCK
@@ -19,7 +21,7 @@ def neighbour(table, blocks, b, x, y, z):
     return table[bx, by, bz], place
 
 
-@njit
+@device_function()
 def gather(table, blocks, b, values, weights, min_weight, out):
     """The 9^3 values that the cells of a block need; not-a-number where too little is known."""
     for x in range(SIDE):
@@ -32,13 +34,13 @@ def gather(table, blocks, b, values, weights, min_weight, out):
                     out[(x * SIDE + y) * SIDE + z] = np.nan
 
 
-@njit
+@device_function()
 def offset_of(corner):
     """Place of a cell's corner among the 9^3 values, from the cell's first corner."""
     return ((corner & 1) * SIDE + (corner >> 1 & 1)) * SIDE + (corner >> 2 & 1)
 
 
-@njit
+@device_function()
 def case_of(near, at):
     """Which corners of the cell lie inside, as bits; 0 where one of them is unknown."""
     case = 0
@@ -51,7 +53,7 @@ def case_of(near, at):
     return case
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def count_parts(table, blocks, values, weights, min_weight, triangle_counts, crossed, vertices, triangles):
     """How many vertices and triangles each block owns; ``crossed`` gets a bit for each axis of a voxel.
 
@@ -79,7 +81,7 @@ def count_parts(table, blocks, values, weights, min_weight, triangle_counts, cro
         vertices[b], triangles[b] = vertex_count, triangle_count
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def place_vertices(table, blocks, values, weights, min_weight, crossed, starts, first, points):
     """Vertices where values change sign along edges, in voxels from the grid's first voxel centre.
 
@@ -107,7 +109,7 @@ def place_vertices(table, blocks, values, weights, min_weight, crossed, starts, 
                             number += 1
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def place_triangles(
     table, blocks, values, weights, min_weight, edge_corners, edge_table, triangle_counts,
     crossed, first, starts, faces,

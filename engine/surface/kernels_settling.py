@@ -3,13 +3,15 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from octasplat.engine.compilation import kernel
 
 MIN_COSINE = 0.15
 """Pixels that see a triangle more from the side say nothing of where it lies."""
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def linearise(vertices, normals, sizes, rgb, corners, weights, directions, steady, change, lifts):
     """How each pixel's colour changes as its triangle moves by one along its normal, and who moves it.
 
@@ -40,7 +42,7 @@ def linearise(vertices, normals, sizes, rgb, corners, weights, directions, stead
             change[p, c] = step / cosine
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def show(corners, weights, lifts, change, values, pixels):
     """Colours of pixels for ``values`` of vertices: red, green, blue and how far they move."""
     for p in prange(len(corners)):
@@ -56,7 +58,7 @@ def show(corners, weights, lifts, change, values, pixels):
         pixels[p, 2] = blue + change[p, 2] * moved
 
 
-@njit(cache=True)
+@kernel()
 def gather(corners, weights, lifts, change, pixels, values):
     """The transpose of :func:`show`, added to ``values``; one thread, so that sums have one order."""
     for p in range(len(corners)):
@@ -70,7 +72,7 @@ def gather(corners, weights, lifts, change, pixels, values):
             values[i, 3] += lifts[p, c] * moved
 
 
-@njit(cache=True)
+@kernel()
 def gather_squares(corners, weights, lifts, change, sure, values):
     """The diagonal of :func:`gather` after :func:`show`, pixels weighted by ``sure``, added to ``values``."""
     for p in range(len(corners)):

@@ -2,10 +2,10 @@
 
 import math
 
-from numba import njit
+from octasplat.engine.compilation import kernel
 
 
-@njit(cache=True)
+@kernel()
 def rasterise(xy, faces, owner, weights):
     """Number of the triangle at each pixel's centre, and the weights of its second and third corner.
 

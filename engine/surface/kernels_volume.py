@@ -3,7 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from octasplat.engine.compilation import device_function, kernel
 
 BLOCK = 8
 VOXELS = BLOCK**3
@@ -16,7 +18,7 @@ MARGIN_VOXELS = 2.0
 """Blocks are taken this far around a band, so that cells at its rim find all of their corners."""
 
 
-@njit
+@device_function()
 def contract(x, y, z):
     """Contracted position of a point in units of the unit ball."""
     length = math.sqrt(x * x + y * y + z * z)
@@ -26,7 +28,7 @@ def contract(x, y, z):
     return x * factor, y * factor, z * factor
 
 
-@njit
+@device_function()
 def expand(x, y, z):
     """The way back from :func:`contract`, and how much lengths grow on it, at most (1 inside the ball).
 
@@ -42,7 +44,7 @@ def expand(x, y, z):
     return x * factor, y * factor, z * factor, world * world
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def mark_blocks(
     distances, fx, fy, cx, cy, rotation, centre, low, voxel, contracted, middle, radius, truncation, marks
 ):  # fmt: skip
@@ -93,7 +95,7 @@ def mark_blocks(
                             marks[bx, by, bz] = 1
 
 
-@njit
+@device_function()
 def depth_at(distances, cosines, u, v, jump):
     """Distance and cosine at an image point: bilinear on one surface, else of the pixel itself.
 
@@ -114,7 +116,7 @@ def depth_at(distances, cosines, u, v, jump):
     return (a * (1 - tx) + b * tx) * (1 - ty) + (c * (1 - tx) + d * tx) * ty, cosine
 
 
-@njit(cache=True)
+@kernel()
 def tile_ranges(distances, nearest, farthest):
     """Least and largest distance in each tile of 16 x 16 pixels; unknown ones count as 0."""
     height, width = distances.shape
@@ -126,7 +128,7 @@ def tile_ranges(distances, nearest, farthest):
             farthest[y, x] = max(farthest[y, x], distances[row, column])
 
 
-@njit
+@device_function()
 def block_lies(
     ox, oy, oz, half, band, fx, fy, cx, cy, rotation, width, height, nearest, farthest
 ):  # fmt: skip
@@ -164,7 +166,7 @@ def block_lies(
     return NEAR
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def fuse_view(
     distances, cosines, nearest, farthest, fx, fy, cx, cy, rotation, centre,
     low, voxel, contracted, middle, radius, truncation, blocks, values, weights,

@@ -4,21 +4,23 @@ from collections.abc import Callable
 from typing import Any
 
 import llvmlite.ir as ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from octasplat.engine.compilation import device_function
 
 LINE = 64
 """Bytes of a cache line."""
 
 
 def lean(**options: Any) -> Callable[[Any], Any]:
-    """Njit for functions that make no arrays: nothing counts references to those that they use.
+    """Return :func:`device_function` for functions that make no arrays: no references are counted.
 
     Else every use of a field of a named tuple counts one up and down again, one by one for all threads, which
     takes longer than the work of a hit.
     """
-    return njit(_nrt=False, error_model="numpy", **options)
+    return device_function(_nrt=False, error_model="numpy", **options)
 
 
 def _pointer_cast(element):

@@ -6,8 +6,9 @@ Embree gives each ray of eight what it would give that ray alone.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.trace.kernels_native import call_with_four_pointers, lean
 
 LANES = 8
@@ -61,7 +62,7 @@ def _ask(query, origins, directions, t_min, t_max, which, k, last, coherent, wor
     )
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def closest_hits(
     query, origins, directions, t_min, t_max, which, first, last, coherent, scratch,
     distances, faces, barycentrics,
@@ -83,7 +84,7 @@ def closest_hits(
             barycentrics[k + lane, 1] = scratch[V * LANES + lane] if hit else np.float32(0.0)
 
 
-@lean(cache=True, nogil=True)
+@kernel(_nrt=False, error_model="numpy")
 def any_hits(query, origins, directions, t_min, t_max, which, first, last, scratch, occluded):
     """Whether any triangle lies on each ray; see :func:`closest_hits`."""
     for k in range(first, last, LANES):
@@ -92,7 +93,7 @@ def any_hits(query, origins, directions, t_min, t_max, which, first, last, scrat
             occluded[k + lane] = scratch[T_FAR * LANES + lane] == -np.inf
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def closest_hits_side_by_side(
     query, origins, directions, t_min, t_max, which, scratch, distances, faces, barycentrics
 ):
@@ -105,7 +106,7 @@ def closest_hits_side_by_side(
         )  # fmt: skip
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def any_hits_side_by_side(query, origins, directions, t_min, t_max, which, scratch, occluded):
     """:func:`any_hits` on all rays and several threads."""
     count, chunks = len(directions), len(scratch)

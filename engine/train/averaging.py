@@ -9,8 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from octasplat.engine.compilation import run_ranges
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.rows import row_arrays
+from octasplat.engine.threads import threads_in_use
 from octasplat.engine.train.kernels_averaging import move_towards
 
 AVERAGE_EVERY = 10
@@ -39,7 +41,8 @@ class RunningMean:
         share = np.float32(1.0 / self.count)
         values = row_arrays(now)
         for name, mean in row_arrays(self.gaussians).items():
-            move_towards(mean.reshape(-1), np.ascontiguousarray(values[name]).reshape(-1), share)
+            flat, new = mean.reshape(-1), np.ascontiguousarray(values[name]).reshape(-1)
+            run_ranges(move_towards, threads_in_use(), len(flat), flat, new, share)
 
     def clear(self) -> None:
         """Forget all states, as rows now belong to other Gaussians."""

@@ -4,10 +4,11 @@ import math
 
 import llvmlite.ir as ir
 import numpy as np
-from numba import njit, prange, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.trace.kernels_native import ask_for, float32_pointer, lean
 
 LANES = 16
@@ -23,7 +24,7 @@ LEAST_SHARE = 1e-3
 """Numbers between 0 and 1 stay this far from both, so that they can come back."""
 
 
-@njit
+@device_function()
 def _update(
     value, gradient, first, second, row, column, rate, correction1, correction2, beta1, beta2, epsilon
 ):
@@ -235,8 +236,9 @@ def step_chunk(begin, end, ids, steps, powers, room, state, gaussian, gradients,
         step_gaussian(k, i, room, (first, second, numbers), gaussian, gradients, rates, regular, corrections)
 
 
-@njit(cache=True, parallel=True)
+@kernel()
 def adam_step(
+    first_chunk, last_chunk,
     ids, steps, powers, first, second,
     means, quats, log_scales, logits, sh,
     g_means, g_quats, g_log_scales, g_logits, g_sh,
@@ -244,7 +246,7 @@ def adam_step(
     opacity_weight, scale_weight, min_log_scale, max_log_scale,
     beta1, beta2, epsilon, mean_steps, corrections,
 ):  # fmt: skip
-    """One step for the Gaussians ``ids``; each has its own step count for the bias correction.
+    """One step for the Gaussians ``ids`` of some chunks of :data:`CHUNK`; each has its own step count for the bias correction.
 
     ``powers`` are those of ``beta1`` and ``beta2``, for as many steps as any has taken and one more.
     ``rate_mean`` is in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric
@@ -257,7 +259,7 @@ def adam_step(
     each mean's step, world units, and ``corrections`` what both moments are multiplied by.
     """
     count = len(ids)
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
+    for chunk in range(first_chunk, last_chunk):
         room = np.zeros((10, LANES), np.float32)
         step_chunk(
             chunk * CHUNK, min(count, (chunk + 1) * CHUNK), ids, steps, powers, room,
@@ -273,14 +275,28 @@ def adam_step(
         )  # fmt: skip
 
 
-@njit(cache=True, parallel=True)
-def adam_shares(ids, corrections, first, second, column, values, g_values, rate, beta1, beta2, epsilon):
+@kernel()
+def adam_shares(
+    first_row,
+    last_row,
+    ids,
+    corrections,
+    first,
+    second,
+    column,
+    values,
+    g_values,
+    rate,
+    beta1,
+    beta2,
+    epsilon,
+):
     """One step for numbers in (0, 1) of the Gaussians ``ids``, taken by their logits.
 
     Their moments begin at ``column``; ``corrections`` are those of :func:`adam_step`. A ``rate`` of 0 changes
     nothing.
     """
-    for k in prange(len(ids)):
+    for k in range(first_row, last_row):
         i = ids[k]
         c1, c2 = corrections[k, 0], corrections[k, 1]
         for place in range(values.shape[1]):

@@ -1,10 +1,10 @@
 """A mean of arrays, moved by one more of them."""
 
-from numba import njit, prange
+from octasplat.engine.compilation import kernel
 
 
-@njit(cache=True, parallel=True)
-def move_towards(mean, now, share):
+@kernel()
+def move_towards(first, last, mean, now, share):
     """Move each number of ``mean`` by ``share`` of its way to that of ``now``, in float32."""
-    for k in prange(len(mean)):
+    for k in range(first, last):
         mean[k] += (now[k] - mean[k]) * share

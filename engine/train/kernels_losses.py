@@ -1,8 +1,8 @@
 """The pixels' loss and its gradient in one pass."""
 
 import numpy as np
-from numba import njit, prange
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.trace.kernels_native import lean
 
 CHUNKS = 64
@@ -26,11 +26,11 @@ def _part(first, last, render, target, weight, l1, l2, gradient, sums):
     sums[0], sums[1] = absolute, squared
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def pixel_terms(render, target, weight, l1, l2, gradient, sums):
+@kernel(error_model="numpy")
+def pixel_terms(first, last, render, target, weight, l1, l2, gradient, sums):
     """Write ``gradient`` = (l1 sign(d) + l2 d) weight, d = render - target, and ``sums`` of |d| and d^2."""
     count, chunks = len(render), len(sums)
-    for c in prange(chunks):
+    for c in range(first, last):
         _part(
             c * count // chunks, (c + 1) * count // chunks, render, target, weight, l1, l2, gradient, sums[c]
         )

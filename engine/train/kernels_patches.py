@@ -1,10 +1,11 @@
 """How much small patches of photographs differ."""
 
 import numpy as np
-from numba import njit
+
+from octasplat.engine.compilation import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def patch_differences(ours, theirs, rows, level_weight, costs):
     """Difference of each patch ``theirs[k]`` from ``ours[rows[k]]``, written to ``costs[k]``.
 

@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.ndimage import correlate1d
 
+from octasplat.engine.compilation import run_ranges
+from octasplat.engine.threads import threads_in_use
 from octasplat.engine.train.batches import Batch
 from octasplat.engine.train.config import LossWeights
 from octasplat.engine.train.kernels_losses import CHUNKS, pixel_terms
@@ -118,8 +120,10 @@ def pixel_loss(
     """L1 and squared error, averaged over the rays of non-zero weight and the channels."""
     valid = max(float(weight.sum(dtype=np.float64)), 1.0)
     gradient, sums = np.empty(render.shape, np.float32), np.empty((CHUNKS, 2))
-    pixel_terms(
-        render, target, weight, np.float32(l1 / (3 * valid)), np.float32(2 * l2 / (3 * valid)), gradient, sums
-    )
+    run_ranges(
+        pixel_terms, threads_in_use(), CHUNKS,
+        render, target, weight, np.float32(l1 / (3 * valid)), np.float32(2 * l2 / (3 * valid)), gradient, sums,
+        grain=1,
+    )  # fmt: skip
     absolute, squared = sums.sum(axis=0) / (3 * valid)
     return BatchLoss(float(l1 * absolute + l2 * squared), gradient, float(squared))

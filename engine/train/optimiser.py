@@ -9,11 +9,13 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
+from octasplat.engine.compilation import run_ranges
 from octasplat.engine.gaussians.model import SH_C0, FlatGaussians
 from octasplat.engine.gaussians.rows import join_rows, row_arrays, select_rows
+from octasplat.engine.threads import threads_in_use
 from octasplat.engine.trace.protocol import GaussianGradients
 from octasplat.engine.train.config import LearningRates, LossWeights
-from octasplat.engine.train.kernels_adam import GEOMETRY, LANES, adam_shares, adam_step
+from octasplat.engine.train.kernels_adam import CHUNK, GEOMETRY, LANES, adam_shares, adam_step
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -101,7 +103,8 @@ class Adam:
         vectors = -(-3 * gaussians.sh.shape[1] // LANES)
         rates_sh = np.full(vectors * LANES, colour * rates.sh_rest_ratio, np.float32)
         rates_sh[:3] = colour
-        adam_step(
+        run_ranges(
+            adam_step, threads_in_use(), -(-len(gradients.ids) // CHUNK),
             gradients.ids, self.steps, _powers(1 << (int(self.steps.max(initial=0)) + 1).bit_length()),
             self.first, self.second,
             gaussians.means_world, gaussians.quats_wxyz, gaussians.log_scales,
@@ -114,7 +117,7 @@ class Adam:
             rates_sh,
             loss.opacity / hit, loss.scale / (2 * hit * extent),
             float(np.log(1e-6 * extent)), float(np.log(10.0 * extent)),
-            BETA1, BETA2, EPSILON, moved, corrections,
+            BETA1, BETA2, EPSILON, moved, corrections, grain=1,
         )  # fmt: skip
         self._step_channels(gaussians, gradients, rates, decay, corrections)
         return moved
@@ -133,7 +136,8 @@ class Adam:
         for name, values in gaussians.channels.items():
             rate, width = rates.of_channel(name), values.shape[1]
             if rate > 0:
-                adam_shares(
+                run_ranges(
+                    adam_shares, threads_in_use(), len(gradients.ids),
                     gradients.ids, corrections, self.channel_first, self.channel_second, column, values,
                     gradients.features[:, column : column + width], rate * decay, BETA1, BETA2, EPSILON,
                 )  # fmt: skip

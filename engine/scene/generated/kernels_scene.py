@@ -1,10 +1,11 @@
 """Compiled inner loops of the generated scene: gradient noise, and interpolation on triangles."""
 
-import numba
 import numpy as np
 
+from octasplat.engine.compilation import device_function, kernel
 
-@numba.njit(cache=True, nogil=True, inline="always")
+
+@device_function(inline="always")
 def _hash(x, y, z, seed):  # type: ignore[no-untyped-def]
     """32 well mixed bits of an integer lattice point."""
     h = np.uint32(x) * np.uint32(0x8DA6B343) ^ np.uint32(y) * np.uint32(0xD8163841)
@@ -15,7 +16,7 @@ def _hash(x, y, z, seed):  # type: ignore[no-untyped-def]
     return np.uint32(h ^ (h >> np.uint32(15)))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def hashed(cells, seed, out):  # type: ignore[no-untyped-def]
     """A number in [0, 1) of every integer cell (n, 3), into ``out`` (n,)."""
     for i in range(cells.shape[0]):
@@ -24,7 +25,7 @@ def hashed(cells, seed, out):  # type: ignore[no-untyped-def]
         )
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@device_function(inline="always")
 def _slope(h, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Height at an offset from a lattice point, on the plane that the hash gives to that point."""
     scale = np.float32(1.0 / 511.5)
@@ -34,7 +35,7 @@ def _slope(h, dx, dy, dz):  # type: ignore[no-untyped-def]
     return gx * dx + gy * dy + gz * dz
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def fractal_noise(points, octaves, seed, out):  # type: ignore[no-untyped-def]
     """Sum of ``octaves`` gradient noises, each twice as fine and half as strong, into ``out`` (n,)."""
     one = np.float32(1)
@@ -67,7 +68,7 @@ def fractal_noise(points, octaves, seed, out):  # type: ignore[no-untyped-def]
         out[i] = total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel()
 def interpolate(attributes, faces, face_ids, u, v, out):  # type: ignore[no-untyped-def]
     """Vertex attributes (vertices, k) at barycentric coordinates (u, v) on faces, into ``out`` (n, k)."""
     width = attributes.shape[1]

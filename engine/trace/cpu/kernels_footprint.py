@@ -7,9 +7,10 @@ between them are found by a table over bins of a and b.
 
 import llvmlite.ir as ir
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
+from octasplat.engine.compilation import device_function
 from octasplat.engine.trace.cpu.kernels_rays import ray_slopes
 from octasplat.engine.trace.cpu.kernels_simd import FLOAT8, I64, LANES, ROUNDING, Lanes, broadcast, size_of
 
@@ -21,7 +22,7 @@ FRAME_WORDS = 15
 """A packet's axis, e and f; its slopes a low, a high, b low, b high; bins per slope along a and b."""
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def write_bins(rays, first, last, frame, below):
     """Bins per slope into the frame, and the bits of the rays in bins before i into ``below[axis, i]``."""
     frame[13] = BINS / (frame[10] - frame[9])
@@ -115,7 +116,7 @@ def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def rays_between(bins, lane, below):
     """Bits of the rays in the bins of one lane, and the cell of their middle."""
     i0, i1, j0, j1 = bins[0, lane], bins[1, lane], bins[2, lane], bins[3, lane]

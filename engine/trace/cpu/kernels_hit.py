@@ -8,8 +8,9 @@ precision and the order of hits does not depend on how the hierarchy was walked.
 import math
 
 import numpy as np
-from numba import carray, cfunc, njit, types
+from numba import carray, cfunc, types
 
+from octasplat.engine.compilation import device_function
 from octasplat.engine.trace.kernels_native import (
     float32_pointer,
     float64_pointer,
@@ -43,7 +44,7 @@ GRAZING_COSINE = 1e-6
 COS_22, SIN_22 = math.cos(math.pi / 8), math.sin(math.pi / 8)
 
 
-@njit(fastmath={"contract"})
+@device_function(fastmath={"contract"})
 def insert_hit(context_i32, context_f32, context_f64, t, identity, alpha):
     """Insert by (t, id) into the sorted buffer; drop hits that lie behind the ray's end. Return new count."""
     count = context_i32[COUNT]
@@ -77,7 +78,7 @@ def insert_hit(context_i32, context_f32, context_f64, t, identity, alpha):
     return count
 
 
-@njit(forceinline=True, fastmath={"contract"})
+@device_function(forceinline=True, fastmath={"contract"})
 def plane_distance(record, context_f64):
     """Distance along the ray at which it meets the Gaussian's plane; infinite where it runs inside it.
 
@@ -93,7 +94,7 @@ def plane_distance(record, context_f64):
     return -(x * nx + y * ny + z * nz) / cosine, cosine > 0.0
 
 
-@njit(forceinline=True, fastmath={"contract"})
+@device_function(forceinline=True, fastmath={"contract"})
 def octagon_place(record, context_f64, distance):
     """Where the ray meets the plane, in standard deviations, and whether that is inside the octagon."""
     x = context_f64[RAY64] - record[MEAN] + distance * context_f64[RAY64 + 3]
@@ -106,7 +107,7 @@ def octagon_place(record, context_f64, distance):
     return u, v, farthest <= record[INNER_RADIUS]
 
 
-@njit(forceinline=True, fastmath={"contract"})
+@device_function(forceinline=True, fastmath={"contract"})
 def alpha_at(record, context_f64, u, v):
     """Alpha of the Gaussian at u, v, rounded to float32."""
     return np.float32(min(record[OPACITY] * math.exp(-0.5 * (u * u + v * v)), context_f64[ALPHA_MAX]))

@@ -25,9 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt64
-from numba import njit, prange
 
-from octasplat.engine.trace.cpu.bundles import Forward
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels_packet import (
     AHEAD,
     RECORD_BYTES,
@@ -94,13 +93,13 @@ class View(NamedTuple):
     lines: Float32[np.ndarray, "c 16 1"]
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def aligned_rows(rows, lanes):
     """Rows of so many float32, a multiple of sixteen, on cache lines."""
     return aligned_doubles(rows * lanes // 2).view(np.float32).reshape((rows, lanes))
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def new_view(room):
     """Memory for packets of up to ``room`` candidates, one after another."""
     return View(
@@ -212,8 +211,8 @@ def keep(packet, met, frame, view, kept, start):
             kept.lines[start + k, word] = view.lines[k, word, 0]
 
 
-@njit(error_model="numpy")
-def see_from_counter(forward, packets, tree, kept, counter, places):
+@kernel(error_model="numpy")
+def see_packets(forward, packets, tree, kept, counter, places):
     """Trace packets until the ``counter`` has passed the last.
 
     What they meet is kept where ``places``, a counter too, says; where that is beyond the room of ``kept``
@@ -237,14 +236,3 @@ def see_from_counter(forward, packets, tree, kept, counter, places):
             start = taken_from_counter(places.ctypes.data, met)
             if start + met <= len(kept.ids):
                 keep(packet, met, pyramid.frame, view, kept, start)
-
-
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def see_packets(rays, scene, limits, out, hits, recording, packets, tree, kept, workers, counter, places):
-    """:func:`see_from_counter` on ``workers`` threads; ``counter`` and ``places`` hold one zero each.
-
-    The first six are a :class:`Forward`, as a parallel loop takes no tuples of tuples.
-    """
-    for _worker in prange(workers):
-        forward = Forward(rays, scene, limits, out, hits, recording)
-        see_from_counter(forward, packets, tree, kept, counter, places)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
-from numba import njit, prange
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.trace.cpu.kernels_one_order import aligned_rows, group_bits, write_ray_rows
 from octasplat.engine.trace.cpu.kernels_packet_backward import PACKET, RED, ROW_WORDS, W
 from octasplat.engine.trace.cpu.kernels_sixteen import (
@@ -71,8 +71,8 @@ def replay_packet(packet, rays, packets, kept, limits, g, rows, view):
                 rows.sums[row, RED + channel] = np.float32(0.0)
 
 
-@njit(error_model="numpy")
-def replay_from_counter(rays, packets, kept, limits, g, counter, rows):
+@kernel(error_model="numpy")
+def replay_one_order(rays, packets, kept, limits, g, counter, rows):
     """Replay packets until the ``counter`` has passed the last."""
     view = ViewBack(
         aligned_rows(RAY_ROWS, RAYS), aligned_rows(BACK_ROWS, RAYS), aligned_rows(MOMENTS, SIXTEEN)
@@ -82,10 +82,3 @@ def replay_from_counter(rays, packets, kept, limits, g, counter, rows):
         if packet >= len(packets):
             break
         replay_packet(packet, rays, packets, kept, limits, g, rows, view)
-
-
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def replay_one_order(rays, packets, kept, limits, g, workers, counter, rows):
-    """:func:`replay_from_counter` on ``workers`` threads; ``counter`` holds one zero."""
-    for _worker in prange(workers):
-        replay_from_counter(rays, packets, kept, limits, g, counter, rows)

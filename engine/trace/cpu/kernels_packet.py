@@ -38,8 +38,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt64
-from numba import njit
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels_eight import A_X, ALPHA_0, B_X, INNER, N_0, N_X, ROWS
 from octasplat.engine.trace.cpu.kernels_hit import (
     AXIS_U,
@@ -108,7 +108,7 @@ class Candidates(NamedTuple):
     numbers: Int32[np.ndarray, " c8"]
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def aligned_doubles(count):
     """Room for doubles from a line on, else each vector of eight would lie in two."""
     raw = np.empty(count + LINE // 8, np.float64)
@@ -116,7 +116,7 @@ def aligned_doubles(count):
     return raw[first : first + count]
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def new_candidates(room):
     """Room for so many candidates, a multiple of eight."""
     return Candidates(
@@ -141,7 +141,7 @@ def new_candidates(room):
     )
 
 
-@njit(cache=True)
+@kernel()
 def packet_starts(origins, directions, most, least_cosine, starts):
     """First ray of each packet: neighbours in the array that share an origin and look about one way.
 
@@ -171,7 +171,7 @@ def packet_starts(origins, directions, most, least_cosine, starts):
     return packets
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def find_candidates(rays, first, last, tree, pyramid, walk, candidates):
     """Candidates of the packet of rays ``first`` to ``last``, and how many; room grows as needed."""
     write_pyramid(rays, first, last, pyramid)

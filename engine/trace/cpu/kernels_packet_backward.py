@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
-from numba import njit, prange
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels_eight_backward import add_row, replay_hits, walk_through
 from octasplat.engine.trace.cpu.kernels_packet import AHEAD, RECORD_BYTES
 from octasplat.engine.trace.cpu.kernels_rays import first_place, ray_origin, side_shown
@@ -62,7 +62,7 @@ class Replay(NamedTuple):
     by_ray: Float32[np.ndarray, "8"]
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def new_replay(most_hits, slots):
     """Memory for packets, one after another."""
     return Replay(
@@ -183,8 +183,8 @@ def replay_packet(packet, memory, rays, packets, hits, kept, counts, parameters,
                 rows.sums[base + slot, RED + channel] = np.float32(0.0)
 
 
-@njit(error_model="numpy")
-def replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows):
+@kernel(error_model="numpy")
+def replay_packets(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows):
     """Replay packets until the ``counter`` has passed the last."""
     memory = new_replay(limits.max_hits, START_SLOTS)
     while True:
@@ -199,19 +199,10 @@ def replay_from_counter(rays, packets, hits, kept, counts, parameters, features,
         )
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def replay_packets(
-    rays, packets, hits, kept, counts, parameters, features, limits, g, workers, counter, rows
-):
-    """:func:`replay_from_counter` on ``workers`` threads; ``counter`` holds one zero."""
-    for _worker in prange(workers):
-        replay_from_counter(rays, packets, hits, kept, counts, parameters, features, limits, g, counter, rows)
-
-
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def sum_weights(by_gaussian, weights, out):
-    """What each Gaussian that was hit weighed, from the ``weights`` of the rows."""
-    for segment in prange(len(out)):
+@kernel(error_model="numpy")
+def sum_weights(first, last, by_gaussian, weights, out):
+    """Sum the ``weights`` of the rows of each of the Gaussians ``first`` to ``last`` that were hit."""
+    for segment in range(first, last):
         total = 0.0
         for k in range(by_gaussian.starts[segment], by_gaussian.starts[segment + 1]):
             total += weights[by_gaussian.order[k]]
@@ -301,11 +292,17 @@ def sum_chunk(
         out.counts[place] = np.int32(sums[COUNT])
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def sum_packets(rays, packets, parameters, scene, limits, by_gaussian, which, rows, chunks, out):
-    """:func:`sum_chunk` on the Gaussians that are numbers ``which`` of those that were hit."""
+@kernel(error_model="numpy")
+def sum_packets(rays, packets, parameters, scene, limits, by_gaussian, which, rows, chunks, counter, out):
+    """:func:`sum_chunk` on the Gaussians that are numbers ``which`` of those that were hit.
+
+    Takes one of ``chunks`` parts after the other until the ``counter`` has passed the last.
+    """
     per_chunk = (len(which) + chunks - 1) // chunks
-    for chunk in prange(chunks):
+    while True:
+        chunk = next_from_counter(counter.ctypes.data)
+        if chunk >= chunks:
+            break
         first, last = chunk * per_chunk, min(len(which), (chunk + 1) * per_chunk)
         sums, here = np.empty(ROW_WORDS, np.float64), np.empty(ROW_WORDS, np.float64)
         sum_chunk(

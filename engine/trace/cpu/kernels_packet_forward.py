@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt64
-from numba import njit, prange
 
-from octasplat.engine.trace.cpu.bundles import Forward
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels_eight import (
     add_shown,
     keep_hits,
@@ -67,7 +66,7 @@ class Scratch(NamedTuple):
     slots: Int64[np.ndarray, "8"]
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def new_scratch():
     """Memory for rays, one after another."""
     return Scratch(
@@ -285,8 +284,8 @@ def trace_ray(r, bit, place, slots, slot_base, origin, frame, forward, candidate
     return place, slots
 
 
-@njit(error_model="numpy")
-def trace_from_counter(forward, packets, tree, kept, counter):
+@kernel(error_model="numpy")
+def trace_packets(forward, packets, tree, kept, counter):
     """Trace packets of rays ``packets[p, 0]`` to ``packets[p, 1]`` until the ``counter`` has passed the last.
 
     Packet p's hits are stored from the first place of its first ray on, and ``kept`` beside them. A ray's
@@ -315,17 +314,6 @@ def trace_from_counter(forward, packets, tree, kept, counter):
             kept.slot_counts[packet] = slots
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def trace_packets(rays, scene, limits, out, hits, recording, packets, tree, kept, workers, counter):
-    """:func:`trace_from_counter` on ``workers`` threads; ``counter`` holds one zero.
-
-    The first six are a :class:`Forward`, as a parallel loop takes no tuples of tuples.
-    """
-    for _worker in prange(workers):
-        forward = Forward(rays, scene, limits, out, hits, recording)
-        trace_from_counter(forward, packets, tree, kept, counter)
-
-
 @lean(fastmath={"contract"})
 def absorb_ray(r, bit, rays, frame, candidates, count, limits):
     """What the candidates leave of ray ``r``, ray ``bit`` of its packet; 0 where that is below eps1."""
@@ -342,8 +330,8 @@ def absorb_ray(r, bit, rays, frame, candidates, count, limits):
     return left
 
 
-@njit(error_model="numpy")
-def absorb_from_counter(rays, scene, limits, packets, tree, counter, transmittance):
+@kernel(error_model="numpy")
+def absorb_packets(rays, scene, limits, packets, tree, counter, transmittance):
     """The transmittance of rays alone: nothing is sorted, no colour is read."""
     pyramid, walk = new_pyramid(), new_walk()
     candidates = new_candidates(START_ROOM)
@@ -357,10 +345,3 @@ def absorb_from_counter(rays, scene, limits, packets, tree, counter, transmittan
         write_rows(candidates, count, scene, ray_origin(rays, first), pyramid.frame, False)
         for r in range(first, last):
             transmittance[r] = absorb_ray(r, r - first, rays, pyramid.frame, candidates, count, limits)
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def absorb_packets(rays, scene, limits, packets, tree, workers, counter, transmittance):
-    """:func:`absorb_from_counter` on ``workers`` threads; ``counter`` holds one zero."""
-    for _worker in prange(workers):
-        absorb_from_counter(rays, scene, limits, packets, tree, counter, transmittance)

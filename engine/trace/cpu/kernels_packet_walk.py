@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt64
-from numba import njit
 
+from octasplat.engine.compilation import device_function
 from octasplat.engine.trace.cpu.kernels_footprint import (
     BINS,
     FRAME_WORDS,
@@ -72,7 +72,7 @@ class Walk(NamedTuple):
     histogram: Int32[np.ndarray, "256"]
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def new_pyramid():
     """Room for a pyramid."""
     return Pyramid(
@@ -83,7 +83,7 @@ def new_pyramid():
     )
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def new_walk():
     """Memory for walks, one after another."""
     return Walk(

@@ -3,12 +3,12 @@
 import math
 
 import numpy as np
-from numba import njit, prange
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN, NORMAL, OPACITY
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def rotation_columns(q0, q1, q2, q3):
     """Columns r1, r2, r3 of the rotation of a quaternion (w, x, y, z) of any length, float64."""
     scale = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
@@ -20,7 +20,7 @@ def rotation_columns(q0, q1, q2, q3):
     )
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def opacity_and_radius(logit, q):
     """Opacity, and the octagon's corner radius in standard deviations."""
     # without overflow at either end
@@ -29,7 +29,7 @@ def opacity_and_radius(logit, q):
     return opacity, math.sqrt(max(0.0, q + 2.0 * math.log(opacity)))
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def legs(i, quats, log_scales, logits, q):
     """Corner radii in world units along r2 and r3, and those axes."""
     _r1, r2, r3 = rotation_columns(
@@ -40,7 +40,7 @@ def legs(i, quats, log_scales, logits, q):
     return radius * s2, radius * s3, r2, r3
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def write_record(records, i, means, quats, log_scales, logits, q):
     """Record of one Gaussian."""
     r1, r2, r3 = rotation_columns(
@@ -58,14 +58,14 @@ def write_record(records, i, means, quats, log_scales, logits, q):
     records[i, OPACITY] = opacity
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def write_records(records, means, quats, log_scales, logits, q):
+@kernel(error_model="numpy")
+def write_records(first, last, records, means, quats, log_scales, logits, q):
     """All records."""
-    for i in prange(len(means)):
+    for i in range(first, last):
         write_record(records, i, means, quats, log_scales, logits, q)
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def write_box(box, i, means, quats, log_scales, logits, q, padding):
     """Box of one octagon's ellipse enlarged by the fraction ``padding`` of its size.
 
@@ -84,22 +84,21 @@ def write_box(box, i, means, quats, log_scales, logits, q, padding):
             box[axis], box[3 + axis] = centre - half, centre + half
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def write_boxes(boxes, means, quats, log_scales, logits, q, padding):
+@kernel(error_model="numpy")
+def write_boxes(first, last, boxes, means, quats, log_scales, logits, q, padding):
     """Boxes of all octagons, see :func:`write_box`."""
-    for i in prange(len(means)):
+    for i in range(first, last):
         write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def outgrown_boxes(boxes, ids, means, quats, log_scales, logits, q, padding):
-    """Give those of ``ids`` that have left their box a new one; returns how many had.
+@kernel(error_model="numpy")
+def outgrown_boxes(first, last, outgrown, boxes, ids, means, quats, log_scales, logits, q, padding):
+    """Give those of ``ids`` that have left their box a new one, and mark them in ``outgrown``.
 
     The new box is larger by ``padding`` and by four times what the Gaussian stuck out, so that one that goes
     on moving as fast does not need the next one at once.
     """
-    left = 0
-    for k in prange(len(ids)):
+    for k in range(first, last):
         i = ids[k]
         now = np.empty(6, np.float32)
         write_box(now, i, means, quats, log_scales, logits, q, 0.0)
@@ -107,17 +106,16 @@ def outgrown_boxes(boxes, ids, means, quats, log_scales, logits, q, padding):
         for axis in range(3):
             out = max(out, boxes[i, axis] - now[axis], now[3 + axis] - boxes[i, 3 + axis])
         if out > 0.0 and now[0] <= now[3]:
-            left += 1
+            outgrown[k] = True
             write_box(boxes[i], i, means, quats, log_scales, logits, q, padding)
             if out < np.inf:
                 for axis in range(3):
                     boxes[i, axis] -= 4 * out
                     boxes[i, 3 + axis] += 4 * out
-    return left
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def refresh_records(records, ids, means, quats, log_scales, logits, q):
+@kernel(error_model="numpy")
+def refresh_records(first, last, records, ids, means, quats, log_scales, logits, q):
     """Records of the Gaussians ``ids`` from their changed parameters."""
-    for k in prange(len(ids)):
+    for k in range(first, last):
         write_record(records, ids[k], means, quats, log_scales, logits, q)

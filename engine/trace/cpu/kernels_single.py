@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, UInt64
-from numba import njit, prange
 
-from octasplat.engine.trace.cpu.bundles import Forward
+from octasplat.engine.compilation import kernel
 from octasplat.engine.trace.cpu.kernels_composite import Hit, begin, composite, finish
 from octasplat.engine.trace.cpu.kernels_hit import (
     ALPHA_MAX,
@@ -139,19 +138,14 @@ def trace_from_counter(embree, forward, which, rays_per_chunk, counter, basis):
             place = front.place
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def trace_rays(embree, rays, scene, limits, out, hits, recording, which, rays_per_chunk, workers, counter):
-    """:func:`trace_from_counter` on ``workers`` threads; ``counter`` holds one zero.
-
-    ``rays`` to ``recording`` are a :class:`Forward`, as a parallel loop takes no tuples of tuples.
-    """
-    for _worker in prange(workers):
-        forward = Forward(rays, scene, limits, out, hits, recording)
-        trace_from_counter(embree, forward, which, rays_per_chunk, counter, np.empty(16, np.float64))
+@kernel(error_model="numpy")
+def trace_rays(embree, forward, which, rays_per_chunk, counter):
+    """:func:`trace_from_counter` with room for the harmonics."""
+    trace_from_counter(embree, forward, which, rays_per_chunk, counter, np.empty(16, np.float64))
 
 
-@lean(fastmath={"contract"})
-def absorb_from_counter(embree, rays, scene, limits, which, rays_per_chunk, counter, transmittance):
+@kernel(_nrt=False, error_model="numpy", fastmath={"contract"})
+def absorb_rays(embree, rays, scene, limits, which, rays_per_chunk, counter, transmittance):
     """The transmittance alone of the rays ``which``, 0 where it falls below eps1."""
     chunk_count = (len(which) + rays_per_chunk - 1) // rays_per_chunk
     while True:
@@ -177,10 +171,3 @@ def absorb_from_counter(embree, rays, scene, limits, which, rays_per_chunk, coun
                 )
             left = context_f64[TRANSMITTANCE]
             transmittance[r] = 0.0 if left < limits.eps1 else left
-
-
-@njit(cache=True, parallel=True, error_model="numpy")
-def absorb_rays(embree, rays, scene, limits, which, rays_per_chunk, workers, counter, transmittance):
-    """:func:`absorb_from_counter` on ``workers`` threads; ``counter`` holds one zero."""
-    for _worker in prange(workers):
-        absorb_from_counter(embree, rays, scene, limits, which, rays_per_chunk, counter, transmittance)

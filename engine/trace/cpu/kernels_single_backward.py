@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int32
-from numba import njit, prange
 
+from octasplat.engine.compilation import kernel
 from octasplat.engine.gaussians.model import SH_C0
 from octasplat.engine.trace.cpu.kernels_hit import MEAN, NORMAL, OPACITY
 from octasplat.engine.trace.cpu.kernels_rays import (
@@ -129,10 +129,10 @@ def replay_ray(r, first, rays, hits, counts, scene, limits, g, shares):
         shares.g_t[out] = gt
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def replay_rays(rays, which, offsets, hits, counts, scene, limits, g, shares):
+@kernel(error_model="numpy")
+def replay_rays(first, last, rays, which, offsets, hits, counts, scene, limits, g, shares):
     """:func:`replay_ray` on the rays ``which``; ``offsets`` are the places of their hits in ``shares``."""
-    for s in prange(len(which)):
+    for s in range(first, last):
         replay_ray(which[s], offsets[s], rays, hits, counts, scene, limits, g, shares)
 
 
@@ -275,24 +275,17 @@ def gather_chunk(first, last, memory, rays, parameters, scene, limits, by_gaussi
         out.counts[segment] = starts[segment + 1] - starts[segment]
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"}, error_model="numpy")
-def gather_gaussians(
-    rays, parameters, scene, limits, by_gaussian, chunk_bounds, workers, counter, shares, g, out
-):
+@kernel(fastmath={"contract"}, error_model="numpy")
+def gather_gaussians(rays, parameters, scene, limits, by_gaussian, chunk_bounds, counter, shares, g, out):
     """Sum the hits of each Gaussian and turn the sums into gradients of its raw parameters.
 
     Chunk c has the Gaussians ``chunk_bounds[c]`` to ``chunk_bounds[c + 1]``; ``counter`` holds one zero.
     """
     feature_count = out.features.shape[1]
-    for _worker in prange(workers):
-        memory = (
-            np.empty(16, np.float64),
-            np.empty((16, 3), np.float64),
-            np.empty(max(feature_count, 1), np.float64),
-        )
-        while True:
-            chunk = next_from_counter(counter.ctypes.data)
-            if chunk >= len(chunk_bounds) - 1:
-                break
-            first, last = chunk_bounds[chunk], chunk_bounds[chunk + 1]
-            gather_chunk(first, last, memory, rays, parameters, scene, limits, by_gaussian, shares, g, out)
+    memory = np.empty(16), np.empty((16, 3)), np.empty(max(feature_count, 1))
+    while True:
+        chunk = next_from_counter(counter.ctypes.data)
+        if chunk >= len(chunk_bounds) - 1:
+            break
+        first, last = chunk_bounds[chunk], chunk_bounds[chunk + 1]
+        gather_chunk(first, last, memory, rays, parameters, scene, limits, by_gaussian, shares, g, out)

@@ -6,7 +6,8 @@ the packets' hierarchy.
 
 import numpy as np
 from jaxtyping import Int, Int32, Int64, Shaped
-from numba import njit, prange
+
+from octasplat.engine.compilation import kernel, run_ranges
 
 DIGIT_BITS = 11
 BUCKETS = 1 << DIGIT_BITS
@@ -16,22 +17,34 @@ START_CHUNKS = 64
 """Parts in which the first of equal keys are looked for."""
 
 
-@njit(cache=True, parallel=True)
-def _sort_pass(keys, order, shift, keys_out, order_out, histograms):
-    chunks = histograms.shape[0]
+@kernel()
+def _count_digits(first, last, keys, shift, histograms):
+    """Write the histogram of a digit for each of the chunks ``first`` to ``last``."""
     count = len(keys)
-    per = (count + chunks - 1) // chunks
-    for c in prange(chunks):
+    per = (count + len(histograms) - 1) // len(histograms)
+    for c in range(first, last):
         histograms[c, :] = 0
         for e in range(c * per, min(count, (c + 1) * per)):
             histograms[c, np.int64(keys[e] >> shift) & (BUCKETS - 1)] += 1
+
+
+@kernel()
+def _add_up(histograms):
+    """Replace each count by the place of its first key."""
     total = 0
     for b in range(BUCKETS):
-        for c in range(chunks):
+        for c in range(len(histograms)):
             size = histograms[c, b]
             histograms[c, b] = total
             total += size
-    for c in prange(chunks):
+
+
+@kernel()
+def _scatter(first, last, keys, order, shift, keys_out, order_out, histograms):
+    """Move the keys of the chunks ``first`` to ``last`` to their places."""
+    count = len(keys)
+    per = (count + len(histograms) - 1) // len(histograms)
+    for c in range(first, last):
         for e in range(c * per, min(count, (c + 1) * per)):
             bucket = np.int64(keys[e] >> shift) & (BUCKETS - 1)
             slot = histograms[c, bucket]
@@ -40,40 +53,28 @@ def _sort_pass(keys, order, shift, keys_out, order_out, histograms):
             order_out[slot] = order[e]
 
 
-@njit(cache=True)
-def _sort(keys, order, keys_out, order_out, spare, shifts, histograms):
-    """All passes; ``keys`` are left as they are, ``spare`` is room for as many."""
-    _sort_pass(keys, order, shifts[0], keys_out, order_out, histograms)
-    source, target = keys_out, spare
-    for k in range(1, len(shifts)):
-        order, order_out = order_out, order
-        _sort_pass(source, order, shifts[k], target, order_out, histograms)
-        source, target = target, source
-    return order_out, source
-
-
-@njit(cache=True, parallel=True)
-def _segment_starts(keys, starts, firsts):
+@kernel()
+def _count_segments(first, last, keys, firsts):
+    """Write how many segments begin in each of the chunks ``first`` to ``last``."""
     count, chunks = len(keys), len(firsts)
-    for c in prange(chunks):
+    for c in range(first, last):
         found = 0
         for e in range(c * count // chunks, (c + 1) * count // chunks):
             if e == 0 or keys[e] != keys[e - 1]:
                 found += 1
         firsts[c] = found
-    segments = 0
-    for c in range(chunks):
-        found = firsts[c]
-        firsts[c] = segments
-        segments += found
-    for c in prange(chunks):
+
+
+@kernel()
+def _write_segments(first, last, keys, starts, firsts):
+    """Write where the segments of the chunks ``first`` to ``last`` begin; ``firsts`` are their numbers."""
+    count, chunks = len(keys), len(firsts)
+    for c in range(first, last):
         segment = firsts[c]
         for e in range(c * count // chunks, (c + 1) * count // chunks):
             if e == 0 or keys[e] != keys[e - 1]:
                 starts[segment] = e
                 segment += 1
-    starts[segments] = count
-    return segments
 
 
 def stable_order(
@@ -89,10 +90,16 @@ def stable_order(
         threads: how many to take at most.
     """
     order = np.arange(len(keys), dtype=np.int32)
-    histograms = np.empty((max(1, min(threads, len(keys) // LEAST_CHUNK)), BUCKETS), np.int64)
-    shifts = np.arange(0, max(1, bits), DIGIT_BITS, dtype=keys.dtype)
-    room = np.empty_like(keys), np.empty_like(order), np.empty_like(keys)
-    return _sort(keys, order, *room, shifts, histograms)
+    chunks = max(1, min(threads, len(keys) // LEAST_CHUNK))
+    histograms = np.empty((chunks, BUCKETS), np.int64)
+    source, target, spare, order_out = keys, np.empty_like(keys), np.empty_like(keys), np.empty_like(order)
+    for shift in np.arange(0, max(1, bits), DIGIT_BITS, dtype=keys.dtype):
+        run_ranges(_count_digits, threads, chunks, source, shift, histograms, grain=1)
+        _add_up(histograms)
+        run_ranges(_scatter, threads, chunks, source, order, shift, target, order_out, histograms, grain=1)
+        order, order_out = order_out, order
+        source, target = target, spare if source is keys else source
+    return order, source
 
 
 def sort_by_gaussian(
@@ -105,5 +112,10 @@ def sort_by_gaussian(
     """
     order, keys = stable_order(keys, (gaussian_count - 1).bit_length(), threads)
     starts = np.empty(len(keys) + 1, np.int64)
-    segments = _segment_starts(keys, starts, np.empty(START_CHUNKS, np.int64))
+    counts = np.empty(START_CHUNKS, np.int64)
+    run_ranges(_count_segments, threads, START_CHUNKS, keys, counts, grain=1)
+    ends = np.cumsum(counts)
+    run_ranges(_write_segments, threads, START_CHUNKS, keys, starts, ends - counts, grain=1)
+    segments = int(ends[-1])
+    starts[segments] = len(keys)
     return order, keys, starts[: segments + 1]

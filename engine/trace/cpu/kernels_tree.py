@@ -9,8 +9,8 @@ ray wants.
 import math
 
 import numpy as np
-from numba import njit, prange
 
+from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.gaussians.kernels_order import spread_bits
 from octasplat.engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN
 
@@ -31,17 +31,17 @@ TOP_CELL = (1 << _CURVE_BITS) - 1
 _CLASSES = 32
 
 
-_spread = njit(error_model="numpy")(spread_bits)
+_spread = device_function(error_model="numpy")(spread_bits)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def curve_keys(records, low, inverse_cell, keys):
+@kernel(error_model="numpy")
+def curve_keys(first, last, records, low, inverse_cell, keys):
     """Keys along a Z-order curve, by size class first: factors of four, the large ones in front.
 
     Without the classes one large Gaussian would blow up its small neighbours' box. One that has no octagon
     may get one before the next build, so it has a place, too; one that is no number has none.
     """
-    for i in prange(len(records)):
+    for i in range(first, last):
         radius = max(np.float64(records[i, INNER_RADIUS]), 0.0) / COS_22
         u2 = v2 = total = 0.0
         for axis in range(3):
@@ -60,7 +60,7 @@ def curve_keys(records, low, inverse_cell, keys):
         keys[i] = key
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def write_leaf(blocks, slot, records, i):
     """Mean and legs of Gaussian ``i`` into its lane; a vanished octagon gets legs that are not a number."""
     block, lane = slot // WIDTH, slot % WIDTH
@@ -78,7 +78,7 @@ def write_leaf(blocks, slot, records, i):
         blocks[block, 6 + axis, lane] = records[i, AXIS_V + axis] * scale_v
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def write_block_box(blocks, b, nodes):
     """The box of block ``b`` at level 0, around the ellipses that have not vanished."""
     lo0 = lo1 = lo2 = np.inf
@@ -114,11 +114,11 @@ def write_block_box(blocks, b, nodes):
     nodes[node, 3, lane], nodes[node, 4, lane], nodes[node, 5, lane] = hi0, hi1, hi2
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def write_leaves(blocks, slots, records, order, nodes):
+@kernel(error_model="numpy")
+def write_leaves(first, last, blocks, slots, records, order, nodes):
     """Blocks in curve order, each Gaussian's place in them, and the boxes of the blocks (level 0)."""
     count = len(order)
-    for b in prange(len(blocks)):
+    for b in range(first, last):
         for lane in range(WIDTH):
             k = b * WIDTH + lane
             if k >= count:
@@ -130,7 +130,7 @@ def write_leaves(blocks, slots, records, order, nodes):
         write_block_box(blocks, b, nodes)
 
 
-@njit(error_model="numpy")
+@device_function(error_model="numpy")
 def write_box_of_node(nodes, child, parent, lane):
     """Box ``lane`` of ``parent``, around the eight boxes of ``child``."""
     for row in range(3):
@@ -140,37 +140,29 @@ def write_box_of_node(nodes, child, parent, lane):
         nodes[parent, row, lane], nodes[parent, 3 + row, lane] = low, high
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@kernel(error_model="numpy")
 def write_upper_levels(nodes, level_starts):
     """Boxes of every level above the first; node k of a level bounds box k of the next."""
     for level in range(1, len(level_starts) - 1):
         below, here = level_starts[level - 1], level_starts[level]
-        for k in prange(here - below):
+        for k in range(here - below):
             write_box_of_node(nodes, below + k, here + k // WIDTH, k % WIDTH)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def refresh_leaves(blocks, slots, records, ids, touched):
+@kernel(error_model="numpy")
+def refresh_leaves(first, last, blocks, slots, records, ids, touched):
     """Rewrite the lanes of Gaussians whose records changed, and note the blocks that they lie in."""
-    for k in prange(len(ids)):
+    for k in range(first, last):
         slot = slots[ids[k]]
         if slot >= 0:
             write_leaf(blocks, slot, records, ids[k])
             touched[slot // WIDTH] = True
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def refit_blocks(blocks, touched, nodes):
+@kernel(error_model="numpy")
+def refit_blocks(first, last, blocks, touched, nodes):
     """The boxes of the blocks that were touched, and of no others."""
-    for b in prange(len(blocks)):
+    for b in range(first, last):
         if touched[b]:
             write_block_box(blocks, b, nodes)
             touched[b] = False
-
-
-@njit(cache=True, error_model="numpy")
-def refit(blocks, slots, records, ids, touched, nodes, level_starts):
-    """Take changed records over, and make the boxes around them anew."""
-    refresh_leaves(blocks, slots, records, ids, touched)
-    refit_blocks(blocks, touched, nodes)
-    write_upper_levels(nodes, level_starts)

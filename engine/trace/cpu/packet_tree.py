@@ -6,6 +6,7 @@ Their layout is described in :mod:`octasplat.engine.trace.cpu.kernels_tree`.
 import numpy as np
 from jaxtyping import Float32, Int32
 
+from octasplat.engine.compilation import run_ranges
 from octasplat.engine.trace.cpu.kernels_packet_walk import Tree
 from octasplat.engine.trace.cpu.kernels_sort import stable_order
 from octasplat.engine.trace.cpu.kernels_tree import (
@@ -16,7 +17,8 @@ from octasplat.engine.trace.cpu.kernels_tree import (
     TOP_CELL,
     WIDTH,
     curve_keys,
-    refit,
+    refit_blocks,
+    refresh_leaves,
     write_leaves,
     write_upper_levels,
 )
@@ -42,7 +44,7 @@ class PacketTree:
         count = len(records)
         keys = np.empty(count, np.uint64)
         low, cell = _grid(records[:, :3])
-        curve_keys(records, low, 1.0 / cell, keys)
+        run_ranges(curve_keys, threads, count, records, low, 1.0 / cell, keys)
         order, sorted_keys = stable_order(keys, KEY_BITS, threads)
         order = order[: int(np.searchsorted(sorted_keys, LEFT_OUT))]
         blocks = -(-len(order) // WIDTH)
@@ -55,9 +57,10 @@ class PacketTree:
         nodes[:, 3:] = -np.inf  # boxes turned inside out are in no pyramid
         self.arrays = Tree(nodes, level_starts, aligned_empty((blocks, LEAF_ROWS, WIDTH)), order)
         self._slots = np.full(count, -1, np.int32)
-        write_leaves(self.arrays.blocks, self._slots, records, order, nodes)
+        run_ranges(write_leaves, threads, blocks, self.arrays.blocks, self._slots, records, order, nodes)
         write_upper_levels(nodes, level_starts)
         self._touched = np.zeros(blocks, np.bool_)
+        self._threads = threads
 
     def refresh(self, records: Float32[np.ndarray, "n 16"], ids: Int32[np.ndarray, " u"]) -> None:
         """Take the changed records of ``ids`` over, and refit the boxes around them.
@@ -65,7 +68,9 @@ class PacketTree:
         The boxes are then those of a new build along the old curve.
         """
         nodes, level_starts, blocks, _order = self.arrays
-        refit(blocks, self._slots, records, ids, self._touched, nodes, level_starts)
+        run_ranges(refresh_leaves, self._threads, len(ids), blocks, self._slots, records, ids, self._touched)
+        run_ranges(refit_blocks, self._threads, len(blocks), blocks, self._touched, nodes)
+        write_upper_levels(nodes, level_starts)
 
 
 def _grid(means_world: Float32[np.ndarray, "n 3"]) -> tuple[np.ndarray, float]:

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
+from octasplat.engine.compilation import run_on_threads, run_ranges
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.trace.cpu.bundles import (
     ByGaussian,
@@ -119,7 +120,9 @@ class PacketTracer:
     def trace(self, forward: Forward, packets: Int64[np.ndarray, "p 2"], kept: PacketHits) -> None:
         """Follow the rays of the packets."""
         assert self._tree is not None, "build first"
-        trace_packets(*forward, packets, self._tree.arrays, kept, self._threads, np.zeros(1, np.int64))
+        run_on_threads(
+            trace_packets, self._threads, forward, packets, self._tree.arrays, kept, np.zeros(1, np.int64)
+        )
 
     def trace_in_one_order(
         self, forward: Forward, packets: Int64[np.ndarray, "p 2"], rays: int
@@ -138,8 +141,9 @@ class PacketTracer:
             )  # fmt: skip
             kept = OneOrderHits(ids, bits, lines, starts, counts, frames, left)
             met = np.zeros(1, np.int64)
-            see_packets(
-                *forward, packets, self._tree.arrays, kept, self._threads, np.zeros(1, np.int64), met
+            run_on_threads(
+                see_packets, self._threads,
+                forward, packets, self._tree.arrays, kept, np.zeros(1, np.int64), met,
             )  # fmt: skip
             if met[0] <= places or not forward.recording:
                 left[:] = forward.out.transmittance
@@ -155,9 +159,9 @@ class PacketTracer:
     ) -> None:
         """Write the transmittance of the rays of the packets."""
         assert self._tree is not None, "build first"
-        absorb_packets(
-            rays, scene, self._limits, packets, self._tree.arrays, self._threads, np.zeros(1, np.int64),
-            transmittance,
+        run_on_threads(
+            absorb_packets, self._threads,
+            rays, scene, self._limits, packets, self._tree.arrays, np.zeros(1, np.int64), transmittance,
         )  # fmt: skip
 
     def backward(
@@ -187,19 +191,23 @@ class PacketTracer:
         rows = Rows(firsts, ids, weights, sums, by_geometry, features)
         rays, packets, counter = Rays.of(recording.rays), recording.packets, np.zeros(1, np.int64)
         if isinstance(kept, OneOrderHits):
-            replay_one_order(rays, packets, kept, self._limits, gradients, self._threads, counter, rows)
+            run_on_threads(
+                replay_one_order, self._threads, rays, packets, kept, self._limits, gradients, counter, rows
+            )
         else:
-            replay_packets(
+            run_on_threads(
+                replay_packets, self._threads,
                 rays, packets, recording.hits, kept, recording.counts, parameters, scene.features,
-                self._limits, gradients, self._threads, counter, rows,
+                self._limits, gradients, counter, rows,
             )  # fmt: skip
         by_gaussian = ByGaussian(*sort_by_gaussian(rows.ids, len(parameters.means), self._threads))
         met = np.empty(len(by_gaussian.starts) - 1, np.float32)
-        sum_weights(by_gaussian, rows.weights, met)
+        run_ranges(sum_weights, self._threads, len(met), by_gaussian, rows.weights, met)
         which = np.flatnonzero(met >= least_weight)
         out = empty_gradients(len(which), basis_count, feature_count)
-        sum_packets(
+        run_on_threads(
+            sum_packets, self._threads,
             rays, packets, parameters, scene, self._limits, by_gaussian, which, rows,
-            SUM_CHUNKS * self._threads, raw_gradients(out),
+            SUM_CHUNKS * self._threads, np.zeros(1, np.int64), raw_gradients(out),
         )  # fmt: skip
         return out

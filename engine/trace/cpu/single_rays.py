@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from octasplat.engine.compilation import run_on_threads, run_ranges
 from octasplat.engine.trace.cpu.bundles import (
     ByGaussian,
     Forward,
@@ -73,9 +74,9 @@ class SingleRayTracer:
 
     def trace(self, forward: Forward, which: Int64[np.ndarray, " s"]) -> None:
         """Follow the rays ``which``, in ascending order."""
-        trace_rays(
-            self._embree(intersect1_address()), *forward, which, _rays_per_chunk(which), self._threads,
-            np.zeros(1, np.int64),
+        run_on_threads(
+            trace_rays, self._threads,
+            self._embree(intersect1_address()), forward, which, _rays_per_chunk(which), np.zeros(1, np.int64),
         )  # fmt: skip
 
     def absorb(
@@ -86,9 +87,10 @@ class SingleRayTracer:
         transmittance: Float32[np.ndarray, " r"],
     ) -> None:
         """Write the transmittance of the rays ``which``."""
-        absorb_rays(
+        run_on_threads(
+            absorb_rays, self._threads,
             self._embree(occluded1_address()), rays, scene, self._limits, which, _rays_per_chunk(which),
-            self._threads, np.zeros(1, np.int64), transmittance,
+            np.zeros(1, np.int64), transmittance,
         )  # fmt: skip
 
     def backward(
@@ -100,9 +102,10 @@ class SingleRayTracer:
         total = int(offsets[-1])
         ids, flags = np.empty(total, np.int32), np.empty(total, np.int32)
         shares = Shares(ids, flags, *(np.empty(total, np.float32) for _ in range(3)))
-        replay_rays(
-            rays, which, offsets, recording.hits, recording.counts, scene, self._limits, gradients, shares
-        )
+        run_ranges(
+            replay_rays, self._threads, len(which),
+            rays, which, offsets, recording.hits, recording.counts, scene, self._limits, gradients, shares,
+        )  # fmt: skip
         by_gaussian = ByGaussian(*sort_by_gaussian(ids, len(parameters.means), self._threads))
         starts = by_gaussian.starts
         segments = len(starts) - 1
@@ -110,8 +113,9 @@ class SingleRayTracer:
         bounds = np.searchsorted(starts, places)
         bounds[0], bounds[-1] = 0, segments
         out = empty_gradients(segments, scene.sh.shape[1], scene.features.shape[1])
-        gather_gaussians(
-            rays, parameters, scene, self._limits, by_gaussian, bounds, self._threads,
+        run_on_threads(
+            gather_gaussians, self._threads,
+            rays, parameters, scene, self._limits, by_gaussian, bounds,
             np.zeros(1, np.int64), shares, gradients, raw_gradients(out),
         )  # fmt: skip
         return out

@@ -4,6 +4,7 @@ import numba
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
+from octasplat.engine.compilation import run_ranges
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.rays import RayBatch
 from octasplat.engine.threads import use_threads
@@ -101,7 +102,9 @@ class CpuTracer:
             self._boxes = np.empty((count, 6), np.float32)
         self._gaussians = gaussians
         self._features = np.empty((count, 0), np.float32) if features is None else features
-        write_records(self._records, *Parameters.of(gaussians), self.settings.q)
+        run_ranges(
+            write_records, self.threads, count, self._records, *Parameters.of(gaussians), self.settings.q
+        )
         self._packets.build(self._records)
         self._built_singles = False
         self._build = object()
@@ -113,10 +116,15 @@ class CpuTracer:
         if ids is None:
             ids = np.arange(len(self._gaussians), dtype=np.int32)
         parameters, q = Parameters.of(self._gaussians), self.settings.q
-        refresh_records(self._records, ids, *parameters, q)
+        run_ranges(refresh_records, self.threads, len(ids), self._records, ids, *parameters, q)
         self._packets.refresh(self._records, ids)
-        if self._built_singles and outgrown_boxes(self._boxes, ids, *parameters, q, self._padding):
-            self._built_singles = False
+        if self._built_singles:
+            outgrown = np.zeros(len(ids), np.bool_)
+            run_ranges(
+                outgrown_boxes, self.threads, len(ids),
+                outgrown, self._boxes, ids, *parameters, q, self._padding,
+            )  # fmt: skip
+            self._built_singles = not outgrown.any()
 
     def trace(self, rays: RayBatch, *, record: bool = False) -> TraceResult:
         """Follow rays; see the protocol. Directions must have unit length."""
@@ -190,7 +198,11 @@ class CpuTracer:
         packets, alone = find_packets(rays, self._ways, coloured=coloured)
         if len(alone) and not self._built_singles:
             assert self._gaussians is not None, "build first"
-            write_boxes(self._boxes, *Parameters.of(self._gaussians), self.settings.q, self._padding)
+            parameters = Parameters.of(self._gaussians)
+            run_ranges(
+                write_boxes, self.threads, len(self._boxes),
+                self._boxes, *parameters, self.settings.q, self._padding,
+            )  # fmt: skip
             self._singles.build(self._boxes)
             self._built_singles = True
         return packets, alone
