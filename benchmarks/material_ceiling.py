@@ -14,6 +14,7 @@ import argparse
 import time
 from pathlib import Path
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
@@ -35,6 +36,13 @@ from octasplat.engine.render.images import read_image, write_png
 from octasplat.engine.render.jobs import view_shots
 from octasplat.engine.scene import load_scene
 from octasplat.engine.trace.protocol import TraceSettings
+
+
+@numba.njit
+def axes_around(x, y, z):  # type: ignore[no-untyped-def]
+    """Return two unit vectors across (x, y, z)."""
+    return around(x, y, z)
+
 
 SPACING = 0.006
 """Distance of the Gaussians, of the scene's radius."""
@@ -115,7 +123,7 @@ def gaussians_on(
     sums = np.stack([np.bincount(cell, both[:, k], len(count)) for k in range(11)], axis=1)
     mean = sums / count[:, None]
     normals = mean[:, 3:6] / np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True)
-    frames = np.array([(n, *np.reshape(around(*n), (2, 3))) for n in normals]).transpose(0, 2, 1)
+    frames = np.array([(n, *np.reshape(axes_around(*n), (2, 3))) for n in normals]).transpose(0, 2, 1)
     scene = FlatGaussians(
         mean[:, :3].astype(np.float32),
         quaternions(frames).astype(np.float32),

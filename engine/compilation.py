@@ -2,8 +2,8 @@
 
 Three rules keep the first use of the program short:
 
-- A function that only other kernels call is a :func:`device_function`: it is typed and lowered, and its code is
-  generated as part of its callers. It has no wrapper for Python and no machine code of its own.
+- A function that only other kernels call is a :func:`device_function`: it is typed and lowered, and its code
+  is generated as part of its callers. It has no wrapper for Python and no machine code of its own.
 - A loop over threads whose body is long is a :func:`kernel` that each thread calls (:func:`run_on_threads`).
   Numba's ``prange`` would generate the code of its body three times.
 - Machine code is kept by the content of the sources that it is made of, not by path and time stamp, so that a
@@ -58,14 +58,19 @@ class _DeviceCompiler(Compiler):  # type: ignore[misc]
         library._optimize_final_module = lambda: None
         self.state.library = library
         result = super().compile_extra(func)
-        # Callers find the code by the identity of a builtin; a bound method of a new string is one.
-        entry = f"{func.__qualname__} is called by kernels only, not from Python".encode
+        # Callers find the code by the identity of a builtin. This one is new, and raises whatever it is
+        # called with, as the format asks for a value that nobody gives.
+        entry = f"{{{func.__name__} is called by kernels only, not from Python}}".format
         context.insert_user_function(entry, result.fndesc, [result.library])
         return result._replace(entry_point=entry)
 
 
 def device_function(**options: Any) -> Callable[[Any], Any]:
-    """Return a decorator for functions that kernels call and Python does not; options as of ``numba.njit``."""
+    """Return a decorator for functions that kernels call and Python does not.
+
+    Args:
+        options: as of ``numba.njit``.
+    """
     return njit(pipeline_class=_DeviceCompiler, **options)
 
 
@@ -194,8 +199,8 @@ def _is_usable(folder: Path) -> bool:
 def cache_folder() -> Path:
     """Return the folder in which this process keeps the machine code of kernels.
 
-    That is ``NUMBA_CACHE_DIR`` where it is set, else the user's cache folder. Where that cannot be written, as
-    in a container with a read-only home or where ``~/.cache`` belongs to another user, it is a private folder
+    That is ``NUMBA_CACHE_DIR`` where it is set, else the user's cache folder. Where that cannot be written,
+    as in a container with a read-only home or with a ``~/.cache`` of another user, it is a private folder
     among the temporary files, and a warning is logged.
     """
     from platformdirs import user_cache_path
@@ -210,9 +215,12 @@ def cache_folder() -> Path:
     if not _is_private(private):
         private = Path(tempfile.mkdtemp(prefix=f"{PACKAGE}-kernels-"))
     LOG.warning(
-        "compiled kernels cannot be kept in %s, which cannot be written; they are kept in %s. Set %s to a folder"
-        " that can be written to keep them for good", wanted, private, CACHE_VARIABLE,
-    )  # fmt: skip
+        "compiled kernels cannot be kept in %s, which cannot be written; they are kept in %s."
+        " Set %s to a folder that can be written to keep them for good",
+        wanted,
+        private,
+        CACHE_VARIABLE,
+    )
     return private
 
 

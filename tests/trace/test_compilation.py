@@ -1,0 +1,131 @@
+"""Kernels are found again by the content of their sources, and nothing stops where no folder can be written."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from octasplat.engine import compilation
+from octasplat.engine.compilation import run_on_threads, run_ranges, source_digest
+from octasplat.engine.trace.cpu.kernels_sh import write_basis
+
+
+def run_python(code: str, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout + done.stderr
+
+
+SORT = """
+    import logging
+    logging.basicConfig()
+    import numpy as np
+    from octasplat.engine.trace.cpu import kernels_sort
+    order, keys = kernels_sort.stable_order(np.array([3, 1, 2], np.int32), 2, 1)
+    print(order, kernels_sort._scatter.stats.cache_hits)
+"""
+
+
+def test_second_process_finds_the_code_of_the_first(tmp_path: Path) -> None:
+    assert "[1 2 0] Counter()" in run_python(SORT, NUMBA_CACHE_DIR=str(tmp_path))
+    assert "[1 2 0] Counter({" in run_python(SORT, NUMBA_CACHE_DIR=str(tmp_path))
+
+
+def test_another_checkout_with_the_same_sources_finds_the_code(tmp_path: Path) -> None:
+    root = Path(compilation.__file__).parents[1]
+    for name in ("one", "two"):
+        package = tmp_path / name / "octasplat"
+        package.mkdir(parents=True)
+        (package / "__init__.py").touch()
+        (package / "engine").symlink_to(root / "engine")
+    code = str(tmp_path / "code")
+    first = run_python(SORT, NUMBA_CACHE_DIR=code, PYTHONPATH=str(tmp_path / "one"))
+    second = run_python(SORT, NUMBA_CACHE_DIR=code, PYTHONPATH=str(tmp_path / "two"))
+    assert "Counter()" in first
+    assert "Counter({" in second
+
+
+def test_changed_source_that_a_kernel_inlines_is_compiled_anew(tmp_path: Path) -> None:
+    package = tmp_path / "octasplat"
+    (package / "engine").mkdir(parents=True)
+    for name in ("__init__.py", "engine/__init__.py"):
+        (package / name).touch()
+    (package / "engine" / "compilation.py").write_text(Path(compilation.__file__).read_text())
+    inner, outer = package / "engine" / "inner.py", package / "engine" / "outer.py"
+    imported = "from octasplat.engine.compilation import device_function, kernel\n"
+    outer.write_text(
+        imported + "from octasplat.engine.inner import factor\n\n"
+        "@kernel()\ndef scaled(x):\n    return factor() * x\n"
+    )
+    say = "from octasplat.engine.outer import scaled\nprint(scaled(2.0))"
+    environment = {"NUMBA_CACHE_DIR": str(tmp_path / "code"), "PYTHONPATH": str(tmp_path)}
+    found = []
+    for value in ("3.0", "5.0"):
+        inner.write_text(imported + f"\n@device_function()\ndef factor():\n    return {value}\n")
+        os.utime(inner, (1.0, 1.0))  # the time stamp tells nothing
+        found.append(run_python(say, **environment).strip())
+    assert found == ["6.0", "10.0"]
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs users")
+def test_folder_that_cannot_be_written_is_named_and_replaced(tmp_path: Path) -> None:
+    occupied = tmp_path / "file"
+    occupied.write_text("")
+    said = run_python(SORT, NUMBA_CACHE_DIR=str(occupied / "kernels"), TMPDIR=str(tmp_path))
+    assert "[1 2 0]" in said
+    assert f"compiled kernels cannot be kept in {occupied / 'kernels'}" in said
+    private = tmp_path / f"octasplat-kernels-{os.getuid()}"
+    assert private.stat().st_mode & 0o077 == 0
+    assert list(private.rglob("*.nbi"))
+
+
+def test_folder_that_others_can_write_is_not_used(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)
+    said = run_python(SORT, NUMBA_CACHE_DIR=str(shared), TMPDIR=str(tmp_path))
+    assert "cannot be kept in" in said
+    assert not list(shared.rglob("*.nbi"))
+
+
+def test_device_function_called_from_python_raises() -> None:
+    with pytest.raises(KeyError, match="write_basis is called by kernels only"):
+        write_basis(np.zeros(16), 16, 0.0, 0.0, 1.0)
+
+
+def test_digest_follows_imports_and_is_stable() -> None:
+    one = source_digest("octasplat.engine.trace.cpu.kernels_sort")
+    assert one == source_digest("octasplat.engine.trace.cpu.kernels_sort")
+    assert one != source_digest("octasplat.engine.trace.cpu.kernels_tree")
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_ranges_cover_each_element_once(threads: int) -> None:
+    seen = np.zeros(1003, int)
+
+    def count(first: int, last: int) -> None:
+        seen[first:last] += 1
+
+    run_ranges(count, threads, len(seen), grain=1)
+    assert (seen == 1).all()
+
+
+def test_error_of_another_thread_reaches_the_caller() -> None:
+    calls = iter([None, ValueError("broken"), None])
+
+    def fail() -> None:
+        error = next(calls)
+        if error is not None:
+            raise error
+
+    with pytest.raises(ValueError, match="broken"):
+        run_on_threads(fail, 3)
