@@ -246,7 +246,9 @@ def adam_step(
     opacity_weight, scale_weight, min_log_scale, max_log_scale,
     beta1, beta2, epsilon, mean_steps, corrections,
 ):  # fmt: skip
-    """One step for the Gaussians ``ids`` of some chunks of :data:`CHUNK`; each has its own step count for the bias correction.
+    """One step for the Gaussians ``ids`` of some chunks of :data:`CHUNK` each.
+
+    Each Gaussian has its own step count for the bias correction.
 
     ``powers`` are those of ``beta1`` and ``beta2``, for as many steps as any has taken and one more.
     ``rate_mean`` is in world units or, where ``mean_by_size``, in units of the Gaussian's size: the geometric

@@ -122,8 +122,8 @@ def pixel_loss(
     gradient, sums = np.empty(render.shape, np.float32), np.empty((CHUNKS, 2))
     run_ranges(
         pixel_terms, threads_in_use(), CHUNKS,
-        render, target, weight, np.float32(l1 / (3 * valid)), np.float32(2 * l2 / (3 * valid)), gradient, sums,
-        grain=1,
+        render, target, weight, np.float32(l1 / (3 * valid)), np.float32(2 * l2 / (3 * valid)),
+        gradient, sums, grain=1,
     )  # fmt: skip
     absolute, squared = sums.sum(axis=0) / (3 * valid)
     return BatchLoss(float(l1 * absolute + l2 * squared), gradient, float(squared))

@@ -1,4 +1,4 @@
-"""Kernels are found again by the content of their sources, and nothing stops where no folder can be written."""
+"""Kernels are found again by the content of their sources, and work where no folder can be written."""
 
 import os
 import subprocess

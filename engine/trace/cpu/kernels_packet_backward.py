@@ -199,7 +199,7 @@ def replay_packets(rays, packets, hits, kept, counts, parameters, features, limi
         )
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def sum_weights(first, last, by_gaussian, weights, out):
     """Sum the ``weights`` of the rows of each of the Gaussians ``first`` to ``last`` that were hit."""
     for segment in range(first, last):

@@ -8,7 +8,7 @@ from octasplat.engine.compilation import device_function, kernel
 from octasplat.engine.trace.cpu.kernels_hit import AXIS_U, AXIS_V, COS_22, INNER_RADIUS, MEAN, NORMAL, OPACITY
 
 
-@device_function(error_model="numpy")
+@device_function(_nrt=False, error_model="numpy")
 def rotation_columns(q0, q1, q2, q3):
     """Columns r1, r2, r3 of the rotation of a quaternion (w, x, y, z) of any length, float64."""
     scale = 1.0 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
@@ -20,7 +20,7 @@ def rotation_columns(q0, q1, q2, q3):
     )
 
 
-@device_function(error_model="numpy")
+@device_function(_nrt=False, error_model="numpy")
 def opacity_and_radius(logit, q):
     """Opacity, and the octagon's corner radius in standard deviations."""
     # without overflow at either end
@@ -29,7 +29,7 @@ def opacity_and_radius(logit, q):
     return opacity, math.sqrt(max(0.0, q + 2.0 * math.log(opacity)))
 
 
-@device_function(error_model="numpy")
+@device_function(_nrt=False, error_model="numpy")
 def legs(i, quats, log_scales, logits, q):
     """Corner radii in world units along r2 and r3, and those axes."""
     _r1, r2, r3 = rotation_columns(
@@ -40,7 +40,7 @@ def legs(i, quats, log_scales, logits, q):
     return radius * s2, radius * s3, r2, r3
 
 
-@device_function(error_model="numpy")
+@device_function(_nrt=False, error_model="numpy")
 def write_record(records, i, means, quats, log_scales, logits, q):
     """Record of one Gaussian."""
     r1, r2, r3 = rotation_columns(
@@ -58,14 +58,14 @@ def write_record(records, i, means, quats, log_scales, logits, q):
     records[i, OPACITY] = opacity
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def write_records(first, last, records, means, quats, log_scales, logits, q):
     """All records."""
     for i in range(first, last):
         write_record(records, i, means, quats, log_scales, logits, q)
 
 
-@device_function(error_model="numpy")
+@device_function(_nrt=False, error_model="numpy")
 def write_box(box, i, means, quats, log_scales, logits, q, padding):
     """Box of one octagon's ellipse enlarged by the fraction ``padding`` of its size.
 
@@ -84,7 +84,7 @@ def write_box(box, i, means, quats, log_scales, logits, q, padding):
             box[axis], box[3 + axis] = centre - half, centre + half
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def write_boxes(first, last, boxes, means, quats, log_scales, logits, q, padding):
     """Boxes of all octagons, see :func:`write_box`."""
     for i in range(first, last):
@@ -114,7 +114,7 @@ def outgrown_boxes(first, last, outgrown, boxes, ids, means, quats, log_scales, 
                     boxes[i, 3 + axis] += 4 * out
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def refresh_records(first, last, records, ids, means, quats, log_scales, logits, q):
     """Records of the Gaussians ``ids`` from their changed parameters."""
     for k in range(first, last):

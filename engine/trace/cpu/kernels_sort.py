@@ -17,7 +17,7 @@ START_CHUNKS = 64
 """Parts in which the first of equal keys are looked for."""
 
 
-@kernel()
+@kernel(_nrt=False)
 def _count_digits(first, last, keys, shift, histograms):
     """Write the histogram of a digit for each of the chunks ``first`` to ``last``."""
     count = len(keys)
@@ -28,7 +28,7 @@ def _count_digits(first, last, keys, shift, histograms):
             histograms[c, np.int64(keys[e] >> shift) & (BUCKETS - 1)] += 1
 
 
-@kernel()
+@kernel(_nrt=False)
 def _add_up(histograms):
     """Replace each count by the place of its first key."""
     total = 0
@@ -39,7 +39,7 @@ def _add_up(histograms):
             total += size
 
 
-@kernel()
+@kernel(_nrt=False)
 def _scatter(first, last, keys, order, shift, keys_out, order_out, histograms):
     """Move the keys of the chunks ``first`` to ``last`` to their places."""
     count = len(keys)
@@ -53,7 +53,7 @@ def _scatter(first, last, keys, order, shift, keys_out, order_out, histograms):
             order_out[slot] = order[e]
 
 
-@kernel()
+@kernel(_nrt=False)
 def _count_segments(first, last, keys, firsts):
     """Write how many segments begin in each of the chunks ``first`` to ``last``."""
     count, chunks = len(keys), len(firsts)
@@ -65,7 +65,7 @@ def _count_segments(first, last, keys, firsts):
         firsts[c] = found
 
 
-@kernel()
+@kernel(_nrt=False)
 def _write_segments(first, last, keys, starts, firsts):
     """Write where the segments of the chunks ``first`` to ``last`` begin; ``firsts`` are their numbers."""
     count, chunks = len(keys), len(firsts)

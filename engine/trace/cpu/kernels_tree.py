@@ -31,10 +31,10 @@ TOP_CELL = (1 << _CURVE_BITS) - 1
 _CLASSES = 32
 
 
-_spread = device_function(error_model="numpy")(spread_bits)
+_spread = device_function(_nrt=False, error_model="numpy")(spread_bits)
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def curve_keys(first, last, records, low, inverse_cell, keys):
     """Keys along a Z-order curve, by size class first: factors of four, the large ones in front.
 
@@ -60,7 +60,7 @@ def curve_keys(first, last, records, low, inverse_cell, keys):
         keys[i] = key
 
 
-@device_function(error_model="numpy")
+@device_function(_nrt=False, error_model="numpy")
 def write_leaf(blocks, slot, records, i):
     """Mean and legs of Gaussian ``i`` into its lane; a vanished octagon gets legs that are not a number."""
     block, lane = slot // WIDTH, slot % WIDTH
@@ -78,7 +78,7 @@ def write_leaf(blocks, slot, records, i):
         blocks[block, 6 + axis, lane] = records[i, AXIS_V + axis] * scale_v
 
 
-@device_function(error_model="numpy")
+@device_function(_nrt=False, error_model="numpy")
 def write_block_box(blocks, b, nodes):
     """The box of block ``b`` at level 0, around the ellipses that have not vanished."""
     lo0 = lo1 = lo2 = np.inf
@@ -114,7 +114,7 @@ def write_block_box(blocks, b, nodes):
     nodes[node, 3, lane], nodes[node, 4, lane], nodes[node, 5, lane] = hi0, hi1, hi2
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def write_leaves(first, last, blocks, slots, records, order, nodes):
     """Blocks in curve order, each Gaussian's place in them, and the boxes of the blocks (level 0)."""
     count = len(order)
@@ -130,7 +130,7 @@ def write_leaves(first, last, blocks, slots, records, order, nodes):
         write_block_box(blocks, b, nodes)
 
 
-@device_function(error_model="numpy")
+@device_function(_nrt=False, error_model="numpy")
 def write_box_of_node(nodes, child, parent, lane):
     """Box ``lane`` of ``parent``, around the eight boxes of ``child``."""
     for row in range(3):
@@ -140,7 +140,7 @@ def write_box_of_node(nodes, child, parent, lane):
         nodes[parent, row, lane], nodes[parent, 3 + row, lane] = low, high
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def write_upper_levels(nodes, level_starts):
     """Boxes of every level above the first; node k of a level bounds box k of the next."""
     for level in range(1, len(level_starts) - 1):
@@ -149,7 +149,7 @@ def write_upper_levels(nodes, level_starts):
             write_box_of_node(nodes, below + k, here + k // WIDTH, k % WIDTH)
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def refresh_leaves(first, last, blocks, slots, records, ids, touched):
     """Rewrite the lanes of Gaussians whose records changed, and note the blocks that they lie in."""
     for k in range(first, last):
@@ -159,7 +159,7 @@ def refresh_leaves(first, last, blocks, slots, records, ids, touched):
             touched[slot // WIDTH] = True
 
 
-@kernel(error_model="numpy")
+@kernel(_nrt=False, error_model="numpy")
 def refit_blocks(first, last, blocks, touched, nodes):
     """The boxes of the blocks that were touched, and of no others."""
     for b in range(first, last):
