@@ -45,8 +45,8 @@ IN_FLIGHT = 20
 OVER = ("succeeded", "failed", "canceled")
 GLUTTON = "glutton"
 TRAIN = {
-    "iterations": 150, "rays": 256, "sh_degree": 1, "max_gaussians": 300, "initial_points": 250,
-    "fit_iterations": 10, "rebuild_every": 25, "checkpoint_every": 25, "probe_rays": 256,
+    "iterations": 150, "rays_per_batch": 256, "sh_degree": 1, "max_gaussians": 300, "initial_points": 250,
+    "densify_from_iter": 10, "rebuild_every": 25, "checkpoint_every": 25, "probe_rays": 256,
 }  # fmt: skip
 RECONSTRUCTION: dict[str, Any] = {"preset": "fast", "train": TRAIN}
 COMPARED = ("chain.bin", "scene.ply", "mesh.ply", "mesh.obj", "mesh.glb", "held_out.json")

@@ -98,7 +98,7 @@ class CloudPhotographs:
 def milliseconds_an_iteration(gaussians: FlatGaussians, iterations: int = 50, sh_degree: int = 0) -> float:
     """Mean wall time of a training iteration, rebuilds of the hierarchy included, densification not."""
     config = TrainConfig(
-        iterations=iterations, max_gaussians=len(gaussians), sh_degree=sh_degree, sh_every=1,
+        iterations=iterations, max_gaussians=len(gaussians), sh_degree=sh_degree, sh_degree_interval=1,
         checkpoint_every=10_000, probe_rays=256, densify=McmcConfig(start=10_000),
     )  # fmt: skip
     marks: list[tuple[int, float]] = []

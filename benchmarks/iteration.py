@@ -94,7 +94,7 @@ def spent(
     """Medians by stage of wall, CPU and own CPU time, seconds; hits a ray; Gaussians hit."""
     use_threads(threads)
     clock = Clock()
-    settings = config.trace.model_copy(update={"order": "packet" if in_one_order(config) else "ray"})
+    settings = config.trace.model_copy(update={"sort": "packet" if in_one_order(config) else "ray"})
     tracer = TimedTracer(make_tracer(settings, threads=threads, box_padding=config.box_padding), clock)
     densifier = make_densifier(config.densify, iterations=iterations, max_gaussians=len(state.gaussians))
     machinery = Machinery(tracer, make_shading(config, len(dataset.views), dataset.extent), densifier)
@@ -149,7 +149,7 @@ def main() -> None:
                 rounds[threads].append(found)
     print(
         f"{options.scene.name}: {len(first.gaussians)} Gaussians of degree {first.gaussians.sh_degree}, "
-        f"{config.rays} rays, {hits:.1f} hits a ray, {met:.0f} Gaussians met"
+        f"{config.rays_per_batch} rays, {hits:.1f} hits a ray, {met:.0f} Gaussians met"
     )
     for threads, found_rounds in rounds.items():
         table = 1e3 * np.median(found_rounds, axis=0)

@@ -197,7 +197,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("--views", type=int, default=3, help="so many, evenly spread")
     parser.add_argument("--samples", type=int, default=64, help="a pixel; a square number")
-    parser.add_argument("--depth", type=int, default=6, help="most surfaces on a path")
+    parser.add_argument("--max-bounces", type=int, default=6, help="most surfaces on a path")
     parser.add_argument("--relit", action="store_true", help="also under the maps of the relit pictures")
     parser.add_argument("--gaussians", action="store_true", help="camera rays meet the Gaussians too")
     parser.add_argument("--pictures", type=Path, help="write pictures there")
@@ -221,7 +221,9 @@ def main() -> None:
     chosen = chosen[:: max(1, len(chosen) // given.views)][: given.views]
     lights = [(given.scene / "test" / "images", truth.environment)]
     lights += list(truth.relit) if given.relit else []
-    settings = Integrator(samples=given.samples, max_depth=given.depth, roulette_depth=given.depth)
+    settings = Integrator(
+        samples=given.samples, max_depth=given.max_bounces, roulette_depth=given.max_bounces
+    )
     for folder, environment in lights:
         assert environment is not None
         tracer = tracer_under(environment, scene, truth.up_world, settings, LIFT * spacing)

@@ -16,8 +16,12 @@ from typing import Any
 
 PIPELINE = "octasplat.engine.pipeline"
 SETTINGS = {
-    "iterations": "30", "rays": "256", "max_gaussians": "400", "initial_points": "300", "probe_rays": "256",
-}  # fmt: skip
+    "iterations": "30",
+    "rays_per_batch": "256",
+    "max_gaussians": "400",
+    "initial_points": "300",
+    "probe_rays": "256",
+}
 
 
 class Visits:

@@ -1,10 +1,11 @@
 """Lit GLBs in Cycles and in three.js beside ``octasplat relight`` and, where it is known, the truth.
 
     octasplat surface OUT --materials -o thing.glb
-    python benchmarks/surface_materials.py OUT thing.glb --on SCENE/test --environment other.hdr --views 2
+    python benchmarks/surface_materials.py OUT thing.glb --other-dataset SCENE/test --environment other.hdr
 
-The light is OUT/environment.hdr and each ``--environment``; pictures are at the views of ``--on``, over
-black. Truth: the photographs under the first, and what ``truth.json`` names under the others. Needs node,
+The light is OUT/environment.hdr and each ``--environment``; pictures are at the views of
+``--other-dataset``, over black. Truth:
+the photographs under the first, and what ``truth.json`` names under the others. Needs node,
 Chromium and OCTASPLAT_BPY_PYTHON. PSNR of display values, means over the views: of the whole picture, and of
 the pixels that our picture covers.
 """
@@ -76,7 +77,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("run", type=Path)
     parser.add_argument("glb", type=Path, nargs="+")
-    parser.add_argument("--on", type=Path, required=True)
+    parser.add_argument("--other-dataset", type=Path, required=True)
     parser.add_argument("--environment", type=Path, action="append", default=[])
     parser.add_argument("--views", type=int, default=2)
     parser.add_argument("--max-side", type=int, default=400)
@@ -93,9 +94,11 @@ def main() -> None:
         "path": PathRelighter(gaussians, trace, paths),
         "split sum": SplitSumRelighter(gaussians, trace, config.train.materials, extent_world=extent),
     }
-    places = [path for path in (asked.on / TRUTH, asked.on.parent / TRUTH) if path.is_file()]
+    places = [
+        path for path in (asked.other_dataset / TRUTH, asked.other_dataset.parent / TRUTH) if path.is_file()
+    ]
     truth = read_truth(places[0]) if places else None
-    photographs = load_scene(asked.on, max_side=asked.max_side, least_views=1, for_training=False)
+    photographs = load_scene(folder, max_side=asked.max_side, least_views=1, for_training=False)
     names = [view.name for view in photographs.views]
     wanted = [name for name in (truth.content.relight.views if truth else names) if name in names]
 

@@ -1,6 +1,6 @@
 """A coloured surface beside the scene that it was made of, at views that neither was trained on.
 
-    octasplat surface OUT -o thing.glb --texture 2048
+    octasplat surface OUT -o thing.glb --texture-size 2048
     python benchmarks/surface_views.py OUT thing.glb [--pictures FOLDER]
     python benchmarks/surface_views.py scene.ply thing.glb         # of a file: at eight views of a turntable
 
@@ -100,7 +100,7 @@ def views_of(
         )
     config = read_config(source / CONFIG)
     dataset = open_photographs(photographs_folder(source), source, config, 0, lambda _event: None)
-    colour = background_colour(config.evaluate_background)
+    colour = background_colour(config.evaluation_background)
     found: list[tuple[str, ImageRays, Picture | None]] = []
     for index in dataset.test_indices:
         rgb, alpha, _ = dataset.view_image(int(index))

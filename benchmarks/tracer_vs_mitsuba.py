@@ -158,7 +158,7 @@ def compare(name: str, gaussians: FlatGaussians, repeats: int, order: Literal["r
     gaussians.log_scales += np.float32(np.log(ENLARGE))
     origins, directions = camera_rays(gaussians)
     theirs = Mitsuba(gaussians, origins, directions)
-    ours = CpuTracer(SETTINGS.model_copy(update={"order": order}), threads=2)
+    ours = CpuTracer(SETTINGS.model_copy(update={"sort": order}), threads=2)
     ours.build(gaussians)
     gradient = np.random.default_rng(1).normal(size=(len(origins), 3)).astype(np.float32)
 

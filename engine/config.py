@@ -12,9 +12,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 
 from octasplat.engine.errors import ConfigError
-from octasplat.engine.fields import ADVANCED, Spelling
+from octasplat.engine.fields import ADVANCED
 from octasplat.engine.nested_options import merged
 from octasplat.engine.refusals import Refusal, SettingsRefused, refusals_of, submodels, unknown_setting
+from octasplat.engine.renamed_settings import former_names, with_new_names
 from octasplat.engine.run_settings import RunSettings
 from octasplat.engine.settings import Settings
 from octasplat.engine.train.config import TrainConfig, preset, with_materials
@@ -25,18 +26,21 @@ class ReconstructionConfig(RunSettings):
     """Everything that decides what a reconstruction gives; the number of threads does not."""
 
     train: TrainConfig = Field(TrainConfig(), description="The settings of the training.")
-    evaluate_background: Annotated[Literal["black", "white"], Spelling(("--background",)), ADVANCED] = Field(
+    evaluation_background: Annotated[Literal["black", "white"], ADVANCED] = Field(
         "black", description="What lies behind renders and photographs with alpha when they are compared."
     )
 
     @model_validator(mode="before")
     @classmethod
     def _measured_as_trained(cls, values: Any) -> Any:
-        if not isinstance(values, Mapping) or values.get("evaluate_background") is not None:
+        if not isinstance(values, Mapping):
+            return values
+        values = with_new_names((cls,), values)
+        if values.get("evaluation_background") is not None:
             return values
         train = values.get("train", {})
         behind = train.get("background") if isinstance(train, Mapping) else train.background
-        return {**values, "evaluate_background": "white" if behind == "white" else "black"}
+        return {**values, "evaluation_background": "white" if behind == "white" else "black"}
 
     def background_mismatch(self, has_alpha: bool) -> str | None:
         """Return a sentence where views are measured on another background than they were trained on.
@@ -44,7 +48,7 @@ class ReconstructionConfig(RunSettings):
         Args:
             has_alpha: whether the photographs have alpha, so that they have no background of their own.
         """
-        shown = self.evaluate_background
+        shown = self.evaluation_background
         trained = self.train.background if self.train.background != "auto" else "black"
         if has_alpha or trained not in ("black", "white") or trained == shown:
             return None
@@ -78,8 +82,8 @@ def resolve_config(
         materials: learn materials and the environment.
         settings: fields of :class:`RunSettings`; None values are left at their defaults.
         train: some settings of the training, nested as in :class:`ReconstructionConfig`.
-        assignments: of any setting, values as JSON: ``rates.mean=2e-4``, which is
-            ``train.rates.mean=2e-4``, or ``test_every=4``.
+        assignments: of any setting, values as JSON: ``lr.mean=2e-4``, which is
+            ``train.lr.mean=2e-4``, or ``test_every=4``.
 
     Raises:
         SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
@@ -113,6 +117,7 @@ def revise_config(
     Raises:
         SettingsRefused: an unknown name, a value out of range, or settings that contradict each other.
     """
+    before = with_new_names((ReconstructionConfig,), before)
     values, changes = _collected(settings or {}, materials, train, assignments)
     values = {**before, **values}
     kept: Mapping[str, Any] = before.get("train", {})
@@ -137,7 +142,9 @@ def read_config(path: Path) -> ReconstructionConfig:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return _validated(content["reconstruction"])
+        return _validated(
+            with_new_names((ReconstructionConfig,), content["reconstruction"], source=str(path))
+        )
     except SettingsRefused as error:
         raise ConfigError(f"{path} is not a configuration of this version: {error}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -153,18 +160,20 @@ def _collected(
     assignments: Sequence[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The fields of :class:`RunSettings` and the nested settings of the training that are asked for."""
-    values = dict(settings)
+    values = with_new_names((RunSettings,), settings)
     changes: dict[str, Any] = {} if materials is None else {"materials": {"learn": materials}}
     if train:
+        train = with_new_names((TrainConfig,), train)
         _check_names(train)
         changes = merged(changes, train)
     for assignment in assignments:
         path, value = _read_assignment(assignment)
-        if len(path) == 1 and path[0] in RunSettings.model_fields:
-            values[path[0]] = value
-            continue
         for name in reversed(path):
             value = {name: value}
+        value = with_new_names((RunSettings, TrainConfig), value)
+        if RunSettings.model_fields.keys() & value:
+            values |= value
+            continue
         _check_names(value)
         changes = merged(changes, value)
     return values, changes
@@ -181,7 +190,7 @@ def _read_assignment(assignment: str) -> tuple[list[str], Any]:
     """The path and the value that an assignment names; the value is JSON, or else the text itself."""
     name, equals, text = (part.strip() for part in assignment.partition("="))
     if not equals or not name:
-        sentence = f"{assignment}: write an assignment as name=value, e.g. rates.mean=2e-4."
+        sentence = f"{assignment}: write an assignment as name=value, e.g. lr.mean=2e-4."
         raise SettingsRefused([Refusal(("assignments",), "assignment", sentence)])
     try:
         value = json.loads(text)
@@ -239,7 +248,9 @@ def _check_names(train: Mapping[str, Any]) -> None:
     """
     unknown = list(_unknown((TrainConfig,), train, ("train",)))
     if unknown:
-        raise SettingsRefused([unknown_setting(path, _setting_names()) for path in unknown])
+        raise SettingsRefused(
+            [unknown_setting(path, _setting_names(), former=former_setting_names()) for path in unknown]
+        )
 
 
 def _unknown(
@@ -280,3 +291,20 @@ def _names_in(models: Sequence[type[BaseModel]], prefix: str) -> Iterator[str]:
                 yield from _names_in(inner, f"{prefix}{name}.")
             else:
                 yield prefix + name
+
+
+@cache
+def former_setting_names() -> Mapping[str, str]:
+    """Return the names of all settings of the training, with dots, by those of the last version."""
+    return dict(_former_in((TrainConfig,), "", ""))
+
+
+def _former_in(models: Sequence[type[BaseModel]], before: str, after: str) -> Iterator[tuple[str, str]]:
+    for model in models:
+        former = {new: old for old, new in former_names(model).fields.items()}
+        for name, info in model.model_fields.items():
+            old = former.get(name, name)
+            if inner := submodels(info.annotation):
+                yield from _former_in(inner, f"{before}{old}.", f"{after}{name}.")
+            elif (before, old) != (after, name):
+                yield before + old, after + name

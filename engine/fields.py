@@ -128,7 +128,7 @@ Source = Annotated[Path, Positional("IN")]
 OUTPUT_FLAGS = Spelling(("-o", "--output"))
 Output = Annotated[Path, OUTPUT_FLAGS]
 """Where a verb writes; a job has its own place."""
-DatasetFolder = Annotated[Path | None, Spelling(("--scene", "--dataset"), metavar="FOLDER")]
+DatasetFolder = Annotated[Path | None, Spelling(("--dataset",), metavar="FOLDER")]
 """The folder of a run's photographs; a job that needs them has its own."""
 
 

@@ -9,10 +9,10 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
 
     Names with dots are also found by their last part.
 
-    >>> nearest_name("window_ray", ["window_rays", "rates.quat"])
-    'window_rays'
-    >>> nearest_name("quats", ["window_rays", "rates.quat"])
-    'rates.quat'
+    >>> nearest_name("window_ray", ["ray_patch_rays", "lr.quat"])
+    'ray_patch_rays'
+    >>> nearest_name("quats", ["ray_patch_rays", "lr.quat"])
+    'lr.quat'
     """
     names = list(known)
     if whole := get_close_matches(name, names, n=1, cutoff=0.75):

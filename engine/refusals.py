@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
@@ -49,10 +50,23 @@ def refusals_of(error: ValidationError, model: type[BaseModel]) -> list[Refusal]
     return list(found.values())
 
 
-def unknown_setting(path: Sequence[str | int], known: Iterable[str], of_kind: str = "") -> Refusal:
-    """Return the refusal of a setting that there is not; it offers the nearest of those that are known."""
+def unknown_setting(
+    path: Sequence[str | int],
+    known: Iterable[str],
+    of_kind: str = "",
+    former: Mapping[str, str] = MappingProxyType({}),
+) -> Refusal:
+    """Return the refusal of a setting that there is not; it offers the nearest of those that are known.
+
+    Args:
+        path: where it is.
+        known: names of settings.
+        of_kind: the kind of section that it is in, where there are several.
+        former: names of settings by those of the last version; near one of these, its new name is offered.
+    """
     name = setting_name(path)
-    nearest = nearest_name(name, known)
+    nearest = nearest_name(name, [*known, *former])
+    nearest = former.get(nearest, nearest) if nearest else None
     help_text = f"; the nearest is {nearest}." if nearest else "; octasplat config list --all lists them."
     if of_kind:
         help_text = f" where the kind is {of_kind}{help_text}"
@@ -62,8 +76,8 @@ def unknown_setting(path: Sequence[str | int], known: Iterable[str], of_kind: st
 def setting_name(path: Sequence[str | int]) -> str:
     """Return the name by which users set what is at ``path``; those of the training need no ``train.``.
 
-    >>> setting_name(("train", "rates", "quat")), setting_name(("test_every",))
-    ('rates.quat', 'test_every')
+    >>> setting_name(("train", "lr", "quat")), setting_name(("test_every",))
+    ('lr.quat', 'test_every')
     """
     return ".".join(map(str, path[1:] if path[0] == "train" and len(path) > 1 else path))
 

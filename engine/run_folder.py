@@ -62,7 +62,7 @@ def photographs_folder(output: Path, scene: Path | None = None) -> Path:
         return noted
     raise DatasetError(
         f"The photographs that {output} was made from ({noted}) are not on this machine; "
-        "say where they are with --scene FOLDER."
+        "say where they are with --dataset FOLDER."
     )
 
 

@@ -77,7 +77,7 @@ def place_misfits(
         Cancelled: stopped as asked.
     """
     is_long = _is_long(dataset, config)
-    if not (config.train.place_misfits and is_long) or found_model(output) is not None:
+    if not (config.train.repair_poses and is_long) or found_model(output) is not None:
         return False
     with stage("check", tell, CHECK_ITERATIONS):
         doubtful = doubtful_views(
@@ -110,7 +110,7 @@ def place_misfits(
         tell(
             Warned(
                 f"{which} did not stand where matches with the others say: {', '.join(moved)}. The training "
-                "takes the poses that follow from the matches; place_misfits=false leaves given poses alone."
+                "takes the poses that follow from the matches; repair_poses=false leaves given poses alone."
             )
         )
     return bool(moved)
@@ -131,7 +131,7 @@ def free_lenses(
     Raises:
         Cancelled: stopped as asked.
     """
-    if not (config.train.free_lenses and _is_long(dataset, config)):
+    if not (config.train.per_view_principal_point and _is_long(dataset, config)):
         return False
     if "lenses" in read_record(output / POSES):
         return False
@@ -150,7 +150,8 @@ def free_lenses(
         Warned(
             "The lens moved between the photographs, as stabilised ones do: each has a principal point of "
             f"its own, {facts['shift_px_median']:.1f} px from the given one in the middle, and the sparse "
-            f"points fit to {after:.2f} px instead of {before:.2f}; free_lenses=false leaves lenses alone."
+            f"points fit to {after:.2f} px instead of {before:.2f}; "
+            f"per_view_principal_point=false leaves lenses alone."
         )
     )
     return True

@@ -1,9 +1,11 @@
 """What decides a reconstruction beside its training; imports nothing heavy."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.export_names import ExportNames
 from octasplat.engine.fields import ADVANCED, BASIC, Spelling, Unit
 from octasplat.engine.train.preset_names import PresetName
@@ -14,11 +16,13 @@ class RunSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.RUN
+
     preset: Annotated[PresetName, BASIC] = Field(
         "standard",
         description="Where the settings of the training come from: fast is a first look, standard is "
-        "better, high is better yet and takes about three times as many iterations, paper has the published "
-        "settings.",
+        "better, high is better yet and takes about three times as many iterations, redisplats has "
+        "the published settings.",
     )
     max_side: Annotated[int | None, Unit("px"), BASIC] = Field(
         None,
@@ -38,7 +42,7 @@ class RunSettings(BaseModel):
     poses: Annotated[Literal["given", "auto", "missing"], BASIC] = Field(
         "missing",
         description="Where the poses of the cameras come from: given takes the COLMAP model of the dataset "
-        "(photographs far from where matches put them are moved, see place_misfits); auto finds the poses, "
+        "(photographs far from where matches put them are moved, see repair_poses); auto finds the poses, "
         "by COLMAP's features, matching and mapping; missing does so only where the dataset holds no model.",
     )
     masks: Annotated[Literal["ignore", "alpha"], ADVANCED] = Field(
@@ -46,9 +50,7 @@ class RunSettings(BaseModel):
         description="What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as "
         "the alpha, for objects that are cut out.",
     )
-    evaluate_background: Annotated[
-        Literal["black", "white"] | None, Spelling(("--background",)), ADVANCED
-    ] = Field(
+    evaluation_background: Annotated[Literal["black", "white"] | None, ADVANCED] = Field(
         None,
         description="What lies behind renders and photographs with alpha when they are compared; by default "
         "that of the training: white where train.background is white, else black.",
@@ -65,3 +67,8 @@ class RunSettings(BaseModel):
         max_length=100,
         description="Files to write besides scene.ply; their names say the format.",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_new_names(cls, given: Any) -> Any:
+        return renamed_settings.with_new_names((cls,), given) if isinstance(given, Mapping) else given

@@ -6,6 +6,8 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
+from octasplat.engine.renamed_settings import NONE, FormerNames, former_names, with_new_names
+
 
 @dataclass(frozen=True)
 class FormerSetting:
@@ -27,14 +29,15 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     former_settings: ClassVar[Mapping[str, FormerSetting]] = {}
+    former_names: ClassVar[FormerNames] = NONE
 
     @model_validator(mode="before")
     @classmethod
     def _without_former_settings(cls, given: Any) -> Any:
-        """Leave out former settings that have the value of the constant; refuse other values."""
+        """Read former names; leave out former settings that have the value of the constant, refuse others."""
         if not isinstance(given, Mapping):
             return given
-        kept = dict(given)
+        kept = with_new_names((cls,), given)
         for name, former in cls.former_settings.items():
             if name not in kept or name in cls.model_fields:
                 continue
@@ -46,18 +49,36 @@ class Settings(BaseModel):
         return kept
 
 
-def dump_with_former_settings(settings: Settings) -> dict[str, Any]:
-    """Return the settings as JSON values, with the former ones where earlier versions wrote them.
+def json_by_former_names(settings: Settings) -> str:
+    """Return the settings as JSON by the names of the last version, for digests that are to stay valid."""
+    names = former_names(type(settings))
+    former_name = {new: old for old, new in names.fields.items()}
+    text = settings.model_dump_json()
+    for name in type(settings).model_fields:
+        text = text.replace(f'"{name}":', f'"{former_name.get(name, name)}":')
+        for old, new in names.values.get(name, {}).items():
+            text = text.replace(f'"{name}":"{new}"', f'"{name}":"{old}"')
+    return text
 
-    Digests of settings stay valid by this when a setting becomes a constant.
+
+def dump_with_former_settings(settings: Settings) -> dict[str, Any]:
+    """Return the settings as JSON values, by former names, with the former ones where these were written.
+
+    Digests of settings stay valid by this when a setting is renamed or becomes a constant.
     """
     dumped: dict[str, Any] = {}
+    names = former_names(type(settings))
+    former_name = {new: old for old, new in names.fields.items()}
     for name, value in settings.model_dump(mode="json").items():
         inner = getattr(settings, name)
-        dumped[name] = dump_with_former_settings(inner) if isinstance(inner, Settings) else value
+        former_value = {new: old for old, new in names.values.get(name, {}).items()}
+        if isinstance(inner, Settings):
+            dumped[former_name.get(name, name)] = dump_with_former_settings(inner)
+        else:
+            dumped[former_name.get(name, name)] = former_value.get(value, value) if former_value else value
         previous = name
-        for former_name, former in settings.former_settings.items():
+        for constant, former in settings.former_settings.items():
             if former.after == previous:
-                dumped[former_name] = former.value
-                previous = former_name
+                dumped[constant] = former.value
+                previous = constant
     return dumped

@@ -13,7 +13,7 @@ import annotated_types
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from octasplat.engine.config import ReconstructionConfig, resolve_config
+from octasplat.engine.config import ReconstructionConfig, former_setting_names, resolve_config
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.fields import Group, Level, Unit
 from octasplat.engine.refusals import SettingsRefused, unknown_setting
@@ -105,7 +105,7 @@ def setting_named(name: str) -> Setting:
     inside = [known for known in names if known.startswith(f"{wanted}.")]
     if inside:
         raise ConfigError(f"{name} is a group of settings: {', '.join(inside)}.")
-    raise SettingsRefused([unknown_setting(wanted.split("."), names)])
+    raise SettingsRefused([unknown_setting(wanted.split("."), names, former=former_setting_names())])
 
 
 def setting_values(config: ReconstructionConfig) -> dict[str, object]:

@@ -69,7 +69,9 @@ def ceilings_by_path(kind: JobKind, settings: ServiceSettings) -> dict[str, int]
         if demand.of not in ("exports", "render_pixels", "render_paths", "workspace_bytes")
     ]
     return {
-        demand.path: settings.ceilings[demand.of] for demand in numbers if demand.path != "train.patch_side"
+        demand.path: settings.ceilings[demand.of]
+        for demand in numbers
+        if demand.path != "train.ssim_patch_side"
     }
 
 

@@ -235,7 +235,7 @@ def test_training_takes_channels_along(tmp_path: Path) -> None:
     names = np.arange(len(start), dtype=np.float32)[:, None]
     first = start.copy().with_channels({"label": names})
     config = small_config(iterations=60)
-    config = config.model_copy(update={"rates": config.rates.model_copy(update={"quat": 0.0})})
+    config = config.model_copy(update={"lr": config.lr.model_copy(update={"quat": 0.0})})
     trainer = Trainer(
         world, config, fresh_state(first, 0), folder=tmp_path, fingerprint="", listener=lambda _event: None,
         threads=1,

@@ -41,14 +41,14 @@ reconstruct(
 def make_config(**assignments: object) -> ReconstructionConfig:
     values: dict[str, object] = {
         "iterations": ITERATIONS,
-        "rays": 1024,
-        "patch_fraction": 0.25,
-        "patch_side": 16,
+        "rays_per_batch": 1024,
+        "ssim_patch_fraction": 0.25,
+        "ssim_patch_side": 16,
         "sh_degree": 1,
-        "sh_every": 100,
+        "sh_degree_interval": 100,
         "max_gaussians": 900,
         "initial_points": 500,
-        "fit_iterations": 40,
+        "densify_from_iter": 40,
         "densify.start": 50,
         "densify.interval": 30,
         "densify.growth": 0.1,
@@ -269,7 +269,7 @@ def test_checkpoints_of_other_photographs_are_refused_and_kept(
 
 def test_failed_training_exports_nothing(scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    config = make_config(**{"rates.mean": 1e6, "rates.mean_final": 1e6})
+    config = make_config(**{"lr.mean": 1e6, "lr.mean_final": 1e6})
     with pytest.raises(TrainingFailure):
         reconstruct(scene, run, config, threads=1)
     names = {path.name for path in run.iterdir()}

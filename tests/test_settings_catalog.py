@@ -77,10 +77,10 @@ def test_catalog_entry_of_a_setting_with_a_known_answer() -> None:
 
 
 def test_catalog_has_defaults_by_preset_and_with_materials() -> None:
-    exceptions = setting_named("rays").exceptions
-    assert setting_named("rays").default == 16_384
-    assert exceptions["paper"] == 8192 and exceptions["standard+materials"] == 8192
-    assert setting_named("densify.split_scale").defaults == {"paper": 0.005}
+    exceptions = setting_named("rays_per_batch").exceptions
+    assert setting_named("rays_per_batch").default == 16_384
+    assert exceptions["redisplats"] == 8192 and exceptions["standard+materials"] == 8192
+    assert setting_named("densify.split_scale").defaults == {"redisplats": 0.005}
 
 
 def test_catalog_has_every_setting_once() -> None:
@@ -91,7 +91,7 @@ def test_catalog_has_every_setting_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "nearest"), [("window_ray", "window_rays"), ("quats", "rates.quat"), ("rate.mean", "rates.mean")]
+    ("name", "nearest"), [("window_ray", "ray_patch_rays"), ("quats", "lr.quat"), ("rate.mean", "lr.mean")]
 )
 def test_unknown_setting_is_refused_and_the_nearest_one_offered(name: str, nearest: str) -> None:
     with pytest.raises(ConfigError, match=f"the nearest is {nearest}"):
@@ -102,16 +102,16 @@ def test_unknown_setting_is_refused_and_the_nearest_one_offered(name: str, neare
 
 
 def test_differences_are_those_that_were_set() -> None:
-    changed = resolve_config("fast", assignments=["rates.quat=0.5", "test_every=4"])
+    changed = resolve_config("fast", assignments=["lr.quat=0.5", "test_every=4"])
     assert differences(defaults_of(changed), changed) == (
         Difference("test_every", 8, 4),
-        Difference("rates.quat", 0.015, 0.5),
+        Difference("lr.quat", 0.015, 0.5),
     )
     assert differences(changed, changed) == ()
 
 
 def test_differences_name_settings_that_one_side_alone_has() -> None:
-    found = differences(resolve_config("standard"), resolve_config("paper"))
+    found = differences(resolve_config("standard"), resolve_config("redisplats"))
     assert Difference("densify.split_scale", None, 0.005) in found
     assert Difference("densify.growth", 0.2, None) in found
 
@@ -129,10 +129,10 @@ def test_config_list_shows_the_basic_settings_and_all_on_request() -> None:
 
 
 def test_config_explain_tells_what_is_known() -> None:
-    text = config_command("explain", "rates.decay").stdout
-    assert "Unit: share" in text and "Default: 0.3" in text and "With paper: 0.1" in text
-    refused = config_command("explain", "rates.decai")
-    assert refused.exit_code == 1 and "the nearest is rates.decay." in refused.stderr
+    text = config_command("explain", "lr.decay").stdout
+    assert "Unit: share" in text and "Default: 0.3" in text and "With redisplats: 0.1" in text
+    refused = config_command("explain", "lr.decai")
+    assert refused.exit_code == 1 and "the nearest is lr.decay." in refused.stderr
 
 
 def test_config_diff_tells_what_runs_had_changed(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_a_run_on_one_thread_uses_one(tmp_path: Path) -> None:
     )
     command = [
         sys.executable, "-m", "octasplat", "reconstruct", str(scene), "-o", str(tmp_path / "out"), "--quiet",
-        "--threads", "1", "--max-side", "48", "--iterations", "100", "--rays", "4096",
+        "--threads", "1", "--max-side", "48", "--iterations", "100", "--rays-per-batch", "4096",
     ]  # fmt: skip
     began = time.perf_counter()
     program = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "4"})

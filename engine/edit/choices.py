@@ -247,6 +247,6 @@ class Cleaning(BaseModel):
         description="Neighbours belong together if their centres are no further apart than this many times "
         "the sum of their standard deviations.",
     )
-    neighbours: Annotated[int, Group("advanced")] = Field(
+    neighbors: Annotated[int, Group("advanced")] = Field(
         12, ge=1, le=64, description="How many nearest neighbours of a Gaussian may belong to its group."
     )

@@ -35,7 +35,7 @@ def clean(
     floating, groups = 0, 0
     if options.floaters and keep.any():
         rows = np.flatnonzero(keep)
-        labels, sizes = linked_groups(gaussians.select(rows), options.link, options.neighbours)
+        labels, sizes = linked_groups(gaussians.select(rows), options.link, options.neighbors)
         loose = sizes[labels] < min(options.min_group, sizes.max())
         keep[rows[loose]] = False
         floating = int(loose.sum())

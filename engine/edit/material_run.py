@@ -52,7 +52,9 @@ def follows(source: Path) -> bool:
     """Whether the harmonics of a scene show its materials in a light that is known."""
     if not is_run(source) or not run_environment(source).exists():
         return False
-    return read_config(source / CONFIG).train.materials.recipe != "seed"  # there they are the matt part
+    return (
+        read_config(source / CONFIG).train.materials.recipe != "ref_gaussian"
+    )  # there they are the matt part
 
 
 def edit_note(

@@ -141,7 +141,7 @@ def evaluate_scales(
             dataset,
             tracer,
             shading,
-            background_colour(config.evaluate_background),
+            background_colour(config.evaluation_background),
             scales,
             RAYS_ACROSS,
             on_view=lambda done: progress(done, len(dataset.test_indices)),
@@ -154,7 +154,7 @@ def _finished(output: Path, background: Literal["black", "white"] | None) -> Rec
     """Return the settings of a run that has a scene, to be measured with that background."""
     config = read_config(output / CONFIG)
     if background is not None:
-        config = config.model_copy(update={"evaluate_background": background})
+        config = config.model_copy(update={"evaluation_background": background})
     if not (output / SCENE).exists():
         raise OutputError(
             f"{output} holds no {SCENE} yet; finish the run with: octasplat reconstruct --resume."
@@ -218,14 +218,14 @@ def measure_run(
         into or output,
         settings=config.train.trace,
         shading=finished_shading(output, config.train, dataset, extent, exposed=into is None),
-        background=config.evaluate_background,
+        background=config.evaluation_background,
         run={
             "gaussians": len(gaussians),
             "iterations": training["iterations"],
             "seconds": training["seconds"],
             "seed": config.train.seed,
             "resolution": {"max_side": config.max_side},
-            "background": config.evaluate_background,
+            "background": config.evaluation_background,
             "versions": versions(),
             **{key: training[key] for key in NOTED_BY_TRAINING if key in training},
             **_placed(output),

@@ -51,7 +51,7 @@ def export_losses(
     if gaussians.sh_degree > 0 and without:
         lines.append(
             f"{_formats(without, 'has', 'have')} one colour for each Gaussian; how colours change with the "
-            "direction will be left out (octasplat export --colour chooses the one)."
+            "direction will be left out (octasplat export --color chooses the one)."
         )
     return tuple(lines)
 

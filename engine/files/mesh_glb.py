@@ -186,7 +186,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
             raise ConfigError(f"{path}: not written, as the scene has no materials to be lit by.")
         options, ramp = options.model_copy(update={"ids": False}), material_ramp_png()
     soup = OctagonSoup(gaussians, path, options, OPAQUE_CUTOFF if options.opaque else None)
-    png = white_with_alpha_png(options.texture_size, options.q)
+    png = white_with_alpha_png(options.falloff_texture_size, options.q)
     parts = _parts(soup, path, (len(png), len(ramp)), options)
     paths = [path, *(path.with_name(f"{path.stem}.part{k}{path.suffix}") for k in range(2, len(parts) + 1))]
     for part_path, (layout, chunks) in zip(paths, parts, strict=True):

@@ -329,7 +329,7 @@ def write_octagons(gaussians: FlatGaussians, path: Path, options: ExportOptions)
     soup = OctagonSoup(gaussians, path, options)
     material, texture = _octagon_files(path)
     with replacing(texture) as temporary:
-        temporary.write_bytes(grey_png(options.texture_size, options.q))
+        temporary.write_bytes(grey_png(options.falloff_texture_size, options.q))
     write_text(material, f"{_material(MATERIAL)}map_d {texture.name}\n")
     with replacing(path) as temporary, temporary.open("wb") as handle:
         for text in _octagon_lines(soup, material.name):

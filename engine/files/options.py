@@ -12,7 +12,7 @@ OctagonQ = Annotated[float, Field(gt=0.0, le=100.0)]
 """Chi-square quantile Q of octagons, their squared radius in standard deviations; alpha falls to exp(-Q/2) at
 their corners."""
 
-_TEXTURE = Spelling(("--texture",), metavar="PX")
+_TEXTURE = Spelling(metavar="PX")
 
 
 class ExportChoices(BaseModel):
@@ -41,7 +41,7 @@ class ExportChoices(BaseModel):
         description="GLB: most spatial chunks, which programs sort by distance; rounded down to a power of "
         "two.",
     )
-    texture_size: Annotated[int, _TEXTURE, Unit("px"), Group("advanced")] = Field(
+    falloff_texture_size: Annotated[int, _TEXTURE, Unit("px"), Group("advanced")] = Field(
         128, ge=8, le=4096, description="GLB, OBJ: side of the texture that holds the fall-off."
     )
     ids: Annotated[bool, Group("advanced")] = Field(

@@ -54,7 +54,7 @@ class GaussianLayers:
     def trace(self, rays: RayBatch, t_max: Float32[np.ndarray, " r"]) -> TraceResult:
         """What lies on rays up to a distance each."""
         seen = self.tracer.trace(rays.up_to(t_max))
-        if self.tracer.settings.turned_beyond > 0:
+        if self.tracer.settings.flip_normal_cos > 0:
             normals = faced(seen.normal_world, rays.directions_world)
             seen.normal_world = normals.normal_world.astype(np.float32)
         return seen

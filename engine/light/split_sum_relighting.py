@@ -45,13 +45,13 @@ class SplitSumRelighter:
         self._across = side
         changed = {"learn": True, "environment_height": HEIGHT, "visibility": True, "indirect": "shaded"}
         shading = (learnt or MaterialSettings()).model_copy(update=changed)
-        self._shading = Deferred(shading, extent_world=extent_world, sided=settings.turned_beyond > 0)
+        self._shading = Deferred(shading, extent_world=extent_world, sided=settings.flip_normal_cos > 0)
         self._gaussians = with_room_for_bounced(gaussians)
         self._tracer = make_tracer(settings, threads=threads, build_quality=2)
         self._tracer.build(self._gaussians, self._shading.features(self._gaussians))
         self._all = np.arange(len(gaussians))
         self._open_sides: Float32[np.ndarray, " n"] | None = None
-        if AMBIENT in gaussians.channels and shading.ambient:
+        if AMBIENT in gaussians.channels and shading.ambient_occlusion:
             self._open_sides = self._shading.look_around(self._gaussians, self._all, self._tracer)
         self._radiance: Float32[np.ndarray, "h w 3"] | None = None
 

@@ -5,10 +5,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.errors import Cancelled, ConfigError
 from octasplat.engine.events import Event, Listener, Warned, ignore
 from octasplat.engine.fields import Output, Positional, Source
@@ -18,6 +19,13 @@ class Options(BaseModel):
     """Base of the options of a verb: everything but where its input is read and its output written."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.NONE
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_new_names(cls, given: Any) -> Any:
+        return renamed_settings.with_new_names((cls,), given) if isinstance(given, Mapping) else given
 
 
 class Request(Options):

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.edit.choices import Cleaning
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.events import Listener, ignore
@@ -25,7 +26,9 @@ from octasplat.engine.operations.base import (
 class CleanOptions(Cleaning, Options):
     """Which Gaussians to remove: the faint, the too small or large, floaters, and those before a camera."""
 
-    near_share: Annotated[float, Spelling(("--near",), metavar="SHARE")] = Field(
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.CLEAN
+
+    camera_clearance: Annotated[float, Spelling(metavar="SHARE")] = Field(
         0.25,
         ge=0.0,
         lt=1.0,
@@ -97,7 +100,7 @@ def run(
     if request.output is not None:
         check_changed("clean", request, request.output)
     gaussians = open_scene(source, progress)
-    share = request.near_share
+    share = request.camera_clearance
     zones = run_near_zones(source, share) if share > 0 and is_run(source) else None
     keep, report = clean(gaussians, request, zones)
     told = (

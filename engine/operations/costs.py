@@ -43,7 +43,7 @@ _SAVED_IN_ONE_ORDER = 0.6
 """Share of a ray's time that is saved where the rays of a window composite in one order
 (``docs/experiments.md``, "One order")."""
 _SINGLE_RAY_CPU_SECONDS = 10.8e-6
-"""For a ray that comes alone, as the preset paper has them."""
+"""For a ray that comes alone, as the preset redisplats has them."""
 _PAPER_GAUSSIANS = 60_000
 """What clone and split comes to, whatever its cap."""
 _START_BYTES = 300 << 20
@@ -104,7 +104,7 @@ def estimate_reconstruction(
     trained_on = training_pixels(options, photographs)
     iterations = iteration_count(train, trained_on)
     gaussians = _gaussians(train, trained_on)
-    training_cpu_seconds = iterations * train.rays * _ray_cpu_seconds(train, gaussians)
+    training_cpu_seconds = iterations * train.rays_per_batch * _ray_cpu_seconds(train, gaussians)
     if options.minutes is not None:
         training_cpu_seconds = 60 * options.minutes * max(1, cores) ** _CORE_POWER
     materials = train.materials.learn
@@ -113,11 +113,13 @@ def estimate_reconstruction(
     cpu_seconds = (
         _START_CPU_SECONDS
         + _LOAD_CPU_SECONDS_PER_PIXEL * full_pixels
-        + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.lift_pixels
+        + _LIFT_CPU_SECONDS_PER_POINT * min(train.initial_points, gaussians) * train.plane_sweep_init
         + each_pixel * pixels * held_out
         + training_cpu_seconds
     )
-    training = _gaussian_bytes(train.sh_degree) * gaussians + _RAY_BYTES * max(train.rays, train.probe_rays)
+    training = _gaussian_bytes(train.sh_degree) * gaussians + _RAY_BYTES * max(
+        train.rays_per_batch, train.probe_rays
+    )
     if materials:
         training = max(training + _MATERIAL_TRAIN_BYTES, _MATERIAL_START_BYTES)
     memory = _START_BYTES + max(training, _PIXEL_BYTES * largest)
@@ -210,17 +212,17 @@ def _held_out(options: ReconstructionConfig, count: int) -> int:
 
 def _gaussians(train: TrainConfig, trained_on: int) -> int:
     most = most_gaussians(train, trained_on)
-    return min(most, _PAPER_GAUSSIANS) if train.densify.kind == "paper" else most
+    return min(most, _PAPER_GAUSSIANS) if train.densify.kind == "redisplats" else most
 
 
 def _ray_cpu_seconds(train: TrainConfig, gaussians: int) -> float:
-    if train.window_rays == 1:
+    if train.ray_patch_rays == 1:
         return _SINGLE_RAY_CPU_SECONDS
     if train.materials.learn:
         return float(_MATERIAL_RAY_CPU_SECONDS * (gaussians / _MATERIAL_GAUSSIANS) ** _FAR_RAY_POWER)
     near, far = min(gaussians, _FITTED_GAUSSIANS) / 1e5, max(gaussians / _FITTED_GAUSSIANS, 1.0)
     seconds = max(_RAY_CPU_SECONDS * near**_RAY_POWER * far**_FAR_RAY_POWER, _LEAST_RAY_CPU_SECONDS)
-    saved = _SAVED_IN_ONE_ORDER * train.one_order if in_one_order(train) else 0.0
+    saved = _SAVED_IN_ONE_ORDER * train.shared_sort_until if in_one_order(train) else 0.0
     return float(seconds * (1 - saved))
 
 

@@ -3,10 +3,11 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Positional, Spelling
 from octasplat.engine.operations.base import Operation, Options, Request, Result, never
@@ -31,6 +32,8 @@ def _read_scales(value: object) -> object:
 class EvaluateOptions(Options):
     """Which views of a finished reconstruction are measured, and how."""
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.EVALUATE
+
     all_views: bool = Field(
         False,
         description="Measure all photographs, not only those that were held out, into on/<name of their "
@@ -47,7 +50,7 @@ class EvaluateOptions(Options):
         description="Measure smaller sizes instead, such as 2,4,8: renders at 1/2, 1/4 and 1/8 of the size "
         "against photographs made as small, with 1, 4 and 16 rays per pixel; into scales.json.",
     )
-    background: Literal["black", "white"] | None = Field(
+    evaluation_background: Literal["black", "white"] | None = Field(
         None,
         exclude_if=lambda background: background is None,
         description="Colour behind the scene and behind what masks leave out.  [default: the run's]",
@@ -68,7 +71,7 @@ class EvaluateRequest(EvaluateOptions, Request):
         None,
         description="Where the run's photographs are now, if they were moved or the run was downloaded.",
     )
-    on: Annotated[Path | None, Spelling(metavar="FOLDER")] = Field(
+    other_dataset: Annotated[Path | None, Spelling(metavar="FOLDER")] = Field(
         None,
         description="Measure all photographs of another folder instead (images/ and sparse/0 in the same "
         "world as the run's); the results go to OUT/on/<its name>.",
@@ -76,10 +79,10 @@ class EvaluateRequest(EvaluateOptions, Request):
 
     @model_validator(mode="after")
     def _one_folder(self) -> "EvaluateRequest":
-        if self.on is not None and self.dataset is not None:
-            raise ValueError("choose one of dataset (the run's own photographs) and on (others)")
-        if self.on is not None and self.scales:
-            raise ValueError("scales are measured on the run's own photographs; leave out on")
+        if self.other_dataset is not None and self.dataset is not None:
+            raise ValueError("choose one of dataset (the run's own photographs) and other_dataset")
+        if self.other_dataset is not None and self.scales:
+            raise ValueError("scales are measured on the run's own photographs; leave out other_dataset")
         return self
 
 
@@ -155,14 +158,14 @@ def run(
     listener = stopping(progress, should_stop, "Stopped while evaluating.")
     if request.scales:
         return _measure_scales(request, listener, threads)
-    on, dataset = request.on, request.dataset
+    on, dataset = request.other_dataset, request.dataset
     if request.all_views and on is None:
         on, dataset = photographs_folder(request.source, dataset), None
     metrics = runs.evaluate(
         request.source,
         scene=dataset,
         on=on,
-        background=request.background,
+        background=request.evaluation_background,
         threads=threads,
         listener=listener,
     )
@@ -185,7 +188,7 @@ def _measure_scales(request: EvaluateRequest, listener: Listener, threads: int) 
         request.source,
         request.scales,
         scene=request.dataset,
-        background=request.background,
+        background=request.evaluation_background,
         threads=threads,
         listener=listener,
     )

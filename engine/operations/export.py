@@ -4,10 +4,11 @@ import math
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.errors import Cancelled, ExportFailed, SceneFileError
 from octasplat.engine.events import Listener, StageProgress, Warned, ignore
 from octasplat.engine.export_names import ExportName
@@ -47,12 +48,14 @@ def _with_direction(colour: _Colour | None) -> _Colour | None:
 class _Exporting(ExportChoices, Options):
     """What the options of a job and those of the command have in common."""
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.EXPORT
+
     q: OctagonQ | None = Field(
         None,
         description="Meshes: squared radius of the octagons in standard deviations.  [default: that of the "
         "run, of a file 9.21]",
     )
-    colour: Annotated[
+    color: Annotated[
         _Colour | None,
         BeforeValidator(read_direction, json_schema_input_type=_Colour | str | None),
         AfterValidator(_with_direction),
@@ -178,7 +181,7 @@ def run(
         "export", request.files, [request.source], overwrite=request.overwrite, format=request.format
     )
     found = [exporter_for(path, request.format) for path in request.files]
-    if request.colour is not None and all(exporter.holds_harmonics for exporter in found):
+    if request.color is not None and all(exporter.holds_harmonics for exporter in found):
         told = "colour goes with formats of one colour for each Gaussian and is passed over."
         progress(Warned(told))
     count = len(request.files)
@@ -271,7 +274,7 @@ class _Forms:
         from octasplat.engine.run_folder import is_run
 
         gaussians, source = self._gaussians, self._request.source
-        colour = self._request.colour or ("cameras" if is_run(source) else "constant")
+        colour = self._request.color or ("cameras" if is_run(source) else "constant")
         if colour == "constant" or gaussians.sh_degree == 0:
             return gaussians
         if colour == "cameras":

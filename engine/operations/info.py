@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field, InstanceOf
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.evaluate.scene_facts import OPACITY_EDGES, QUANTILES, HitFacts, SceneFacts
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Source, Spelling
@@ -30,6 +31,8 @@ class InfoRequest(InfoOptions, WritingRequest):
     Counts, bounds, the direction that is up, harmonics, opacities, sizes, memory, and how many Gaussians a
     ray meets. On a terminal it shows a small picture.
     """
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DATASET
 
     source: Source = Field(description="The scene to look at: the folder of a run, or a file of any format.")
     dataset: DatasetFolder = Field(

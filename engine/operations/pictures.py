@@ -1,10 +1,11 @@
 """Options that all renders have in common: which cameras, and what kind of pictures."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.fields import ADVANCED, DatasetFolder, Output, Source, Spelling, Unit
 from octasplat.engine.operations.axes import Axis
@@ -206,6 +207,8 @@ class PictureRequest(PictureOptions, WritingRequest):
     are given: else the views of a run, or a turntable of a file.
     """
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DATASET
+
     source: Source = Field(description="The scene to render: the folder of a run, or a file of any format.")
     output: Output = Field(
         description="A folder, a pattern such as frames/%04d.png (or .exr), or a video such as turn.mp4."
@@ -231,7 +234,8 @@ class PictureRequest(PictureOptions, WritingRequest):
     def _complete(cls, values: Any) -> Any:
         if not isinstance(values, dict) or "output" not in values or "source" not in values:
             return values
-        given = {name: value for name, value in values.items() if value is not None}
+        given = renamed_settings.with_new_names((cls,), values)
+        given = {name: value for name, value in given.items() if value is not None}
         if "path_file" in given and "camera_path" not in given:
             given["camera_path"] = read_path_document(Path(given["path_file"]))
         if "mode" not in given:

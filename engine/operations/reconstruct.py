@@ -3,10 +3,11 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, ValidationError
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import ADVANCED, BASIC, PartOf, Positional, Shortcut, Spelling
 from octasplat.engine.nested_options import merged
@@ -24,6 +25,8 @@ _CONFIG, _METRICS, _REPORT, _SCENE = "config.json", "metrics.json", "report.html
 class ReconstructOptions(RunSettings, Options):
     """How photographs become a scene: a preset, and what is to be otherwise."""
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.RECONSTRUCT
+
     materials: Annotated[bool, BASIC] = Field(
         False,
         description="Learn materials and the environment of shiny things; environment.hdr lies beside the "
@@ -36,7 +39,7 @@ class ReconstructOptions(RunSettings, Options):
     iterations: Annotated[int | None, Shortcut("iterations"), Spelling(metavar="N")] = Field(
         None, description="Iterations of the training; 0 asks the photographs' pixels."
     )
-    rays: Annotated[int | None, Shortcut("rays"), Spelling(metavar="N")] = Field(
+    rays_per_batch: Annotated[int | None, Shortcut("rays_per_batch"), Spelling(metavar="N")] = Field(
         None, description="Rays of one iteration."
     )
     max_gaussians: Annotated[int | None, Shortcut("max_gaussians"), Spelling(metavar="N")] = Field(
@@ -56,7 +59,7 @@ class ReconstructOptions(RunSettings, Options):
     )
     assignments: Annotated[tuple[str, ...], Spelling(("--set",), metavar="NAME=VALUE"), ADVANCED] = Field(
         (),
-        description="Any other setting, e.g. rates.quat=0.02 or test_every=4, values as JSON; octasplat "
+        description="Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat "
         "config list shows them.",
     )
 

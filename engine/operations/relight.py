@@ -3,10 +3,11 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.events import Listener, Warned, ignore
 from octasplat.engine.fields import ADVANCED, InputFile, Spelling, Unit
 from octasplat.engine.operations.axes import Axis, light_up
@@ -29,12 +30,14 @@ Angle = Annotated[float, Field(allow_inf_nan=False)]
 class RelightOptions(PictureOptions):
     """A scene with materials in other light, as images or a video."""
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.RELIGHT
+
     environments: Annotated[tuple[InputFile, ...], Spelling(("--environment",), metavar="MAP")] = Field(
         min_length=1,
         max_length=20,
         description="Equirectangular HDR or EXR image of the light; several are done one after another.",
     )
-    by: Literal["split-sum", "path"] = Field(
+    integrator: Literal["split-sum", "path"] = Field(
         "split-sum",
         description="Method: split-sum is fast, as in training, with traced visibility; path is right, by "
         "paths of light.",
@@ -45,7 +48,7 @@ class RelightOptions(PictureOptions):
         le=65536,
         description=f"Rays or paths per pixel.  [default: {SPLIT_SUM_RAYS} rays of split-sum, {PATHS} paths]",
     )
-    depth: Annotated[int, Unit("surfaces")] = Field(
+    max_bounces: Annotated[int, Unit("surfaces")] = Field(
         6, ge=1, le=64, description="Most surfaces that a path of light meets."
     )
     rotation_degrees: Annotated[Angle, Unit("degrees"), Spelling(("--rotate",), metavar="DEG")] = Field(
@@ -72,7 +75,7 @@ class RelightOptions(PictureOptions):
     @property
     def samples_per_pixel(self) -> int:
         """Rays or paths per pixel under one environment."""
-        return self.samples or (PATHS if self.by == "path" else SPLIT_SUM_RAYS)
+        return self.samples or (PATHS if self.integrator == "path" else SPLIT_SUM_RAYS)
 
     @property
     def is_single(self) -> bool:
@@ -87,7 +90,7 @@ class RelightOptions(PictureOptions):
     def unused(self) -> tuple[str, ...]:
         """Return a sentence for what was given and says nothing about such images."""
         told = super().unused()
-        if self.by == "split-sum" and self.rays_across**2 != self.samples_per_pixel:
+        if self.integrator == "split-sum" and self.rays_across**2 != self.samples_per_pixel:
             told += (
                 f"Of {self.samples_per_pixel} samples split-sum takes {self.rays_across**2}, as many across "
                 "a pixel as down.",
@@ -102,14 +105,14 @@ class RelightRequest(RelightOptions, PictureRequest):
     has a folder of its name, or its turn in one video.
     """
 
-    on: Annotated[Path | None, Spelling(metavar="FOLDER")] = Field(
+    other_dataset: Annotated[Path | None, Spelling(metavar="FOLDER")] = Field(
         None,
         description="Render the views of the photographs of another folder (images/ and sparse/0).",
     )
 
     @classmethod
     def _mode_of(cls, given: dict[str, Any]) -> str:
-        if "on" not in given:
+        if "other_dataset" not in given:
             return super()._mode_of(given)
         if any(name in given for name in ("views", "photographs", "camera_path", "camera")):
             raise ValueError("choose one of views, another folder, a turntable, a camera path and a camera")
@@ -117,13 +120,13 @@ class RelightRequest(RelightOptions, PictureRequest):
 
     @model_validator(mode="after")
     def _on_fits(self) -> "RelightRequest":
-        if self.on is not None and self.mode != "views":
-            raise ValueError("`on` gives views; leave out other cameras")
+        if self.other_dataset is not None and self.mode != "views":
+            raise ValueError("`other_dataset` gives views; leave out other cameras")
         return self
 
     @property
     def _has_views(self) -> bool:
-        return self.on is not None or super()._has_views
+        return self.other_dataset is not None or super()._has_views
 
 
 class RelightResult(RenderResult):
@@ -167,19 +170,35 @@ def run(
     require_materials(source.gaussians, request.source / SCENE if of_run else request.source)
     learnt = read_config(request.source / CONFIG).train.materials if of_run else None
     up = light_up(request.source, request.up)
-    cameras = None if request.on is not None else requested_cameras(request, source)
+    cameras = None if request.other_dataset is not None else requested_cameras(request, source)
     views, shots = _views(request, source) if cameras is None else (None, camera_shots(cameras))
     lightings = lit_shots(list(environments), shots, request.rotation_degrees, spin=request.spin)
-    output = picture_output("relight", request, tuple(lightings), [request.on, *request.environments])
+    output = picture_output(
+        "relight", request, tuple(lightings), [request.other_dataset, *request.environments]
+    )
     background = request.background or source.background
     kept = output.kept_images(
         identity_of(
-            "relight", source.gaussians, source.settings, list(environments), list(environments.values()), up,
-            cameras, views, source.near_world, len(shots), request.by,
-            request.samples_per_pixel, request.depth, request.rotation_degrees, request.spin, background,
-            request.format, *output.numbered(shots),
+            "relight",
+            source.gaussians,
+            source.settings,
+            list(environments),
+            list(environments.values()),
+            up,
+            cameras,
+            views,
+            source.near_world,
+            len(shots),
+            request.integrator,
+            request.samples_per_pixel,
+            request.max_bounces,
+            request.rotation_degrees,
+            request.spin,
+            background,
+            request.format,
+            *output.numbered(shots),
         )
-    )  # fmt: skip
+    )
     relighter = _relighter(request, source, learnt, threads)
     paint = RelitPaint(relighter, environments, up, background, lightings)
     files = output.write(tuple(lightings), paint, kept, tell)
@@ -194,12 +213,12 @@ def _views(request: RelightRequest, source: "RenderSource") -> "tuple[Viewpoints
     from octasplat.engine.render.jobs import view_shots
     from octasplat.engine.scene import Viewpoints, load_scene
 
-    if request.on is None:
+    if request.other_dataset is None:
         shots = requested_views(request, source)
         assert source.viewpoints is not None, "views were asked for"
         return Viewpoints(source.viewpoints.views, source.viewpoints.cameras), shots
     max_side = request.max_side or source.max_side
-    others = load_scene(request.on, max_side=max_side, least_views=1, for_training=False)
+    others = load_scene(request.other_dataset, max_side=max_side, least_views=1, for_training=False)
     shots = view_shots(others, np.arange(len(others.views)), source.near_world)
     return Viewpoints(others.views, others.cameras), shots
 
@@ -211,13 +230,13 @@ def _relighter(
     from octasplat.engine.light.split_sum_relighting import SplitSumRelighter
     from octasplat.engine.light.stage import Integrator
 
-    if request.by == "split-sum":
+    if request.integrator == "split-sum":
         return SplitSumRelighter(
             source.gaussians, source.settings, learnt, extent_world=source.extent_world,
             side=request.rays_across, threads=threads,
         )  # fmt: skip
     integrator = Integrator(
-        samples=request.samples_per_pixel, max_depth=request.depth, roulette_depth=request.depth
+        samples=request.samples_per_pixel, max_depth=request.max_bounces, roulette_depth=request.max_bounces
     )
     return PathRelighter(source.gaussians, source.settings, integrator, threads=threads)
 

@@ -103,7 +103,7 @@ def read_render_source(
                 "folder out, or name the cameras in another way."
             )
         gaussians, facts = open_scene(source, progress), read_facts(source)
-        settings = TraceSettings(turned_beyond=facts.turned_beyond)
+        settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
         return RenderSource(gaussians, settings, facts.near_world, trained_rad=facts.pixel_rad)
     config = read_config(source / CONFIG)
     if not (source / SCENE).exists():
@@ -117,7 +117,7 @@ def read_render_source(
         read_gaussian_ply(source / SCENE)[0],
         config.train.trace,
         run_near_world(source, viewpoints),
-        config.evaluate_background,
+        config.evaluation_background,
         viewpoints,
         config.max_side,
         read_facts(source).pixel_rad,

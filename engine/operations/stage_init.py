@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import ClassVar
 
 from pydantic import Field
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.errors import OutputError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Output, Source
@@ -27,6 +29,8 @@ class StageInitRequest(StageInitOptions, WritingRequest):
     It knows what is up, has a glass ball on what seems to be the floor, and a light from where the scene's
     own seems to come. What else there is stands in it as comments.
     """
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DATASET
 
     source: Source = Field(description="The scene: the folder of a run, or a file of any format.")
     output: Output = Field(description="The TOML file to write.")

@@ -4,7 +4,7 @@ import re
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import (
     BeforeValidator,
@@ -15,6 +15,7 @@ from pydantic import (
     model_validator,
 )
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.errors import OutputError
 from octasplat.engine.events import Listener, ignore
 from octasplat.engine.fields import DatasetFolder, Output, Source, Spelling
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from octasplat.engine.surface.extract import ExtractedSurface
     from octasplat.engine.surface.fitting import Picture
 
-MATERIAL_DEFAULTS: Mapping[str, object] = {"texture_side": 1024, "max_triangles": 60_000}
+MATERIAL_DEFAULTS: Mapping[str, object] = {"texture_size": 1024, "max_triangles": 60_000}
 """With materials, where nothing else is said."""
 
 ROOM: Mapping[str, object] = {
@@ -37,7 +38,7 @@ ROOM: Mapping[str, object] = {
     "truncation": 3.0,
     "min_weight": 0.3,
     "depth_side": 320,
-    "settle": True,
+    "refine_vertices": True,
 }
 """What suits pictures of a room, measured on one; see docs/surface.md."""
 
@@ -77,6 +78,8 @@ def _is_on(value: object) -> bool:
 class SurfaceOptions(ExtractionOptions, Options):
     """How the surface of a scene is meshed and coloured."""
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.EXTRACTION
+
     room: bool = Field(
         False,
         description="What pictures of a room need, where nothing else is said: unbounded, unseen solid, "
@@ -106,6 +109,7 @@ class SurfaceOptions(ExtractionOptions, Options):
     def _with_presets(cls, given: Any) -> Any:
         if not isinstance(given, Mapping):
             return given
+        given = renamed_settings.with_new_names((cls,), given)
         room = ROOM if _is_on(given.get("room", False)) else {}
         materials = MATERIAL_DEFAULTS if _is_on(given.get("materials", False)) else {}
         return {**room, **materials, **given}
@@ -233,7 +237,7 @@ def run(
     from octasplat.engine.trace.make import make_tracer
 
     source, output = request.source, request.output
-    is_textured = request.texture_side is not None
+    is_textured = request.texture_size is not None
     check_surface_path(output, textured=is_textured, lit=request.materials)
     check_targets(
         "surface",

@@ -55,7 +55,7 @@ def camera_views(
         near_world = run_near_world(source, seen)
         return photograph_cameras(seen, seen.train_indices, side_px, near_world), settings
     facts = read_facts(source)
-    settings = TraceSettings(turned_beyond=facts.turned_beyond)
+    settings = TraceSettings(flip_normal_cos=facts.turned_beyond)
     if dataset is not None:
         photographs = load_scene(dataset)
         every = np.arange(len(photographs.views))

@@ -66,7 +66,7 @@ class Train:
             facts = SceneFacts(
                 near_world=dataset.near_world,
                 pixel_rad=trained_pixel_rad(dataset.viewpoints),
-                turned_beyond=config.train.trace.turned_beyond,
+                turned_beyond=config.train.trace.flip_normal_cos,
             )
             write_gaussian_ply(gaussians, run.output / SCENE, facts=facts)
 
@@ -78,7 +78,7 @@ def _train(run: Run, clock: StageClock) -> FlatGaussians:
     gaussians = trainer.run()
     _write_surroundings(trainer.shading, gaussians, run.output, run.progress)
     _write_record(
-        trainer, run.dataset, nearest_world, clock, run.output, keeps_near_free=config.near_share > 0
+        trainer, run.dataset, nearest_world, clock, run.output, keeps_near_free=config.camera_clearance > 0
     )
     return gaussians
 
@@ -98,7 +98,7 @@ def _trainer(
         state.seconds = clock.seconds()
     else:
         clock.add(state.seconds)
-    zones = NearZones.of(dataset.viewpoints, config.near_share * nearest_world, dataset.train_indices)
+    zones = NearZones.of(dataset.viewpoints, config.camera_clearance * nearest_world, dataset.train_indices)
     seen = SeenSpace.of(dataset.viewpoints, dataset.train_indices)
     trainer: Trainer = Trainer(
         dataset,
@@ -110,7 +110,7 @@ def _trainer(
         threads=run.threads,
         should_stop=run.should_stop,
         scale_floor=_scale_floor(dataset, config),
-        near_zones=zones if config.near_share > 0 else None,
+        near_zones=zones if config.camera_clearance > 0 else None,
         seen_space=seen if config.materials.clears_unseen else None,
         onlooker=None
         if (on_step := run.on_step) is None

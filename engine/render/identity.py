@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from octasplat.engine import __version__
+from octasplat.engine.settings import Settings, json_by_former_names
 
 
 def identity_of(*parts: Any) -> str:
@@ -30,6 +31,8 @@ def _add(digest: "hashlib._Hash", value: Any) -> None:
     if isinstance(value, np.ndarray):
         digest.update(f"{value.dtype.str}{value.shape}".encode())
         digest.update(value.tobytes())
+    elif isinstance(value, Settings):
+        _add(digest, json_by_former_names(value))
     elif isinstance(value, BaseModel):
         _add(digest, value.model_dump_json())
     elif isinstance(value, Path):

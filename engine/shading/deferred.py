@@ -68,13 +68,13 @@ class Deferred:
         self._sided = sided
         self.light = LearntLight(
             settings.environment_height,
-            hdr=settings.hdr and settings.recipe != "seed",
+            hdr=settings.hdr and settings.recipe != "ref_gaussian",
             white_weight=settings.white_weight,
-            even_weight=settings.even_weight,
+            even_weight=settings.environment_smoothness_weight,
         )
         self.frame = environment_frame(np.array(settings.up_world, np.float64))
-        self._gap = settings.start * extent_world
-        self._leaving = Leaving(self._gap, settings.leaves * extent_world)
+        self._gap = settings.ray_bias * extent_world
+        self._leaving = Leaving(self._gap, settings.backface_cull_distance * extent_world)
         self._leaving_far = self._leaving._replace(gap_world=2 * self._gap)
         self._started_over = np.zeros(1, bool)
         self._turn = np.array([-1.0, -1.0])
@@ -89,9 +89,13 @@ class Deferred:
     def settle(self, gaussians: FlatGaussians, tracer: Tracer, *, progress: float) -> None:
         """Measure what reaches some of the Gaussians from all around, by turns."""
         settings = self.settings
-        if not settings.ambient or progress < settings.secondary_from or AMBIENT not in gaussians.channels:
+        if (
+            not settings.ambient_occlusion
+            or progress < settings.secondary_from
+            or AMBIENT not in gaussians.channels
+        ):
             return
-        parts = settings.ambient_parts
+        parts = settings.ambient_occlusion_rebuilds
         if progress != self._turn[1]:  # a training that goes on settles once more where it stopped
             self._turn = np.array([self._turn[0] + 1, progress])
         ids = np.arange(int(self._turn[0]) % parts, len(gaussians), parts)
@@ -101,7 +105,7 @@ class Deferred:
         self, gaussians: FlatGaussians, ids: Int64[np.ndarray, " u"], tracer: Tracer
     ) -> Float32[np.ndarray, " u"]:
         """Measure the ambient visibility of Gaussians; returns their open sides for :meth:`bounce`."""
-        rays = self.settings.ambient_rays
+        rays = self.settings.ambient_occlusion_rays
         visible, side = ambient_visibility(
             gaussians, ids, tracer, rays=rays, leaving=self._leaving_far, sided=self._sided
         )
@@ -123,7 +127,7 @@ class Deferred:
         bounced = np.zeros((len(ids), 3), np.float32)
         bounced[dim] = bounced_light(
             gaussians, ids[dim], side[dim], lambda fan: self._radiance(fan, tracer),
-            rays=self.settings.ambient_rays, leaving=self._leaving_far,
+            rays=self.settings.ambient_occlusion_rays, leaving=self._leaving_far,
         )  # fmt: skip
         gaussians.channels[BOUNCED][ids] = bounced
         self._features[ids, BOUNCED_COLUMNS] = bounced
@@ -159,7 +163,7 @@ class Deferred:
             surface = replace(surface, visibility=visibility, indirect_linear=indirect)
         linear = shade(surface, self.light.levels, self.frame)
         rgb = parted.seen.rgb_srgb * np.float32(1 - share)
-        if self.settings.recipe == "seed":
+        if self.settings.recipe == "ref_gaussian":
             shown = linear
             if self.settings.is_seed_deferred(sight.progress):
                 matt = 1 - surface.material[:, 3:4]
@@ -173,9 +177,9 @@ class Deferred:
 
     def _part(self, sight: Sight) -> Parted:
         """The surfaces that are shaded each by itself."""
-        if self.settings.parted == 0 or self.settings.recipe == "seed":
+        if self.settings.depth_split == 0 or self.settings.recipe == "ref_gaussian":
             return whole(sight.rays, sight.seen)
-        apart, record = self.settings.parted * self._gap, sight.view is not None
+        apart, record = self.settings.depth_split * self._gap, sight.view is not None
         return part(sight.rays, sight.seen, sight.tracer, apart_world=apart, record=record)
 
     def reverse(
@@ -206,7 +210,7 @@ class Deferred:
         by_shown = by_rgb[which] * kept.shaded
         by_alpha[which] += (by_shown * kept.shown).sum(axis=1)
         by_linear = by_shown * buffer.alpha[:, None]
-        if settings.recipe != "seed":
+        if settings.recipe != "ref_gaussian":
             by_linear *= encoding_slope(kept.linear)
             by_linear[(kept.linear >= 1) & (by_linear < 0)] = 0.0  # no photograph is whiter than white
         blur = settings.blurred(sight.progress)
@@ -215,7 +219,7 @@ class Deferred:
         incoming = kept.incoming
         if settings.reflected_gradient:
             led = back.reflected + (0.0 if incoming is None else incoming.led(back))
-            normal = normal + clipped(led, settings.normal_clip)
+            normal = normal + clipped(led, settings.normal_gradient_clip)
         if incoming is not None:
             incoming.add_widening(back)
         by_material = back.material
@@ -249,7 +253,7 @@ class Deferred:
         """A step of the environment; what the optimiser made of the materials is taken over."""
         ids = gradients.ids
         if (
-            self.settings.recipe == "seed"
+            self.settings.recipe == "ref_gaussian"
             and not self._started_over[0]
             and self.settings.is_seed_deferred(progress)
         ):
@@ -287,9 +291,9 @@ class Deferred:
     def _dimmed(self, seen: TraceResult, buffer: Buffer) -> Surface:
         """The surface of a buffer with what reaches it from all around, to which no gradient goes."""
         surface = buffer.surface
-        if self.settings.recipe == "seed":  # the seed's matt part is a colour of its own
+        if self.settings.recipe == "ref_gaussian":  # the seed's matt part is a colour of its own
             return replace(surface, ambient=np.zeros(len(buffer.which)))
-        if not self.settings.ambient or seen.features.shape[1] <= AMBIENT_COLUMN:
+        if not self.settings.ambient_occlusion or seen.features.shape[1] <= AMBIENT_COLUMN:
             return surface
         around = seen.features[buffer.which].astype(np.float64) / buffer.alpha[:, None]
         surface = replace(surface, ambient=around[:, AMBIENT_COLUMN])
@@ -306,7 +310,7 @@ class Deferred:
         linear: Float64[np.ndarray, "p 3"],
     ) -> dict[str, Float32[np.ndarray, "r _"]]:
         """What is behind a finished picture: radiance, materials, and what reflected rays said."""
-        if self.settings.recipe == "seed":
+        if self.settings.recipe == "ref_gaussian":
             linear = srgb_to_linear(rgb_srgb[buffer.which] / buffer.alpha[:, None])
         parts = {
             "linear": linear,
@@ -329,10 +333,10 @@ class Deferred:
     def _ask(self, sight: Sight, parted: Parted, buffer: Buffer) -> Incoming:
         """Ask what comes in along reflected directions, in the way of the settings."""
         settings = self.settings
-        if settings.indirect != "shaded" or settings.recipe == "seed":
+        if settings.indirect != "shaded" or settings.recipe == "ref_gaussian":
             return ByOneRay.ask(sight, parted, buffer, self._leaving, settings)
         follower = Follower(
             sight.tracer, self.light.levels, self.frame, self._dimmed,
-            settings.reflections, self._leaving, settings.parted * self._gap,
+            settings.max_bounces, self._leaving, settings.depth_split * self._gap,
         )  # fmt: skip
         return ByLobes.ask(sight, parted, buffer, follower, settings)

@@ -87,8 +87,8 @@ class ByLobes:
             numbers = parted.each(sight.dither.T)[buffer.which].T
         lobe = look(rays, buffer, follower, numbers, least_slope=least, record=record)
         widened = None
-        if record and settings.widened > 0:
-            drawn = numbers_of(ways, salt + 1)[0] < settings.widened
+        if record and settings.roughness_probe_fraction > 0:
+            drawn = numbers_of(ways, salt + 1)[0] < settings.roughness_probe_fraction
             widened = widening(rays, buffer, follower, lobe, drawn, least_slope=least)
         return cls(lobe, widened, buffer.surface.material[:, 4], follower, settings)
 
@@ -107,7 +107,7 @@ class ByLobes:
             return
         at = found.points
         slope = roughness_slope(found, self.roughness[at], back.around[at], back.specular[at])
-        back.material[at, 4] += slope / self.settings.widened
+        back.material[at, 4] += slope / self.settings.roughness_probe_fraction
 
     def back(self, back: ShadeGradients, by_texels: Float64[np.ndarray, "t 3"]) -> Traced:
         """To all that was met on the way."""
@@ -135,7 +135,7 @@ class ByOneRay:
     ) -> "ByOneRay":
         """Ask for the points of a buffer."""
         rays = reflected_rays(parted.rays, buffer, leaving)
-        if settings.recipe == "seed":
+        if settings.recipe == "ref_gaussian":
             met = sight.tracer.trace(rays.up_to(SEED_REACH), record=sight.view is not None)
             visibility = (met.transmittance > HIDDEN).astype(np.float64)
             if settings.indirect == "none":

@@ -4,6 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.settings import FormerSetting, Settings
 
@@ -25,11 +26,13 @@ PROPAGATION_UNTIL = 0.4
 """Share of the training at which that ends."""
 FIRST_ALBEDO, FIRST_METALLIC, FIRST_ROUGHNESS = 0.5, 0.5, 0.3
 """Materials that all Gaussians begin with: in the middle, and smooth enough to show what they reflect."""
-Recipe = Literal["split_sum", "seed"]
+Recipe = Literal["split_sum", "ref_gaussian"]
 
 
 class MaterialSettings(Settings):
     """How materials and an environment are learnt; shares of the training are of all its iterations."""
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.MATERIALS
 
     learn: Annotated[bool, ADVANCED] = Field(
         False,
@@ -38,8 +41,8 @@ class MaterialSettings(Settings):
     )
     recipe: Annotated[Recipe, EXPERIMENTAL] = Field(
         "split_sum",
-        description='split_sum is the way of octasplat; seed does what the code of "Reflective Gaussian '
-        'Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a colour of its '
+        description='split_sum is the way of octasplat; ref_gaussian does what the code of "Reflective '
+        'Gaussian Splatting" (https://arxiv.org/abs/2412.19282) does: the matt part is a colour of its '
         "own from the harmonics, the environment stays in [0, 1], everything is in display "
         "values, visibility is yes or no, and materials start over when deferred shading "
         "begins.",
@@ -65,26 +68,26 @@ class MaterialSettings(Settings):
         description="Let what stands in the way of a reflection hide the environment there. Turning it off "
         "is faster, for single convex objects.",
     )
-    parted: Annotated[float, Unit("ray starts"), ADVANCED] = Field(
+    depth_split: Annotated[float, Unit("ray starts"), ADVANCED] = Field(
         2.0,
         ge=0,
         description="Rays whose mean depth is farther from the median than so many times the distance at "
         "which reflected rays begin show two surfaces, which are shaded each by itself; 0 "
         "shades their mean.",
     )
-    reflections: Annotated[int, Unit("surfaces"), ADVANCED] = Field(
+    max_bounces: Annotated[int, Unit("surfaces"), ADVANCED] = Field(
         3,
         ge=1,
         le=8,
         description="Surfaces on the path of a reflected ray. Raise it for mirrors that face each other.",
     )
-    facet_slope: Annotated[tuple[float, float], Unit("tangent"), ADVANCED] = Field(
+    reflection_ray_slope: Annotated[tuple[float, float], Unit("tangent"), ADVANCED] = Field(
         (0.1, 0.01),
         description="Tangent of the least angle between a normal and the two facets beside it at which rays "
         "are reflected, at the beginning and from blur_until on; the rougher the surface, the "
         "larger.",
     )
-    widened: Annotated[float, Unit("share of points"), EXPERIMENTAL] = Field(
+    roughness_probe_fraction: Annotated[float, Unit("share of points"), EXPERIMENTAL] = Field(
         0.0,
         ge=0,
         le=1,
@@ -97,23 +100,23 @@ class MaterialSettings(Settings):
         description="Light of what stands in the way of a reflection: shaded by the split sum, from the "
         "harmonics, or none. harmonics is faster and less right.",
     )
-    ambient: Annotated[bool, ADVANCED] = Field(
+    ambient_occlusion: Annotated[bool, ADVANCED] = Field(
         True, description="Dim the irradiance where other things hide the environment."
     )
-    bounced: Annotated[bool, ADVANCED] = Field(
+    diffuse_interreflection: Annotated[bool, ADVANCED] = Field(
         True, description="Light matt surfaces by what other surfaces send, too."
     )
-    ambient_rays: Annotated[int, Unit("rays"), ADVANCED] = Field(
+    ambient_occlusion_rays: Annotated[int, Unit("rays"), ADVANCED] = Field(
         16,
         ge=4,
         description="Rays from each side of a Gaussian that say how much of the environment is hidden. More "
         "are slower and less noisy.",
     )
-    ambient_parts: Annotated[int, Unit("rebuilds"), ADVANCED] = Field(
+    ambient_occlusion_rebuilds: Annotated[int, Unit("rebuilds"), ADVANCED] = Field(
         20,
         ge=1,
-        description="Rebuilds of the hierarchy in which all Gaussians have their turn of ambient_rays. "
-        "Fewer are slower and follow changes sooner.",
+        description="Rebuilds of the hierarchy in which all Gaussians have their turn of "
+        "ambient_occlusion_rays. Fewer are slower and follow changes sooner.",
     )
     hdr: Annotated[bool, ADVANCED] = Field(
         True, description="Let the environment be brighter than 1, as lamps and the sun are."
@@ -123,19 +126,19 @@ class MaterialSettings(Settings):
         description="Let normals learn through the reflected direction. Turning it off keeps normals to "
         "what depths say.",
     )
-    normal_clip: Annotated[float, Unit("medians"), ADVANCED] = Field(
+    normal_gradient_clip: Annotated[float, Unit("medians"), ADVANCED] = Field(
         2.0,
         ge=0,
         description="Gradients by normals through the reflected direction are cut off at so many times "
         "their median of a batch; 0 leaves them alone.",
     )
-    start: Annotated[float, Unit("extent"), ADVANCED] = Field(
+    ray_bias: Annotated[float, Unit("extent"), ADVANCED] = Field(
         0.004,
         gt=0,
         description="Distance from the surface at which reflected rays begin, of the extent. Raise it where "
         "surfaces shade themselves in spots.",
     )
-    leaves: Annotated[float, Unit("extent"), ADVANCED] = Field(
+    backface_cull_distance: Annotated[float, Unit("extent"), ADVANCED] = Field(
         0.0,
         ge=0,
         description="Distance up to which reflected rays pass what they would meet from behind, of the "
@@ -152,7 +155,8 @@ class MaterialSettings(Settings):
         0.3,
         ge=0,
         le=1,
-        description="Share of the training at which blur and facet_slope have reached their last values.",
+        description="Share of the training at which blur and reflection_ray_slope have reached "
+        "their last values.",
     )
     normal_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.1, ge=0, description="Weight of the spread of the normals along a ray in the loss."
@@ -187,7 +191,7 @@ class MaterialSettings(Settings):
         description="So many times more smooth_weight counts between metals, which are one colour more "
         "often and which have what is reflected wrongly painted on.",
     )
-    only_seen: Annotated[bool, ADVANCED] = Field(
+    prune_unseen: Annotated[bool, ADVANCED] = Field(
         True,
         description="Take away Gaussians that lie in no photograph; reflected rays alone see those, so that "
         "they would become lamps.",
@@ -198,7 +202,7 @@ class MaterialSettings(Settings):
         description="Weight of the logarithms of the colours of the environment, which keeps it grey where "
         "nothing else is known.",
     )
-    even_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
+    environment_smoothness_weight: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.03,
         ge=0,
         description="Weight of differences between the logarithms of neighbouring texels of the "
@@ -209,7 +213,7 @@ class MaterialSettings(Settings):
         ge=0,
         description="Weight of the harmonics' distance to what was shaded, once they are no longer seen.",
     )
-    propagation: Annotated[bool, EXPERIMENTAL] = Field(
+    normal_propagation: Annotated[bool, EXPERIMENTAL] = Field(
         False, description="Hand normals on to neighbours now and then, those of what reflects best first."
     )
 
@@ -217,7 +221,7 @@ class MaterialSettings(Settings):
         "secondary_share": FormerSetting(1),
         "environment_every": FormerSetting(ENVIRONMENT_EVERY, after="environment_height"),
         "hand_over": FormerSetting(list(HAND_OVER), after="environment_every"),
-        "propagation_every": FormerSetting(PROPAGATION_EVERY, after="propagation"),
+        "propagation_every": FormerSetting(PROPAGATION_EVERY, after="normal_propagation"),
         "propagation_until": FormerSetting(PROPAGATION_UNTIL, after="propagation_every"),
         "environment_rate": FormerSetting(ENVIRONMENT_RATE, after="propagation_until"),
         "first_albedo": FormerSetting(FIRST_ALBEDO, after="environment_rate"),
@@ -228,7 +232,7 @@ class MaterialSettings(Settings):
     @property
     def clears_unseen(self) -> bool:
         """Whether Gaussians that lie in no photograph are taken away; the seed lets them be."""
-        return self.learn and self.only_seen and self.recipe != "seed"
+        return self.learn and self.prune_unseen and self.recipe != "ref_gaussian"
 
     @property
     def smooth_weights(self) -> tuple[float, ...]:
@@ -237,7 +241,7 @@ class MaterialSettings(Settings):
 
     def is_seed_deferred(self, progress: float) -> bool:
         """Whether the seed's second stage has begun."""
-        return self.recipe == "seed" and progress >= SEED_SECOND_STAGE
+        return self.recipe == "ref_gaussian" and progress >= SEED_SECOND_STAGE
 
     def handed_over(self, progress: float) -> float:
         """Share of the picture that is shaded, not taken from the harmonics."""
@@ -252,6 +256,6 @@ class MaterialSettings(Settings):
 
     def least_slope(self, progress: float) -> float:
         """Tangent of the least angle between a normal and its facets."""
-        first, last = self.facet_slope
+        first, last = self.reflection_ray_slope
         share = min(progress / self.blur_until, 1.0) if self.blur_until > 0 else 1.0
         return first * (last / first) ** share

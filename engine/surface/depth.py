@@ -88,7 +88,7 @@ def _picture(
 
 
 def _distances(image: RenderedImage, options: ExtractionOptions) -> Float32[np.ndarray, "h w"]:
-    distances = image.depth_median if options.depth == "median" else image.depth
+    distances = image.depth_median if options.depth_mode == "median" else image.depth
     distances = np.where(image.alpha >= options.min_alpha, distances, UNKNOWN)
     distances[image.alpha < EMPTY_ALPHA] = EMPTY
     if options.depth_trunc is not None:

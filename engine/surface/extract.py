@@ -110,7 +110,7 @@ def extract_levels(
         max_rim = None if options.fill_holes == "all" else options.fill_holes * region.voxel_world
         mesh, closed = fill_holes(mesh, max_rim) if max_rim is None or max_rim > 0 else (mesh, 0)
         progress(3, 3)
-    if options.settle:  # while triangles are small enough to show what the pictures do
+    if options.refine_vertices:  # while triangles are small enough to show what the pictures do
         with counted_stage("settling", tell, 0) as progress:
             mesh = settled(mesh, photographs or renders, progress)
     meshes = _in_levels(mesh, options, levels, tell)
@@ -154,12 +154,12 @@ def _coloured(
         with counted_stage("fitting", tell, 0) as progress:
             return _spread(points, *fitted(palette, rgb, photographs or renders, progress))
 
-    if options.texture_side is None:
+    if options.texture_size is None:
         assert light_frame is None, "materials need a texture"
         rgb = colours(VertexPalette(mesh), mesh.vertices_world, mesh.vertex_normals())
         return replace(mesh, rgb_srgb=rgb)
     with counted_stage("unwrapping", tell, 0):
-        layout = lay_out(mesh, options.texture_side)
+        layout = lay_out(mesh, options.texture_size)
     points, normals = layout.points_world, layout.normals_world
     if light_frame is not None:
         return with_materials(layout, *look_at(points, normals, MATERIALS), light_frame)

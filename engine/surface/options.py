@@ -78,7 +78,7 @@ class ExtractionOptions(BaseModel):
     depth_trunc: Annotated[float | None, Unit("scene units")] = Field(
         None, gt=0, description="Ignore depths beyond this, in scene units.  [default: none]"
     )
-    depth: Literal["median", "expected"] = Field(
+    depth_mode: Literal["median", "expected"] = Field(
         "median",
         description="Which depth is fused: the median, where half of the light is gone, or the expected one.",
     )
@@ -102,7 +102,7 @@ class ExtractionOptions(BaseModel):
         False,
         description="A sphere around everything that shows what the scene shows in the gaps of the mesh.",
     )
-    settle: Annotated[bool, _SAID] = Field(
+    refine_vertices: Annotated[bool, _SAID] = Field(
         False, description="Move vertices along their normals to where the pictures agree, before colours."
     )
     keep_components: Annotated[int | None, Spelling(("--components",))] = Field(
@@ -123,7 +123,7 @@ class ExtractionOptions(BaseModel):
         True,
         description="Of all colours, take those with which the mesh looks as like the pictures as it can.",
     )
-    texture_side: Annotated[int | None, Unit("px"), Spelling(("--texture",), metavar="PX")] = Field(
+    texture_size: Annotated[int | None, Unit("px"), Spelling(metavar="PX")] = Field(
         None,
         ge=64,
         le=16384,

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 from pydantic import Field
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.gaussians.octagon import CHI2_2_99
@@ -16,6 +17,8 @@ from octasplat.engine.settings import FormerSetting, Settings
 
 class TraceSettings(Settings):
     """Which tracer, and how it cuts rays off. Where a ray begins is a matter of the ray."""
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.TRACE
 
     tracer: Annotated[Literal["cpu", "reference"], EXPERIMENTAL] = Field(
         "cpu",
@@ -57,7 +60,7 @@ class TraceSettings(Settings):
         description="Alpha is clamped to this, with zero gradient above it, so that 1/(1 - alpha) stays "
         "finite.",
     )
-    turned_beyond: Annotated[float, Unit("cosine"), ADVANCED] = Field(
+    flip_normal_cos: Annotated[float, Unit("cosine"), ADVANCED] = Field(
         0.0,
         ge=0,
         le=1,
@@ -66,7 +69,7 @@ class TraceSettings(Settings):
         "suits normals without a side. Where they point outwards, those just behind an outline "
         "had better stay: turned, they would cancel the ones just before it.",
     )
-    order: Annotated[Literal["ray", "packet"], ADVANCED] = Field(
+    sort: Annotated[Literal["ray", "packet"], ADVANCED] = Field(
         "ray",
         description="Order in which Gaussians are composited: that of each ray, or one for all rays of a "
         "packet, which is faster and a little wrong. A training decides it by one_order.",

@@ -112,7 +112,7 @@ def _of_hits(
 
     # --- what a hit brings for each unit of its weight ---
     cosine_to_mean = np.einsum("hi,hi->h", hits.to_mean, normals) / np.linalg.norm(hits.to_mean, axis=1)
-    facing = np.where(cosine_to_mean > settings.turned_beyond, -1.0, 1.0)
+    facing = np.where(cosine_to_mean > settings.flip_normal_cos, -1.0, 1.0)
     value = np.einsum("hc,hc->h", np.maximum(colour, 0), given.rgb[ray])
     value += hits.t * given.depth_sum[ray]
     value += facing * np.einsum("hi,hi->h", normals, given.normal[ray])

@@ -138,7 +138,7 @@ def trace_reference(
     inside = torch.maximum(au * cos + av * sin, au * sin + av * cos) <= inner_radius
     t32 = t.detach().float()
     leaves = torch.tensor(rays.t_leaves).expand(len(d))[:, None]
-    left_behind = (cosine > 0) & (t32 < leaves) & (settings.turned_beyond > 0)
+    left_behind = (cosine > 0) & (t32 < leaves) & (settings.flip_normal_cos > 0)
     hit = inside & ~grazing & (t32 > t_min) & (t32 < t_max) & (inner_radius > 0) & ~left_behind
 
     out: list[list[Tensor]] = []
@@ -161,7 +161,7 @@ def trace_reference(
         colour = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, p.sh[ids]), min=0)
         ways = to_mean[ray, ids].detach()
         away = (ways * r1[ids].detach()).sum(-1) / ways.norm(dim=-1)
-        facing = torch.where(away > settings.turned_beyond, -1.0, 1.0)
+        facing = torch.where(away > settings.flip_normal_cos, -1.0, 1.0)
         crossing = torch.nonzero((through[:-1] > 0.5) & (through[1:] <= 0.5)).squeeze(-1)
         median = t[ray, ids[crossing[0]]] if len(crossing) else torch.zeros((), dtype=torch.float64)
         out.append(

@@ -55,8 +55,9 @@ class Batch:
 class BatchSource:
     """Draws the batches of a training.
 
-    A batch has ``config.rays`` rays. Where the loss has an SSIM term, about ``config.patch_fraction`` of them
-    come as patches; the others come in windows, as far as that goes, and singly where a window is one ray.
+    A batch has ``config.rays_per_batch`` rays. Where the loss has an SSIM term, about
+    ``config.ssim_patch_fraction`` of them come as patches; the others come in windows, as far as that goes,
+    and singly where a window is one ray.
 
     Args:
         dataset: the photographs.
@@ -80,7 +81,7 @@ class BatchSource:
         )
         self._patches = self._patch_count()
         self._lines: SightLines | None = None
-        if config.loss.blocked > 0 and isinstance(dataset, PhotographsOfPoints) and len(dataset.points):
+        if config.loss.free_space > 0 and isinstance(dataset, PhotographsOfPoints) and len(dataset.points):
             self._lines = SightLines.of(dataset, SIGHT_LINE_MARGIN)
 
     def leave_out(self, views: Int64[np.ndarray, " m"]) -> None:
@@ -92,15 +93,17 @@ class BatchSource:
 
     def draw(self, rng: np.random.Generator, turn: int = 0) -> Batch:
         """The next batch, after ``turn`` others."""
-        config, sampler, side = self._config, self.sampler, self._config.patch_side
-        loose = config.rays - self._patches * side**2
-        windows = loose // config.window_rays if config.window_rays > 1 else 0
-        single = loose - windows * config.window_rays
+        config, sampler, side = self._config, self.sampler, self._config.ssim_patch_side
+        loose = config.rays_per_batch - self._patches * side**2
+        windows = loose // config.ray_patch_rays if config.ray_patch_rays > 1 else 0
+        single = loose - windows * config.ray_patch_rays
         drawn, grids = [sampler.pixels(rng, single)], None
         if windows:
-            grids = RayWindows(single, windows, math.isqrt(config.window_rays))
+            grids = RayWindows(single, windows, math.isqrt(config.ray_patch_rays))
             drawn.append(
-                sampler.windows(rng, windows, rays=config.window_rays, side=self._window_side_px, turn=turn)
+                sampler.windows(
+                    rng, windows, rays=config.ray_patch_rays, side=self._window_side_px, turn=turn
+                )
             )
         if self._patches:
             drawn.append(sampler.patches(rng, self._patches, side))
@@ -110,27 +113,33 @@ class BatchSource:
         background = self._background(rng)
         lines = None
         if self._lines is not None and len(self._lines):
-            lines = self._lines.draw(rng, max(1, round(config.sight_line_share * config.rays)))
+            lines = self._lines.draw(
+                rng, max(1, round(config.visibility_ray_fraction * config.rays_per_batch))
+            )
         batch = Batch(rays, rgb, alpha, weight, view, self._patches, side, background, lines, grids)
         _ = batch.target_srgb  # worked out here, as the next batch is drawn beside the iteration
         return batch
 
     def _patch_count(self) -> int:
-        config, side = self._config, self._config.patch_side
+        config, side = self._config, self._config.ssim_patch_side
         if config.loss.ssim == 0:
             return 0
         smallest = self.sampler.smallest_side_px
         if smallest < side:
             raise ConfigError(
                 f"loss.ssim compares patches of {side} x {side} pixels, but a training view is only "
-                f"{smallest} pixels wide or high; lower patch_side (16 at least), or set loss.ssim to 0."
+                f"{smallest} pixels wide or high; lower ssim_patch_side (16 at least), or set loss.ssim to 0."
             )
-        count = min(round(config.rays * config.patch_fraction / side**2), config.rays // side**2)
+        count = min(
+            round(config.rays_per_batch * config.ssim_patch_fraction / side**2),
+            config.rays_per_batch // side**2,
+        )
         if count == 0:
             raise ConfigError(
                 f"loss.ssim compares patches of {side} x {side} pixels, but a share of "
-                f"{config.patch_fraction:g} of {config.rays} rays makes none; raise rays or "
-                "patch_fraction, or set loss.ssim to 0."
+                f"{config.ssim_patch_fraction:g} of {config.rays_per_batch} rays makes none; raise "
+                "rays_per_batch or "
+                "ssim_patch_fraction, or set loss.ssim to 0."
             )
         return count
 

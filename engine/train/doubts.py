@@ -30,10 +30,10 @@ MOST_IN_DOUBT, MOST_SHARE_IN_DOUBT = 20, 0.25
 _SETTINGS: dict[str, object] = {
     "iterations": ITERATIONS,
     "max_gaussians": 10_000,
-    "rays": 8192,
+    "rays_per_batch": 8192,
     "sh_degree": 0,
     "exposure": False,
-    "stop_early": 0.0,
+    "early_stopping_db": 0.0,
     "probe_rays": 256,
 }
 

@@ -52,11 +52,11 @@ def initial_gaussians(
         centres = np.stack([dataset.views[i].origin_world for i in dataset.train_indices])
         xyz, rgb = points.xyz_world, points.rgb_srgb
         most = np.full(len(xyz), MAX_ANGLE)
-        if config.lift_pixels and len(xyz) < limit:
+        if config.plane_sweep_init and len(xyz) < limit:
             gains = evening_gains(dataset) if config.exposure is True else None
             more = dense_points(
                 dataset, limit - len(xyz), rng,
-                threads=threads, behind=behind, gains=gains, unseen=config.lift_unseen,
+                threads=threads, behind=behind, gains=gains, unseen=config.plane_sweep_unseen,
             )  # fmt: skip
             xyz, rgb = np.concatenate([xyz, more.xyz_world]), np.concatenate([rgb, more.rgb_srgb])
             most = np.concatenate([most, np.where(more.swept, SWEPT_ANGLE, MAX_ANGLE)])
@@ -68,7 +68,7 @@ def initial_gaussians(
             limit=limit,
             opacity=config.initial_opacity,
             rng=rng,
-            plane_points=config.plane_points,
+            plane_points=config.normal_neighbors,
             most_angles=most,
         )
     view, y, x = dataset.sample_pixels(rng, limit)
@@ -89,7 +89,7 @@ def with_first_materials(gaussians: FlatGaussians, settings: MaterialSettings) -
     """The same Gaussians with the materials that a training begins with, all alike."""
     values = (FIRST_ALBEDO,) * 3, (FIRST_METALLIC,), (FIRST_ROUGHNESS,)
     first = dict(zip(MATERIAL_WIDTHS, values, strict=True)) | {AMBIENT: (1.0,)}
-    if settings.recipe == "split_sum" and settings.bounced:
+    if settings.recipe == "split_sum" and settings.diffuse_interreflection:
         first[BOUNCED] = (0.0,) * 3
     return gaussians.with_channels(
         {name: np.tile(np.array(value, np.float32), (len(gaussians), 1)) for name, value in first.items()}

@@ -82,7 +82,7 @@ def differentiate(
         by_seen = replace(by_seen, ray_errors=ray_errors(render, batch.target_srgb, batch.weight))
     recorded = [(seen.hits, by_seen), *back.further]
     if batch.sight_lines is not None:
-        recorded.append(blocked_term(batch.sight_lines, tracer, weights.blocked))
+        recorded.append(blocked_term(batch.sight_lines, tracer, weights.free_space))
     least = least_weight if len(recorded) == 1 else 0.0  # what several say has to be added up first
     parts = [tracer.backward(hits, by, least_weight=least).numpy() for hits, by in recorded]
     return Differentiated(
@@ -122,16 +122,16 @@ def iterate(
     densifier = machinery.densifier
     found = differentiate(
         batch, tracer, shading, config.loss,
-        progress=progress, with_errors=densifier.wants_errors, least_weight=config.least_weight,
+        progress=progress, with_errors=densifier.wants_errors, least_weight=config.min_blend_weight,
     )  # fmt: skip
     if not np.isfinite(found.loss.value):
         raise TrainingFailure(
             f"The loss became {found.loss.value} at iteration {state.iteration + 1}; lower the learning "
-            "rates (--set rates.mean=...) or look for damaged photographs. The last checkpoint is kept."
+            "rates (--set lr.mean=...) or look for damaged photographs. The last checkpoint is kept."
         )
     gradients = found.gaussians
     moved = state.adam.step(
-        state.gaussians, gradients, config.rates, config.loss, progress=progress, extent=extent
+        state.gaussians, gradients, config.lr, config.loss, progress=progress, extent=extent
     )
     shading.step(state.gaussians, gradients, found.shading, progress=progress)
     tracer.refresh(gradients.ids)

@@ -177,8 +177,8 @@ class TrainingViews:
         its = "its pose" if len(loose) == 1 else "their poses"
         return (
             f"{which} not fit the others; {its} may be wrong, or the picture blurred: {', '.join(loose)}. "
-            "Given poses that are wrong come right with the setting place_misfits, or where all are found "
-            "anew (--poses auto); leave_out_misfits trains without such photographs."
+            "Given poses that are wrong come right with the setting repair_poses, or where all are found "
+            "anew (--poses auto); exclude_outlier_views trains without such photographs."
         )
 
 

@@ -24,7 +24,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 class Adam:
     """First and second moments of every parameter, one row a Gaussian, and each Gaussian's step count.
 
-    Columns: mean 3, quaternion 4, log scales 2, opacity 1, then the harmonics. Where ``rates.axes`` is "own"
+    Columns: mean 3, quaternion 4, log scales 2, opacity 1, then the harmonics. Where ``lr.axes`` is "own"
     the first are along the normal and the two axes in the Gaussian's plane, and the last three of the
     quaternion's are turns around these: where a Gaussian is in its plane photographs say at once, how deep
     it lies they say by parallax, and each direction has steps of a size of its own. A Gaussian that no ray of
@@ -98,8 +98,8 @@ class Adam:
         corrections = np.empty((len(gradients.ids), 2))
         hit = max(1, len(gradients.ids))
         decay = rates.decay**progress
-        colour = rates.colour / SH_C0 * decay
-        mean_unit = extent if rates.mean_of == "extent" else 1.0
+        colour = rates.color / SH_C0 * decay
+        mean_unit = extent if rates.mean_unit == "extent" else 1.0
         vectors = -(-3 * gaussians.sh.shape[1] // LANES)
         rates_sh = np.full(vectors * LANES, colour * rates.sh_rest_ratio, np.float32)
         rates_sh[:3] = colour
@@ -111,7 +111,7 @@ class Adam:
             gaussians.opacity_logits, gaussians.sh,
             gradients.means_world, gradients.quats_wxyz, gradients.log_scales,
             gradients.opacity_logits, gradients.sh,
-            mean_unit * rates.mean * (rates.mean_final / rates.mean) ** progress, rates.mean_of == "size",
+            mean_unit * rates.mean * (rates.mean_final / rates.mean) ** progress, rates.mean_unit == "size",
             rates.axes == "own",
             rates.quat * decay, rates.log_scale * decay, rates.opacity * decay,
             rates_sh,

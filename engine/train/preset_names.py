@@ -2,7 +2,7 @@
 
 from typing import Literal, get_args
 
-PresetName = Literal["fast", "standard", "high", "paper"]
+PresetName = Literal["fast", "standard", "high", "redisplats"]
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 PRESETS_WITH_MATERIALS: tuple[PresetName, ...] = ("fast", "standard", "high")
-"""Those with which materials can be learnt; ``paper`` has published settings for scenes without."""
+"""Those with which materials can be learnt; ``redisplats`` has published settings for scenes without."""

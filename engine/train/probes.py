@@ -94,7 +94,7 @@ class Judge:
         listener: hears of the held-out views.
         rays: number of rays of a probe.
         background_srgb: what is behind the photographs.
-        step_back_db: the best state is chosen where the last one is so much worse.
+        best_checkpoint_margin_db: the best state is chosen where the last one is so much worse.
         seed: of the choice of rays.
     """
 

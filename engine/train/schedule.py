@@ -81,16 +81,16 @@ class Schedule:
 
     def is_late(self, done: int) -> bool:
         """Whether states are averaged by then."""
-        return max(self.config.average_after * self.iterations, self.hastened_after or 0) < done
+        return max(self.config.weight_averaging_start * self.iterations, self.hastened_after or 0) < done
 
     def in_one_order(self, done: int) -> bool:
         """Whether the rays of a window composite in one order in the next iteration."""
-        return in_one_order(self.config) and self.progress(done) < self.config.one_order
+        return in_one_order(self.config) and self.progress(done) < self.config.shared_sort_until
 
     def settles_sides(self, done: int) -> bool:
         """Whether Gaussians whose outer side is in are turned over: until states are averaged."""
-        sided = self.config.trace.turned_beyond > 0 and self.config.materials.learn
-        return sided and self.measures(done) and done <= self.config.average_after * self.iterations
+        sided = self.config.trace.flip_normal_cos > 0 and self.config.materials.learn
+        return sided and self.measures(done) and done <= self.config.weight_averaging_start * self.iterations
 
     def rebuilds(self, done: int, gaussians: int) -> bool:
         """Whether the hierarchy of so many Gaussians is built anew, which is where a run may stop."""
@@ -103,11 +103,11 @@ class Schedule:
 
     def sh_degree(self, done: int) -> int:
         """Degree of the harmonics, raised step by step."""
-        return min(self.config.sh_degree, done // self.config.sh_every)
+        return min(self.config.sh_degree, done // self.config.sh_degree_interval)
 
     def may_densify(self, done: int) -> bool:
         """Whether the fitting of the first Gaussians is over, and the last phase of a short one not begun."""
-        return done >= self.config.fit_iterations and self.hastened_after is None
+        return done >= self.config.densify_from_iter and self.hastened_after is None
 
     def progress(self, done: int) -> float:
         """Share of the training that is done, which is that of the iterations unless it ends early."""

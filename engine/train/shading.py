@@ -19,13 +19,13 @@ def make_shading(config: TrainConfig, views: int, extent_world: float) -> Shadin
     if config.background == "learnt":
         inner = LearntBackground(
             config.background_height,
-            rate=config.rates.background,
-            decay=config.rates.decay,
+            rate=config.lr.background,
+            decay=config.lr.decay,
             even_weight=BACKGROUND_SMOOTHNESS,
             inner=inner,
         )
     if config.exposure is True:
-        return Exposures(views, rate=config.rates.exposure, decay=config.rates.decay, inner=inner)
+        return Exposures(views, rate=config.lr.exposure, decay=config.lr.decay, inner=inner)
     return inner
 
 
@@ -34,7 +34,7 @@ def make_deferred(config: TrainConfig, extent_world: float) -> Deferred:
     return Deferred(
         config.materials,
         extent_world=extent_world,
-        sided=config.trace.turned_beyond > 0,
+        sided=config.trace.flip_normal_cos > 0,
     )
 
 

@@ -115,14 +115,14 @@ class Trainer:
         self._batches = BatchSource(dataset, config)
         pixels, shown = self._batches.sampler.pixel_count, shown_share(dataset)
         self.schedule = Schedule.of(config, pixels, shown)
-        rates = config.rates.calmed(self.schedule.iterations)
-        self._config = config = config.model_copy(update={"rates": rates})
+        rates = config.lr.calmed(self.schedule.iterations)
+        self._config = config = config.model_copy(update={"lr": rates})
         densifier = make_densifier(
             config.densify,
             iterations=self.schedule.iterations,
             max_gaussians=most_gaussians(config, pixels, shown),
         )
-        if config.materials.learn and config.materials.propagation:
+        if config.materials.learn and config.materials.normal_propagation:
             densifier = Propagating(densifier, config.materials.recipe, iterations=self.schedule.iterations)
         if state.hastened_after is not None:
             self.schedule = self.schedule.hastened(state.hastened_after)
@@ -139,7 +139,7 @@ class Trainer:
             listener,
             rays=config.probe_rays,
             background_srgb=self._background_srgb,
-            step_back_db=config.step_back_db,
+            step_back_db=config.best_checkpoint_margin_db,
             seed=config.seed,
         )
         self._names = [view.name for view in dataset.views]
@@ -228,11 +228,11 @@ class Trainer:
     def _make_tracer(self) -> Tracer:
         """A tracer for the next iteration; boxes leave room for what moves between rebuilds."""
         order = "packet" if self.schedule.in_one_order(self.state.iteration) else "ray"
-        settings = self._config.trace.model_copy(update={"order": order})
+        settings = self._config.trace.model_copy(update={"sort": order})
         return make_tracer(settings, threads=self._threads, box_padding=self._config.box_padding)
 
     def _build(self) -> None:
-        one_order = self._machinery.tracer.settings.order == "packet"
+        one_order = self._machinery.tracer.settings.sort == "packet"
         if self._given_tracer is None and one_order != self.schedule.in_one_order(self.state.iteration):
             self._machinery = replace(self._machinery, tracer=self._make_tracer())
         gaussians, machinery = self.state.gaussians, self._machinery
@@ -285,7 +285,7 @@ class Trainer:
     def _leave_out(self) -> None:
         """Find views that do not fit, and train without them from here on."""
         state, done = self.state, self.state.iteration
-        if not (self._config.leave_out_misfits and self.schedule.judges_views(done)):
+        if not (self._config.exclude_outlier_views and self.schedule.judges_views(done)):
             return
         found = self._view_judge.misfits(self._machinery.tracer, self._machinery.shading, state.left_out)
         if len(found):
@@ -301,7 +301,7 @@ class Trainer:
 
     def _hasten(self) -> None:
         """Bring the end forward where the training hardly gains any more."""
-        state, schedule, least_db = self.state, self.schedule, self._config.stop_early
+        state, schedule, least_db = self.state, self.schedule, self._config.early_stopping_db
         if schedule.hastened_after is not None or not gains_no_more(
             state.probed, schedule.iterations, least_db
         ):
@@ -313,7 +313,7 @@ class Trainer:
                 Warned(
                     f"The training rays gained less than {least_db:g} dB in a fifth of all iterations, so "
                     f"that the training ends after {sooner.iterations} of {schedule.iterations}; "
-                    "stop_early=0 lets it go on."
+                    "early_stopping_db=0 lets it go on."
                 )
             )
 
@@ -383,7 +383,7 @@ class Trainer:
                 loss=found.loss.value,
                 psnr=decibels(state.running_mse),
                 gaussians=len(state.gaussians),
-                rays_per_second=self._config.rays / pace_s,
+                rays_per_second=self._config.rays_per_batch / pace_s,
                 hits_per_ray=found.hits_per_ray,
                 seconds=watch.seconds,
                 seconds_left=pace_s * (total - state.iteration),

@@ -106,7 +106,7 @@ def make_plan(
     began = time.perf_counter()
     pace_s = _seconds_an_iteration(dataset, config, first, threads, should_stop)
     if in_one_order(config):  # as the trial was, and the first part of the training is
-        pace_s *= config.one_order + OWN_ORDER_PACE * (1 - config.one_order)
+        pace_s *= config.shared_sort_until + OWN_ORDER_PACE * (1 - config.shared_sort_until)
     left_s = USED_SHARE * (seconds - (time.perf_counter() - began))
     most = most_gaussians(config, dataset.train_pixel_count, shown_share(dataset))
     return choose_plan(left_s, pace_s, len(first), most)
@@ -145,7 +145,7 @@ def _seconds_an_iteration(
 
     enough = WARM + TIMED
     trial = config.model_copy(
-        update={"iterations": 100 * enough, "fit_iterations": 100 * enough, "probe_rays": 256}
+        update={"iterations": 100 * enough, "densify_from_iter": 100 * enough, "probe_rays": 256}
     )
     with tempfile.TemporaryDirectory() as folder, suppress(Cancelled):
         Trainer(

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ValidationError
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.operations.costs import Estimate
 from octasplat.engine.refusals import SettingsRefused
+from octasplat.engine.renamed_settings import collected_notices
 from octasplat.service.actions.access import owned_job, refuse_while_draining
 from octasplat.service.actions.asked import accepted_kind, input_problem, resolved
 from octasplat.service.actions.jobs import job_view
@@ -70,7 +71,8 @@ async def accept_job(
     """
     refuse_while_draining(service)
     kind = accepted_kind(new.kind)
-    asked = _Asked(new, kind, resolved(kind, new.options), traceparent)
+    with collected_notices() as notices:
+        asked = _Asked(new, kind, resolved(kind, new.options), traceparent)
     check_priority(who, new.priority, service.settings)
     if new.webhook is not None:
         check_address(service, new.webhook.url, "#/webhook/url")
@@ -82,7 +84,8 @@ async def accept_job(
         # Without what was not asked for: a version that knows more may get the repetition.
         named = fingerprint("job", new.model_dump(mode="json", exclude_defaults=True))
         job_id, _ = await once(connection, who, key, named, make)
-        return await job_view(connection, service, await owned_job(connection, who, job_id))
+        view = await job_view(connection, service, await owned_job(connection, who, job_id))
+        return view.model_copy(update={"notes": [*view.notes, *notices]})
 
 
 @tried_again
@@ -122,8 +125,10 @@ async def retry_job(
             return job_id
 
         named = fingerprint("retry", str(job_id), asked.start, *([asked.options] if asked.options else []))
-        await once(connection, who, key, named, make)
-        return await job_view(connection, service, await owned_job(connection, who, job_id))
+        with collected_notices() as notices:
+            await once(connection, who, key, named, make)
+        view = await job_view(connection, service, await owned_job(connection, who, job_id))
+        return view.model_copy(update={"notes": [*view.notes, *notices]})
 
 
 async def _make_job(connection: Connection, service: Service, who: Principal, asked: _Asked) -> uuid.UUID:

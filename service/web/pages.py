@@ -124,7 +124,7 @@ async def show_job(request: Request, job_id: uuid.UUID, who: Reader, service: Se
         video=next((row for row in artifacts if row.media_type == "video/mp4"), None),
         q=_octagon_q(config),
         up=_up_world(config),
-        background=config.get("reconstruction", {}).get("evaluate_background", "black"),
+        background=_evaluation_background(config),
         photograph=shown if any(file.path == shown for file in photographs) else None,
         further=[options_form(kind, unwritable) for kind in extra] if who.may("write") else [],
         max_file_bytes=service.settings.max_upload_bytes,
@@ -257,6 +257,11 @@ def _up_world(config: dict[str, object]) -> str:
     found = _at(config, "reconstruction", "train", "materials", "up_world")
     known = isinstance(found, list) and len(found) == 3 and all(isinstance(x, int | float) for x in found)
     return json.dumps(found if known else [0, 0, 1])
+
+
+def _evaluation_background(config: dict[str, object]) -> object:
+    found = _at(config, "reconstruction", "evaluation_background")
+    return found or _at(config, "reconstruction", "evaluate_background") or "black"
 
 
 def _octagon_q(config: dict[str, object]) -> float | None:

@@ -2,7 +2,7 @@
 
 import click
 
-from octasplat.workers.cli.main import cli
+from octasplat.workers.cli.main import cli, main
 
 
 @click.command(short_help="Run the HTTP front end alone.")
@@ -19,11 +19,6 @@ def api(ctx: click.Context) -> None:
 
 
 cli.add_command(api)
-
-
-def main() -> None:
-    """Run the command line."""
-    cli(prog_name="octasplat")
 
 
 if __name__ == "__main__":

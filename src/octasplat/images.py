@@ -129,6 +129,6 @@ def _tracer(scene: Scene, threads: int) -> "Tracer":
     from octasplat.engine.trace.make import make_tracer
     from octasplat.engine.trace.protocol import TraceSettings
 
-    tracer = make_tracer(TraceSettings(turned_beyond=scene.facts.turned_beyond), threads=threads)
+    tracer = make_tracer(TraceSettings(flip_normal_cos=scene.facts.turned_beyond), threads=threads)
     tracer.build(scene.gaussians)
     return tracer

@@ -106,8 +106,12 @@ class Run:
     @property
     def settings(self) -> Mapping[str, Any]:
         """All settings."""
-        found: Mapping[str, Any] = _json(self.path / _CONFIG).get("reconstruction", {})
-        return found
+        from octasplat.engine.config import ReconstructionConfig
+        from octasplat.engine.renamed_settings import with_new_names
+
+        path = self.path / _CONFIG
+        found: Mapping[str, Any] = _json(path).get("reconstruction", {})
+        return with_new_names((ReconstructionConfig,), found, source=str(path))
 
     @property
     def training(self) -> Mapping[str, Any]:

@@ -173,7 +173,7 @@ def trace(
     """
     given = GaussianTensors.of(scene, requires_grad=False) if isinstance(scene, Scene) else scene
     if settings is None:
-        settings = TraceSettings(turned_beyond=scene.facts.turned_beyond)
+        settings = TraceSettings(flip_normal_cos=scene.facts.turned_beyond)
     lines = Rays.of(rays) if isinstance(rays, RenderCamera) else rays
     directions = lines.directions / lines.directions.norm(dim=-1, keepdim=True)
     features = given.features

@@ -76,19 +76,19 @@ def reconstruct(
     source: PathLike,
     output: PathLike,
     *,
-    preset: Literal["fast", "standard", "high", "paper"] | None = None,
+    preset: Literal["fast", "standard", "high", "redisplats"] | None = None,
     max_side: int | None = None,
     test_every: int | None = None,
     held_out: Sequence[str] | None = None,
     poses: Literal["given", "auto", "missing"] | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
-    evaluate_background: Literal["black", "white"] | None = None,
+    evaluation_background: Literal["black", "white"] | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
     for_surface: bool = False,
     iterations: int | None = None,
-    rays: int | None = None,
+    rays_per_batch: int | None = None,
     max_gaussians: int | None = None,
     sh_degree: int | None = None,
     seed: int | None = None,
@@ -106,21 +106,22 @@ def reconstruct(
         source: The folder of the photographs.
         output: Folder for the results.
         preset: Where the settings of the training come from: fast is a first look, standard is better,
-            high is better yet and takes about three times as many iterations, paper has the published
-            settings. Default: standard.
+            high is better yet and takes about three times as many iterations, redisplats has the
+            published settings. Default: standard.
         max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
             for a quick try, or where memory is short.
         test_every: Every how-manieth view by name is held out to be measured; 0 holds out none, so that
             all are trained on. Default: 8.
         held_out: Names of the views to hold out instead of every how-manieth.
         poses: Where the poses of the cameras come from: given takes the COLMAP model of the dataset
-            (photographs far from where matches put them are moved, see place_misfits); auto finds the
+            (photographs far from where matches put them are moved, see repair_poses); auto finds the
             poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
             holds no model. Default: missing.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
-        evaluate_background: What lies behind renders and photographs with alpha when they are compared;
-            by default that of the training: white where train.background is white, else black.
+        evaluation_background: What lies behind renders and photographs with alpha when they are
+            compared; by default that of the training: white where train.background is white, else
+            black.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('mesh.ply',
@@ -129,12 +130,12 @@ def reconstruct(
             scene then.
         for_surface: Hold normals and depths together, so that a surface made of the scene is smoother.
         iterations: Iterations of the training; 0 asks the photographs' pixels.
-        rays: Rays of one iteration.
+        rays_per_batch: Rays of one iteration.
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
         sh_degree: Degree of the spherical harmonics of the colours, 0 to 3.
         seed: Seed of everything random. [default: 0]
         train: Settings of the training that are to be otherwise than the preset's.
-        assignments: Any other setting, e.g. rates.quat=0.02 or test_every=4, values as JSON; octasplat
+        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
             config list shows them.
         resume: Go on with the run in the output folder, if there is one; without other options its own
             settings are taken.
@@ -167,13 +168,13 @@ def reconstruct(
             "held_out": held_out,
             "poses": poses,
             "masks": masks,
-            "evaluate_background": evaluate_background,
+            "evaluation_background": evaluation_background,
             "minutes": minutes,
             "exports": exports,
             "materials": materials,
             "for_surface": for_surface,
             "iterations": iterations,
-            "rays": rays,
+            "rays_per_batch": rays_per_batch,
             "max_gaussians": max_gaussians,
             "sh_degree": sh_degree,
             "seed": seed,
@@ -194,19 +195,19 @@ def reconstruct(
 def estimate(
     source: PathLike,
     *,
-    preset: Literal["fast", "standard", "high", "paper"] | None = None,
+    preset: Literal["fast", "standard", "high", "redisplats"] | None = None,
     max_side: int | None = None,
     test_every: int | None = None,
     held_out: Sequence[str] | None = None,
     poses: Literal["given", "auto", "missing"] | None = None,
     masks: Literal["ignore", "alpha"] | None = None,
-    evaluate_background: Literal["black", "white"] | None = None,
+    evaluation_background: Literal["black", "white"] | None = None,
     minutes: float | None = None,
     exports: Sequence[str] | None = None,
     materials: bool = False,
     for_surface: bool = False,
     iterations: int | None = None,
-    rays: int | None = None,
+    rays_per_batch: int | None = None,
     max_gaussians: int | None = None,
     sh_degree: int | None = None,
     seed: int | None = None,
@@ -222,21 +223,22 @@ def estimate(
     Args:
         source: The folder of the photographs.
         preset: Where the settings of the training come from: fast is a first look, standard is better,
-            high is better yet and takes about three times as many iterations, paper has the published
-            settings. Default: standard.
+            high is better yet and takes about three times as many iterations, redisplats has the
+            published settings. Default: standard.
         max_side: Longest side to which photographs are shrunk; by default they keep their size. Set it
             for a quick try, or where memory is short.
         test_every: Every how-manieth view by name is held out to be measured; 0 holds out none, so that
             all are trained on. Default: 8.
         held_out: Names of the views to hold out instead of every how-manieth.
         poses: Where the poses of the cameras come from: given takes the COLMAP model of the dataset
-            (photographs far from where matches put them are moved, see place_misfits); auto finds the
+            (photographs far from where matches put them are moved, see repair_poses); auto finds the
             poses, by COLMAP's features, matching and mapping; missing does so only where the dataset
             holds no model. Default: missing.
         masks: What masks mean: ignore leaves masked pixels out of the loss, alpha takes the mask as the
             alpha, for objects that are cut out. Default: ignore.
-        evaluate_background: What lies behind renders and photographs with alpha when they are compared;
-            by default that of the training: white where train.background is white, else black.
+        evaluation_background: What lies behind renders and photographs with alpha when they are
+            compared; by default that of the training: white where train.background is white, else
+            black.
         minutes: Time in which the training is to end, which decides its iterations and Gaussians by the
             pace of the machine that begins it; by default the other settings do.
         exports: Files to write besides scene.ply; their names say the format. Default: ('mesh.ply',
@@ -245,12 +247,12 @@ def estimate(
             scene then.
         for_surface: Hold normals and depths together, so that a surface made of the scene is smoother.
         iterations: Iterations of the training; 0 asks the photographs' pixels.
-        rays: Rays of one iteration.
+        rays_per_batch: Rays of one iteration.
         max_gaussians: Most Gaussians; 0, the default, asks the photographs' pixels.
         sh_degree: Degree of the spherical harmonics of the colours, 0 to 3.
         seed: Seed of everything random. [default: 0]
         train: Settings of the training that are to be otherwise than the preset's.
-        assignments: Any other setting, e.g. rates.quat=0.02 or test_every=4, values as JSON; octasplat
+        assignments: Any other setting, e.g. lr.quat=0.02 or test_every=4, values as JSON; octasplat
             config list shows them.
         cores: Cores of the machine to reckon with; 0 takes those of this one. Default: 0.
         progress: told each event; by default they are logged, or shown in a notebook.
@@ -274,13 +276,13 @@ def estimate(
             "held_out": held_out,
             "poses": poses,
             "masks": masks,
-            "evaluate_background": evaluate_background,
+            "evaluation_background": evaluation_background,
             "minutes": minutes,
             "exports": exports,
             "materials": materials,
             "for_surface": for_surface,
             "iterations": iterations,
-            "rays": rays,
+            "rays_per_batch": rays_per_batch,
             "max_gaussians": max_gaussians,
             "sh_degree": sh_degree,
             "seed": seed,
@@ -301,9 +303,9 @@ def evaluate(
     *,
     all_views: bool = False,
     scales: Sequence[int] | str | None = None,
-    background: Literal["black", "white"] | None = None,
+    evaluation_background: Literal["black", "white"] | None = None,
     dataset: PathLike | None = None,
-    on: PathLike | None = None,
+    other_dataset: PathLike | None = None,
     progress: Listener | None = None,
     should_stop: Callable[[], bool] = never,
     threads: int = 0,
@@ -316,10 +318,11 @@ def evaluate(
             folder>; so it is with photographs of another dataset, which a job names as 'dataset_id'.
         scales: Measure smaller sizes instead, such as 2,4,8: renders at 1/2, 1/4 and 1/8 of the size
             against photographs made as small, with 1, 4 and 16 rays per pixel; into scales.json.
-        background: Colour behind the scene and behind what masks leave out. [default: the run's]
+        evaluation_background: Colour behind the scene and behind what masks leave out. [default: the
+            run's]
         dataset: Where the run's photographs are now, if they were moved or the run was downloaded.
-        on: Measure all photographs of another folder instead (images/ and sparse/0 in the same world as
-            the run's); the results go to OUT/on/<its name>.
+        other_dataset: Measure all photographs of another folder instead (images/ and sparse/0 in the
+            same world as the run's); the results go to OUT/on/<its name>.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``Cancelled``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
@@ -337,10 +340,10 @@ def evaluate(
         {
             "all_views": all_views,
             "scales": scales,
-            "background": background,
+            "evaluation_background": evaluation_background,
             "source": source,
             "dataset": dataset,
-            "on": on,
+            "other_dataset": other_dataset,
         },
         progress,
         should_stop,
@@ -410,18 +413,18 @@ def surface(
     resolution: int | None = None,
     truncation: float | None = None,
     depth_trunc: float | None = None,
-    depth: Literal["median", "expected"] | None = None,
+    depth_mode: Literal["median", "expected"] | None = None,
     depth_side: int | None = None,
     min_alpha: float | None = None,
     min_weight: float | None = None,
     unseen: Literal["open", "solid"] | None = None,
     backdrop: bool | None = None,
-    settle: bool | None = None,
+    refine_vertices: bool | None = None,
     keep_components: int | None = None,
     min_component: float | None = None,
     fill_holes: Literal["all"] | float | None = None,
     fit: bool = True,
-    texture_side: int | None = None,
+    texture_size: int | None = None,
     max_memory_gb: float | None = None,
     room: bool = False,
     max_triangles: Sequence[str] | str | int | Sequence[str | int] | None = None,
@@ -450,8 +453,8 @@ def surface(
         truncation: Half width of the band around the surface in which distances are kept. [default: 3%
             of the cameras' distance, about what trained depths are off by, and at least 4]
         depth_trunc: Ignore depths beyond this, in scene units. [default: none]
-        depth: Which depth is fused: the median, where half of the light is gone, or the expected one.
-            Default: median.
+        depth_mode: Which depth is fused: the median, where half of the light is gone, or the expected
+            one. Default: median.
         depth_side: Longer side of the depth maps. Default: 640.
         min_alpha: Pixels that the scene covers less than this have no depth. Default: 0.5.
         min_weight: Least evidence for a voxel; a view that looks straight onto the surface gives 1.
@@ -459,12 +462,12 @@ def surface(
         unseen: Space near the surface that no view saw: open leaves holes there, solid closes the mesh.
             Default: open.
         backdrop: A sphere around everything that shows what the scene shows in the gaps of the mesh.
-        settle: Move vertices along their normals to where the pictures agree, before colours.
+        refine_vertices: Move vertices along their normals to where the pictures agree, before colours.
         keep_components: Keep so many connected parts only, largest first. [default: by min_component]
         min_component: Remove parts of less than this share of the largest part's area. Default: 0.01.
         fill_holes: Close holes with rims shorter than so many voxels; or 'all'. Default: 0.0.
         fit: Of all colours, take those with which the mesh looks as like the pictures as it can.
-        texture_side: Colours in a square texture of this side instead of in the vertices; .glb and
+        texture_size: Colours in a square texture of this side instead of in the vertices; .glb and
             .obj.
         max_memory_gb: Refuse a volume that takes more memory than this. Default: 4.0.
         room: What pictures of a room need, where nothing else is said: unbounded, unseen solid,
@@ -499,18 +502,18 @@ def surface(
             "resolution": resolution,
             "truncation": truncation,
             "depth_trunc": depth_trunc,
-            "depth": depth,
+            "depth_mode": depth_mode,
             "depth_side": depth_side,
             "min_alpha": min_alpha,
             "min_weight": min_weight,
             "unseen": unseen,
             "backdrop": backdrop,
-            "settle": settle,
+            "refine_vertices": refine_vertices,
             "keep_components": keep_components,
             "min_component": min_component,
             "fill_holes": fill_holes,
             "fit": fit,
-            "texture_side": texture_side,
+            "texture_size": texture_size,
             "max_memory_gb": max_memory_gb,
             "room": room,
             "max_triangles": max_triangles,
@@ -770,14 +773,14 @@ def relight(
     resume: bool = False,
     or_anew: bool = False,
     frames_folder: PathLike | None = None,
-    by: Literal["split-sum", "path"] | None = None,
+    integrator: Literal["split-sum", "path"] | None = None,
     samples: int | None = None,
-    depth: int | None = None,
+    max_bounces: int | None = None,
     rotation_degrees: float | None = None,
     clamp: float | None = None,
     spin: bool = False,
     background: Literal["black", "white", "transparent", "environment"] | None = None,
-    on: PathLike | None = None,
+    other_dataset: PathLike | None = None,
     progress: Listener | None = None,
     should_stop: Callable[[], bool] = never,
     threads: int = 0,
@@ -822,17 +825,17 @@ def relight(
         resume: Go on with a render that was stopped, if there is one.
         or_anew: Begin anew where the images that are there are of another render.
         frames_folder: Where a video keeps its frames until it is whole. [default: beside it]
-        by: Method: split-sum is fast, as in training, with traced visibility; path is right, by paths
-            of light. Default: split-sum.
+        integrator: Method: split-sum is fast, as in training, with traced visibility; path is right, by
+            paths of light. Default: split-sum.
         samples: Rays or paths per pixel. [default: 4 rays of split-sum, 64 paths]
-        depth: Most surfaces that a path of light meets. Default: 6.
+        max_bounces: Most surfaces that a path of light meets. Default: 6.
         rotation_degrees: Turn the light about the vertical by this angle in degrees. Default: 0.0.
         clamp: Cut the light of the environments off at this radiance: fewer bright specks by paths, and
             weaker lamps.
         spin: Turn the light once round from the first image to the last.
         background: Behind the scene; transparent gives images alpha. [default: that of the run's
             evaluation, or black]
-        on: Render the views of the photographs of another folder (images/ and sparse/0).
+        other_dataset: Render the views of the photographs of another folder (images/ and sparse/0).
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``Cancelled``.
         threads: number of threads; 0 takes all cores. The result does not depend on it.
@@ -875,14 +878,14 @@ def relight(
             "or_anew": or_anew,
             "frames_folder": frames_folder,
             "environments": environments,
-            "by": by,
+            "integrator": integrator,
             "samples": samples,
-            "depth": depth,
+            "max_bounces": max_bounces,
             "rotation_degrees": rotation_degrees,
             "clamp": clamp,
             "spin": spin,
             "background": background,
-            "on": on,
+            "other_dataset": other_dataset,
         },
         progress,
         should_stop,
@@ -942,10 +945,10 @@ def export(
     spz_version: Literal[3, 4] | None = None,
     opaque: bool = False,
     chunks: int | None = None,
-    texture_size: int | None = None,
+    falloff_texture_size: int | None = None,
     ids: bool = True,
     q: float | None = None,
-    colour: Literal["cameras", "constant"] | Sequence[float] | str | None = None,
+    color: Literal["cameras", "constant"] | Sequence[float] | str | None = None,
     for_viewers: bool = False,
     materials: bool = False,
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
@@ -967,11 +970,11 @@ def export(
         opaque: GLB: cut alpha at a threshold instead of blending, for programs that cannot sort.
         chunks: GLB: most spatial chunks, which programs sort by distance; rounded down to a power of
             two. Default: 64.
-        texture_size: GLB, OBJ: side of the texture that holds the fall-off. Default: 128.
+        falloff_texture_size: GLB, OBJ: side of the texture that holds the fall-off. Default: 128.
         ids: GLB: write the numbers by which edits find back to their Gaussians.
         q: Meshes: squared radius of the octagons in standard deviations. [default: that of the run, of
             a file 9.21]
-        colour: Formats with one colour for each Gaussian: the one that loses least seen from the
+        color: Formats with one colour for each Gaussian: the one that loses least seen from the
             photographs' places of a run, or from all around a file; the harmonics' constant part; or
             the one seen along a direction. [default: cameras for a run, constant for a file]
         for_viewers: GLB: for programs that sort chunks at best: solid middles beneath, and in a run
@@ -1002,10 +1005,10 @@ def export(
             "spz_version": spz_version,
             "opaque": opaque,
             "chunks": chunks,
-            "texture_size": texture_size,
+            "falloff_texture_size": falloff_texture_size,
             "ids": ids,
             "q": q,
-            "colour": colour,
+            "color": color,
             "for_viewers": for_viewers,
             "materials": materials,
             "up": up,
@@ -1398,8 +1401,8 @@ def clean(
     floaters: bool = True,
     min_group: int | None = None,
     link: float | None = None,
-    neighbours: int | None = None,
-    near_share: float | None = None,
+    neighbors: int | None = None,
+    camera_clearance: float | None = None,
     dry_run: bool = False,
     progress: Listener | None = None,
     should_stop: Callable[[], bool] = never,
@@ -1421,9 +1424,9 @@ def clean(
         min_group: Groups of fewer Gaussians are floaters. Default: 20.
         link: Neighbours belong together if their centres are no further apart than this many times the
             sum of their standard deviations. Default: 1.0.
-        neighbours: How many nearest neighbours of a Gaussian may belong to its group. Default: 12.
-        near_share: In a run: remove those nearer to the camera of a training view than this share of
-            the distance at which the sparse points around it begin; 0 for none. Default: 0.25.
+        neighbors: How many nearest neighbours of a Gaussian may belong to its group. Default: 12.
+        camera_clearance: In a run: remove those nearer to the camera of a training view than this share
+            of the distance at which the sparse points around it begin; 0 for none. Default: 0.25.
         dry_run: Only count.
         progress: told each event; by default they are logged, or shown in a notebook.
         should_stop: asked now and then; True ends the work with ``Cancelled``.
@@ -1448,8 +1451,8 @@ def clean(
             "floaters": floaters,
             "min_group": min_group,
             "link": link,
-            "neighbours": neighbours,
-            "near_share": near_share,
+            "neighbors": neighbors,
+            "camera_clearance": camera_clearance,
             "output": output,
             "dry_run": dry_run,
         },

@@ -56,7 +56,7 @@ def service(short_root: Path) -> Iterator[Service]:
 
 SMALL = {
     "preset": "fast",
-    "train": {"iterations": 60, "rays": 512, "max_gaussians": 300},
+    "train": {"iterations": 60, "rays_per_batch": 512, "max_gaussians": 300},
     "exports": ["mesh.ply"],
 }
 

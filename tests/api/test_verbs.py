@@ -58,10 +58,10 @@ def test_a_misspelt_option_is_refused_with_the_nearest_name(scene_file: Path, tm
 
 def test_what_a_preset_switches_on_can_be_said_to_be_off() -> None:
     request = operation("surface").request
-    values = {"source": "run", "output": "a.glb", "room": True, "settle": False, "backdrop": None}
+    values = {"source": "run", "output": "a.glb", "room": True, "refine_vertices": False, "backdrop": None}
     found = build(request, given_values(request, values))
-    assert (found.settle, found.backdrop, found.unbounded) == (False, True, True)
-    parameter = inspect.signature(osp.surface).parameters["settle"]
+    assert (found.refine_vertices, found.backdrop, found.unbounded) == (False, True, True)
+    parameter = inspect.signature(osp.surface).parameters["refine_vertices"]
     assert parameter.default is None
 
 

@@ -21,8 +21,8 @@ from octasplat.workers.cli.main import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (
-    "--preset", "fast", "--iterations", "60", "--rays", "256", "--max-gaussians", "600",
-    "--set", "initial_points=300", "--set", "probe_rays=256", "--set", "patch_side=16",
+    "--preset", "fast", "--iterations", "60", "--rays-per-batch", "256", "--max-gaussians", "600",
+    "--set", "initial_points=300", "--set", "probe_rays=256", "--set", "ssim_patch_side=16",
     "--test-every", "4", "--threads", "1",
 )  # fmt: skip
 """Settings of a run of a second."""
@@ -116,7 +116,7 @@ def shiny_run(run, tmp_path_factory) -> Path:
     write_gaussian_ply(
         gaussians.with_channels(channels),
         root / "run" / "scene.ply",
-        facts=SceneFacts(turned_beyond=given.train.trace.turned_beyond),
+        facts=SceneFacts(turned_beyond=given.train.trace.flip_normal_cos),
     )
     for name in ("environment.exr", "environment.hdr"):
         write_environment(root / "run" / name, np.full((16, 32, 3), 0.5, np.float32))

@@ -68,9 +68,13 @@ def test_a_moved_run_shows_its_scene_from_the_same_places(shiny_run, octasplat, 
     content = json.loads((tmp_path / "moved" / "config.json").read_text())
     assert content["scene"] == json.loads((shiny_run / "config.json").read_text())["scene"].rpartition("/")[2]
     refused = octasplat("evaluate", tmp_path / "moved")
-    assert refused.exit_code == 1 and "--scene FOLDER" in refused.stderr
+    assert refused.exit_code == 1 and "--dataset FOLDER" in refused.stderr
     photographs = json.loads((shiny_run / "config.json").read_text())["scene"]
-    for more in (("--scene", photographs), ("--on", photographs), ("--scene", photographs, "--all-views")):
+    for more in (
+        ("--dataset", photographs),
+        ("--other-dataset", photographs),
+        ("--dataset", photographs, "--all-views"),
+    ):
         refused = octasplat("evaluate", tmp_path / "moved", *more)
         assert refused.exit_code == 1 and "same world" in refused.stderr, refused.output
         assert not (tmp_path / "moved" / "metrics.json").exists()

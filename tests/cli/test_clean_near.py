@@ -30,6 +30,6 @@ def test_a_cloud_before_a_camera_is_taken_away(run, octasplat, tmp_path):
     assert f"{40 + near_before} too near to a camera" in result.output
     cleaned, _ = read_gaussian_ply(tmp_path / "clean.ply")
     assert len(cleaned) == len(scene) - near_before
-    result = octasplat("clean", tmp_path / "run", "--dry-run", *only_near, "--near", 0)
+    result = octasplat("clean", tmp_path / "run", "--dry-run", *only_near, "--camera-clearance", 0)
     assert " 0 too near to a camera" in result.output
     assert len(read_views(run.output / "views.json").views) == len(zones.views) + len(run.metrics()["views"])

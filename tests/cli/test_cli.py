@@ -98,9 +98,9 @@ def test_output_with_other_files(octasplat, run, tmp_path):
     ("arguments", "word"),
     [
         (["--set", "colour=7"], "colour"),
-        (["--set", "rates.mean"], "name=value"),
-        (["--set", "rates.mean=-1"], "mean"),
-        (["--set", "train.rates.mean=-1"], "mean"),
+        (["--set", "lr.mean"], "name=value"),
+        (["--set", "lr.mean=-1"], "mean"),
+        (["--set", "train.lr.mean=-1"], "mean"),
         (["--set", "test_every=-1"], "test_every"),
         (["--iterations", "-1"], "iterations"),
     ],

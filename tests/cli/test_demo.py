@@ -17,12 +17,18 @@ SIZE = ("--views", 4, "--width", 32, "--height", 24)
 
 @pytest.fixture
 def tiny_demo(monkeypatch):
-    settings = ("iterations=3", "rays=64", "initial_points=100", "probe_rays=256", "patch_side=16")
+    settings = (
+        "iterations=3",
+        "rays_per_batch=64",
+        "initial_points=100",
+        "probe_rays=256",
+        "ssim_patch_side=16",
+    )
     monkeypatch.setattr(demonstration, "DEMO_ASSIGNMENTS", {"fast": settings})
 
 
 def test_scene_only(octasplat, tmp_path):
-    result = octasplat("demo", "-o", tmp_path / "still", "--scene-only", *SIZE)
+    result = octasplat("demo", "-o", tmp_path / "still", "--dataset-only", *SIZE)
     assert result.exit_code == 0, result.output
     assert len(list((tmp_path / "still" / "images").iterdir())) == 4
     assert str(tmp_path / "still") in result.stdout
@@ -30,7 +36,7 @@ def test_scene_only(octasplat, tmp_path):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_no_half_of_a_scene(start_octasplat, tmp_path, number, code):
-    process = start_octasplat("demo", "-o", tmp_path / "still", "--scene-only", "--views", 500)
+    process = start_octasplat("demo", "-o", tmp_path / "still", "--dataset-only", "--views", 500)
     deadline = time.monotonic() + 240
     while not any(path.name.endswith(".partial") for path in tmp_path.iterdir()):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()

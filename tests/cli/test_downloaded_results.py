@@ -17,8 +17,13 @@ from octasplat.workers.work.programs import reconstruct
 from octasplat.workers.work.task import Task
 
 SETTINGS = (
-    "iterations=60", "rays=256", "max_gaussians=600", "initial_points=300", "probe_rays=256", "patch_side=16",
-)  # fmt: skip
+    "iterations=60",
+    "rays_per_batch=256",
+    "max_gaussians=600",
+    "initial_points=300",
+    "probe_rays=256",
+    "ssim_patch_side=16",
+)
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ def test_its_views_are_rendered_without_photographs(results, octasplat, tmp_path
 
 @pytest.mark.parametrize(("side", "shape"), [(24, (18, 24, 3)), (64, (48, 64, 3)), (640, (48, 64, 3))])
 def test_its_views_at_other_sizes_are_those_of_the_photographs(results, octasplat, tmp_path, side, shape):
-    for name, more in (("without", ()), ("with", ("--scene", results.photographs))):
+    for name, more in (("without", ()), ("with", ("--dataset", results.photographs))):
         result = octasplat(
             "render", results.folder, "-o", tmp_path / name, "--views", "train", "--max-side", side, *more
         )
@@ -92,7 +97,7 @@ def test_its_views_at_other_sizes_are_those_of_the_photographs(results, octaspla
 
 def test_a_turntable_is_that_of_the_photographs(results, octasplat, tmp_path):
     turn = ("--turntable", "--frames", 2, "--width", 32, "--height", 24)
-    for name, more in (("without", ()), ("with", ("--scene", results.photographs))):
+    for name, more in (("without", ()), ("with", ("--dataset", results.photographs))):
         result = octasplat("render", results.folder, "-o", tmp_path / name, *turn, *more)
         assert result.exit_code == 0, result.output
     for name in ("frame_0000.png", "frame_0001.png"):
@@ -101,7 +106,7 @@ def test_a_turntable_is_that_of_the_photographs(results, octasplat, tmp_path):
 
 def test_a_surface_is_that_of_the_photographs(results, octasplat, tmp_path):
     size = ("--resolution", 32, "--depth-side", 48, "--min-component", 0, "--quiet")
-    for name, more in (("without", ()), ("with", ("--scene", results.photographs))):
+    for name, more in (("without", ()), ("with", ("--dataset", results.photographs))):
         result = octasplat("surface", results.folder, "-o", tmp_path / f"{name}.ply", *size, *more)
         assert result.exit_code == 0, result.output
     without, with_them = (
@@ -118,7 +123,7 @@ def test_evaluation_asks_for_the_photographs_by_its_option(results, octasplat, t
     before = {path.name for path in results.folder.iterdir()}
     result = octasplat("evaluate", results.folder)
     assert result.exit_code == 1
-    assert "still life" in result.stderr and "--scene FOLDER" in result.stderr
+    assert "still life" in result.stderr and "--dataset FOLDER" in result.stderr
     assert result.stderr.count("\n") == 1
     assert {path.name for path in results.folder.iterdir()} == before
 
@@ -126,7 +131,7 @@ def test_evaluation_asks_for_the_photographs_by_its_option(results, octasplat, t
 def test_evaluation_with_the_photographs_gives_the_same_figures(results, octasplat, tmp_path):
     copy = tmp_path / "results"
     shutil.copytree(results.folder, copy)
-    result = octasplat("evaluate", copy, "--scene", results.photographs, "--threads", 1)
+    result = octasplat("evaluate", copy, "--dataset", results.photographs, "--threads", 1)
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
     before, after = (json.loads((folder / "metrics.json").read_text()) for folder in (results.folder, copy))
@@ -138,7 +143,7 @@ def test_evaluation_tells_of_other_photographs(results, octasplat, tmp_path):
     shutil.copytree(results.folder, copy)
     shutil.copytree(results.photographs, others)
     shutil.copy(others / "images/view_001.png", others / "images/view_004.png")
-    result = octasplat("evaluate", copy, "--scene", others, "--threads", 1)
+    result = octasplat("evaluate", copy, "--dataset", others, "--threads", 1)
     assert result.exit_code == 0, result.output
     assert "Warning:" in result.stderr and "view_004.png with another file" in result.stderr
 
@@ -148,7 +153,7 @@ def test_poses_that_the_job_found_are_taken_for_bare_photographs(results, octasp
     shutil.copytree(results.folder, copy)
     shutil.copytree(results.photographs / "sparse/0", copy / "poses")
     shutil.copytree(results.photographs / "images", bare / "images")
-    result = octasplat("evaluate", copy, "--scene", bare, "--threads", 1)
+    result = octasplat("evaluate", copy, "--dataset", bare, "--threads", 1)
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
 
@@ -160,7 +165,7 @@ def test_results_of_old_ask_for_the_photographs_by_the_option(results, octasplat
     (copy / "views.json").unlink()
     result = octasplat(command, copy, "-o", tmp_path / "out.glb")
     assert result.exit_code == 1
-    assert "--scene FOLDER" in result.stderr
+    assert "--dataset FOLDER" in result.stderr
     assert not (tmp_path / "out.glb").exists()
 
 

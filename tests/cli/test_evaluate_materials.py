@@ -54,7 +54,7 @@ def scene_with_truth(run, tmp_path_factory) -> Path:
 
 
 def test_materials_light_and_relit_pictures_are_measured(shiny_run, scene_with_truth, octasplat):
-    done = octasplat("evaluate", shiny_run, "--on", scene_with_truth / "test")
+    done = octasplat("evaluate", shiny_run, "--other-dataset", scene_with_truth / "test")
     assert done.exit_code == 0, done.output
     metrics = json.loads((shiny_run / "on" / "test" / "metrics.json").read_text())
     mean = metrics["truth"]["mean"]
@@ -80,7 +80,7 @@ def test_the_run_is_relit_at_its_own_and_at_other_views(shiny_run, scene_with_tr
     own = json.loads((shiny_run / "metrics.json").read_text())["views"]
     assert {path.stem for path in (tmp_path / "own").iterdir()} == {Path(name).stem for name in own}
     done = octasplat(
-        "relight", shiny_run, "--environment", dim, "-o", tmp_path / "on", "--samples", 1, "--on",
+        "relight", shiny_run, "--environment", dim, "-o", tmp_path / "on", "--samples", 1, "--other-dataset",
         scene_with_truth / "test",
     )  # fmt: skip
     assert done.exit_code == 0, done.output

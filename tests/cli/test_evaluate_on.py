@@ -1,4 +1,4 @@
-"""``octasplat evaluate OUT --on FOLDER``: other photographs than the run's, measured beside its results."""
+"""``octasplat evaluate OUT --other-dataset FOLDER``: photographs that are not the run's are measured."""
 
 import json
 import shutil
@@ -35,7 +35,7 @@ def test_views_of_another_folder_are_measured_as_the_run_measures_its_own(run, o
     held_out = set(run.metrics()["views"])
     some = sorted(path.name for path in (run.scene / "images").iterdir())[:3]
     others = part_of(run.scene, tmp_path / "others", {*held_out, *some})
-    result = octasplat("evaluate", run.output, "--on", others)
+    result = octasplat("evaluate", run.output, "--other-dataset", others)
     assert result.exit_code == 0, result.output
     assert "Warning" not in result.output
     measured = run.output / "on" / "others"
@@ -62,7 +62,7 @@ def test_views_of_another_folder_are_measured_as_the_run_measures_its_own(run, o
     assert len(list((results / "renders").iterdir())) == len(pictures)
 
     same_name = part_of(run.scene, tmp_path / "elsewhere" / "others", {some[1]})
-    result = octasplat("evaluate", run.output, "--on", same_name)
+    result = octasplat("evaluate", run.output, "--other-dataset", same_name)
     assert result.exit_code == 1
     assert str(measured) in result.output and "rename" in result.output
     assert json.loads((measured / "metrics.json").read_text()) == metrics
@@ -70,7 +70,9 @@ def test_views_of_another_folder_are_measured_as_the_run_measures_its_own(run, o
 
 def test_a_single_view_is_enough(run, octasplat, tmp_path):
     name = min(path.name for path in (run.scene / "images").iterdir())
-    result = octasplat("evaluate", run.output, "--on", part_of(run.scene, tmp_path / "one", {name}))
+    result = octasplat(
+        "evaluate", run.output, "--other-dataset", part_of(run.scene, tmp_path / "one", {name})
+    )
     assert result.exit_code == 0, result.output
     assert list(json.loads((run.output / "on" / "one" / "metrics.json").read_text())["views"]) == [name]
 
@@ -80,7 +82,7 @@ def test_a_folder_that_cannot_be_used_is_told(run, octasplat, tmp_path, content)
     folder = tmp_path / "odd"
     if content == "images alone":
         shutil.copytree(run.scene / "images", folder / "images")
-    result = octasplat("evaluate", run.output, "--on", folder)
+    result = octasplat("evaluate", run.output, "--other-dataset", folder)
     assert result.exit_code == 1 and str(folder) in result.output
     assert not (run.output / "on" / "odd").exists()
 
@@ -89,6 +91,6 @@ def test_a_file_that_is_no_truth_is_refused(run, octasplat, tmp_path):
     name = min(path.name for path in (run.scene / "images").iterdir())
     folder = part_of(run.scene, tmp_path / "odd_truth", {name})
     (folder / "truth.json").write_text('{"answer": 42}')
-    result = octasplat("evaluate", run.output, "--on", folder)
+    result = octasplat("evaluate", run.output, "--other-dataset", folder)
     assert result.exit_code == 1 and str(folder / "truth.json") in result.output
     assert not (run.output / "on" / "odd_truth").exists()

@@ -35,7 +35,7 @@ def test_result_holds_the_figures_of_the_metrics_file(copy):
 
 
 def test_smaller_sizes_are_the_same_by_command_and_job(copy, run, octasplat, tmp_path):
-    done = octasplat("evaluate", copy, "--scene", run.scene, "--scales", "4,2,2", "--threads", 1)
+    done = octasplat("evaluate", copy, "--dataset", run.scene, "--scales", "4,2,2", "--threads", 1)
     assert done.exit_code == 0, done.output
     found = json.loads((copy / "scales.json").read_text())
     assert list(found) == ["1/2", "1/4"] and f"{found['1/2']['4']:.2f} dB with 4" in done.output
@@ -51,7 +51,7 @@ def test_smaller_sizes_are_the_same_by_command_and_job(copy, run, octasplat, tmp
 
 def test_all_views_and_another_background(copy, run, octasplat):
     before = (copy / "metrics.json").read_bytes()
-    done = octasplat("evaluate", copy, "--all-views", "--background", "white", "--threads", 1)
+    done = octasplat("evaluate", copy, "--all-views", "--evaluation-background", "white", "--threads", 1)
     assert done.exit_code == 0, done.output
     metrics = json.loads((copy / "on" / run.scene.name / "metrics.json").read_text())
     assert len(metrics["views"]) == 8 and metrics["background"] == "white"
@@ -68,9 +68,9 @@ def test_a_wish_to_stop_is_heard(copy):
     [
         ({"scales": "2,none"}, "scales: scales are whole numbers from 1 on"),
         ({"scales": [0, 2]}, "scales: scales are whole numbers from 1 on"),
-        ({"scales": "2", "on": "a"}, "leave out on"),
+        ({"scales": "2", "other_dataset": "a"}, "leave out other_dataset"),
         ({"scales": "2", "all_views": True}, "leave out all_views"),
-        ({"on": "a", "dataset": "b"}, "choose one of dataset"),
+        ({"other_dataset": "a", "dataset": "b"}, "choose one of dataset"),
     ],
 )
 def test_what_contradicts_is_refused_in_a_sentence(values, told):

@@ -33,7 +33,7 @@ def glb_json(path):
 
 def test_options_reach_a_glb(run, octasplat, tmp_path):
     target = tmp_path / "scene.glb"
-    options = ("--opaque", "--chunks", 1, "--texture", 16, "--no-ids")
+    options = ("--opaque", "--chunks", 1, "--falloff-texture-size", 16, "--no-ids")
     result = octasplat("export", run.output / "scene.ply", target, *options)
     assert result.exit_code == 0, result.output
     document = glb_json(target)
@@ -115,7 +115,7 @@ def test_the_one_colour_of_a_format_without_harmonics_is_chosen(run, octasplat, 
     colours = {}
     for colour in ("constant", "cameras", "0,0,1"):
         path = tmp_path / f"{colour}.splat"
-        result = octasplat("export", run.output, path, "--colour", colour)
+        result = octasplat("export", run.output, path, "--color", colour)
         assert result.exit_code == 0, result.output
         colours[colour] = read_scene(path)[0].base_rgb_srgb
     gaussians = read_scene(run.output)[0]
@@ -123,7 +123,7 @@ def test_the_one_colour_of_a_format_without_harmonics_is_chosen(run, octasplat, 
         assert "will be left out" in result.stderr
         assert all(np.abs(colours["constant"] - colours[name]).max() > 0.01 for name in ("cameras", "0,0,1"))
     for text in ("red", "1,2", "0,0,0"):
-        result = octasplat("export", run.output, tmp_path / "x.splat", "--colour", text)
+        result = octasplat("export", run.output, tmp_path / "x.splat", "--color", text)
         assert result.exit_code == 1 and not (tmp_path / "x.splat").exists()
 
 
@@ -153,8 +153,8 @@ def test_for_viewers_is_for_octagon_glb(run, octasplat, tmp_path):
 
 def test_a_colour_that_no_format_takes_is_told(run, octasplat, tmp_path):
     told = "colour goes with formats of one colour"
-    done = octasplat("export", run.output, tmp_path / "a.spz", "--colour", "constant")
+    done = octasplat("export", run.output, tmp_path / "a.spz", "--color", "constant")
     assert done.exit_code == 0 and told in done.stderr
     both = (tmp_path / "b.spz", tmp_path / "b.glb")
-    done = octasplat("export", run.output, *both, "--colour", "constant", "--threads", 1)
+    done = octasplat("export", run.output, *both, "--color", "constant", "--threads", 1)
     assert done.exit_code == 0 and told not in done.output, done.output

@@ -24,7 +24,7 @@ def test_uneven_photographs_are_told_and_held_out_ones_exposed_alike(uneven, oct
     result = octasplat("reconstruct", uneven, "-o", tmp_path / "fixed", *tiny, *fixed, "--exports", "")
     assert result.exit_code == 0 and "exposure" not in result.output, result.output
     assert "exposures" not in json.loads((tmp_path / "fixed" / "training.json").read_text())
-    quick = ("--set", "rates.exposure=0.03")
+    quick = ("--set", "lr.exposure=0.03")
     result = octasplat("reconstruct", uneven, "-o", tmp_path / "learnt", *tiny, *quick, "--exports", "")
     assert result.exit_code == 0 and "exposure=false" in result.output, result.output
     exposures = json.loads((tmp_path / "learnt" / "training.json").read_text())["exposures"]

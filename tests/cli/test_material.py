@@ -60,7 +60,7 @@ def test_the_folder_is_a_run_for_every_command(shiny_run, changed, octasplat, tm
     assert (changed / "environment.hdr").read_bytes() == (shiny_run / "environment.hdr").read_bytes()
     [note] = json.loads((changed / "edits.json").read_text())
     assert note["where"] == "x > 0 and roughness < 0.6" and note["set"]["metallic"] == 0
-    light = ("--environment", changed / "environment.hdr", "--by", "path", "--samples", 4)
+    light = ("--environment", changed / "environment.hdr", "--integrator", "path", "--samples", 4)
     for run, name in ((shiny_run, "old"), (changed, "new")):
         assert octasplat("relight", run, *light, "-o", tmp_path / name).exit_code == 0
     old, new = (read_image(tmp_path / name / f"{VIEW}.png") for name in ("old", "new"))
@@ -161,7 +161,7 @@ def test_a_mask_means_what_shows_under_it(shiny_run, octasplat, tmp_path):
     mask = np.zeros((96, 128), np.uint8)
     mask[:, :64] = 255
     Image.fromarray(mask).save(tmp_path / f"{VIEW}.png")
-    light = ("--environment", shiny_run / "environment.hdr", "--by", "path", "--samples", 4)
+    light = ("--environment", shiny_run / "environment.hdr", "--integrator", "path", "--samples", 4)
     pictures = []
     for name, inverse in (("in", ()), ("out", ("--inverse",))):
         done = octasplat(

@@ -12,7 +12,7 @@ from octasplat.engine.gaussians.materials import has_materials
 from octasplat.engine.render.environment_map import read_environment
 
 MATERIALS = (
-    "--materials", "--set", "materials.environment_height=16", "--set", "materials.ambient_rays=4",
+    "--materials", "--set", "materials.environment_height=16", "--set", "materials.ambient_occlusion_rays=4",
     "--exports", "",
 )  # fmt: skip
 
@@ -36,7 +36,7 @@ def test_it_leaves_materials_and_an_environment(materials_run):
     exact = read_environment(materials_run / "environment.exr")
     assert (np.abs(environment - exact) <= exact.max(axis=2, keepdims=True) / 255).all()
     train = json.loads((materials_run / "config.json").read_text())["reconstruction"]["train"]
-    assert train["materials"]["learn"] is True and train["rates"]["quat"] < 0.01
+    assert train["materials"]["learn"] is True and train["lr"]["quat"] < 0.01
 
 
 def test_it_is_measured_as_it_is_shaded(materials_run, octasplat):

@@ -42,12 +42,27 @@ TEXTS = (
         "black",
         "auto",
         "fast",
-        "paper",
+        "redisplats",
     ),
     *("NaN", "x", '"learnt"', "[1, 0, 0]", "{}", "mcmc", "area", "given", "world"),
 )
-CHANGED = {"rays": ("64", "4096"), "rates.quat": ("0.02",), "seed": ("1", "2"), "test_every": ("0", "4")}
-UNKNOWN = ("window_ray", "rates.quats", "train.speed", "densify", "materials", "rays.x", "a..b", "", "train")
+CHANGED = {
+    "rays_per_batch": ("64", "4096"),
+    "lr.quat": ("0.02",),
+    "seed": ("1", "2"),
+    "test_every": ("0", "4"),
+}
+UNKNOWN = (
+    "window_ray",
+    "lr.quats",
+    "train.speed",
+    "densify",
+    "materials",
+    "rays_per_batch.x",
+    "a..b",
+    "",
+    "train",
+)
 
 
 DEFAULTS = {entry.name: entry.defaults for entry in catalog()}
@@ -175,25 +190,31 @@ def _nested(preset: str, materials: bool, given: list[str]) -> dict[str, Any]:
 def test_materials_bring_all_their_settings_however_they_are_switched_on(options: dict[str, Any]) -> None:
     config = by_python({"preset": "fast", **options})
     assert isinstance(config, ReconstructionConfig)
-    assert config.train.materials.learn and config.train.rays == 8192 and config.train.sh_degree == 1
-    assert (config.train.one_order, config.train.rates.quat, config.train.iterations) == (0.0, 1e-3, 1400)
+    assert (
+        config.train.materials.learn and config.train.rays_per_batch == 8192 and config.train.sh_degree == 1
+    )
+    assert (config.train.shared_sort_until, config.train.lr.quat, config.train.iterations) == (
+        0.0,
+        1e-3,
+        1400,
+    )
 
 
 def test_the_preset_paper_is_refused_with_materials_in_a_sentence() -> None:
-    refused = by_python({"preset": "paper", "assignments": ["materials.learn=true"]})
+    refused = by_python({"preset": "redisplats", "assignments": ["materials.learn=true"]})
     assert refused == (
-        "The preset paper is for scenes without materials; with materials choose fast, standard or high."
+        "The preset redisplats is for scenes without materials; with materials choose fast, standard or high."
     )
 
 
 @pytest.mark.parametrize(
     ("assignment", "sentence"),
     [
-        ("window_ray=3", "There is no setting 'window_ray'; the nearest is window_rays."),
-        ("rate.quat=3", "There is no setting 'rate.quat'; the nearest is rates.quat."),
-        ("rays=3", "rays: Input should be greater than or equal to 64 (it is 3)."),
-        ("train.rates.quat=-1", "rates.quat: Input should be greater than or equal to 0 (it is -1)."),
-        ("rays", "rays: write an assignment as name=value, e.g. rates.mean=2e-4."),
+        ("window_ray=3", "There is no setting 'window_ray'; the nearest is ray_patch_rays."),
+        ("rate.quat=3", "There is no setting 'rate.quat'; the nearest is lr.quat."),
+        ("rays_per_batch=3", "rays_per_batch: Input should be greater than or equal to 64 (it is 3)."),
+        ("train.lr.quat=-1", "lr.quat: Input should be greater than or equal to 0 (it is -1)."),
+        ("rays", "rays: write an assignment as name=value, e.g. lr.mean=2e-4."),
         (
             "materials.learn=true",
             "refine_poses aligns photographs by what keeps its place, which reflections do not: leave it or "
@@ -208,25 +229,33 @@ def test_settings_that_cannot_be_used_are_refused_in_a_short_sentence(assignment
 def test_options_of_a_job_of_the_last_version_are_kept_as_they_are() -> None:
     kind = kind_named("reconstruct")
     before = (
-        ReconstructOptions(preset="standard", assignments=("rays=4096",)).config().model_dump(mode="json")
+        ReconstructOptions(preset="standard", assignments=("rays_per_batch=4096",))
+        .config()
+        .model_dump(mode="json")
     )
     before["train"]["trace"]["t_min"] = 0.0  # a constant by now
     before["poses"] = "given"
-    assert kind.options.model_validate(before).train.rays == 4096
+    assert kind.options.model_validate(before).train.rays_per_batch == 4096
     revised = kind.revised(before, {"exports": ["scene.spz"]})
-    assert revised.exports == ("scene.spz",) and revised.train.rays == 4096 and revised.poses == "given"
-    paper = ReconstructOptions(preset="paper").config().model_dump(mode="json")
+    assert (
+        revised.exports == ("scene.spz",)
+        and revised.train.rays_per_batch == 4096
+        and revised.poses == "given"
+    )
+    paper = ReconstructOptions(preset="redisplats").config().model_dump(mode="json")
     paper["train"]["materials"]["learn"] = True  # which the last version accepted
     assert kind.revised(paper, {"exports": []}).train.materials.learn
 
 
 def test_materials_that_a_retry_switches_on_bring_their_settings_and_keep_what_was_asked_for() -> None:
     kind = kind_named("reconstruct")
-    before = ReconstructOptions(preset="fast", assignments=("rays=4096", "seed=7")).config()
+    before = ReconstructOptions(preset="fast", assignments=("rays_per_batch=4096", "seed=7")).config()
     changed = kind.revised(before.model_dump(mode="json"), {"materials": True})
     assert (
         changed
-        == ReconstructOptions(preset="fast", materials=True, assignments=("rays=4096", "seed=7")).config()
+        == ReconstructOptions(
+            preset="fast", materials=True, assignments=("rays_per_batch=4096", "seed=7")
+        ).config()
     )
     back = kind.revised(changed.model_dump(mode="json"), {"train": {"materials": {"learn": False}}})
     assert back == before

@@ -101,7 +101,7 @@ def test_a_texture_of_a_surface_replaces_no_picture_of_somebody_else(here, octas
     monkeypatch.chdir(here)
     Image.new("RGB", (4, 4)).save("chair.png")
     before = Path("chair.png").read_bytes()
-    refused = octasplat("surface", "scene.ply", "-o", "chair.obj", "--texture", "64")
+    refused = octasplat("surface", "scene.ply", "-o", "chair.obj", "--texture-size", "64")
     assert refused.exit_code == 1 and "chair.png is there already" in refused.stderr, refused.output
     assert Path("chair.png").read_bytes() == before and not Path("chair.obj").exists()
 

@@ -157,11 +157,11 @@ def test_preview_job_is_one_picture(run, octasplat, tmp_path):
         (
             {
                 "mode": "camera", "camera": [12, 12, 8], "format": "png", "background": "environment",
-                "by": "path", "samples": 2, "depth": 3, "up": "z", **SIZE,
+                "integrator": "path", "samples": 2, "max_bounces": 3, "up": "z", **SIZE,
             },
             (
-                "--camera", 12, 12, 8, "--background", "environment", "--by", "path", "--samples", 2,
-                "--depth", 3, "--up", "z", *SIZE_WORDS,
+                "--camera", 12, 12, 8, "--background", "environment", "--integrator", "path", "--samples", 2,
+                "--max-bounces", 3, "--up", "z", *SIZE_WORDS,
             ),
             "still",
         ),
@@ -246,12 +246,12 @@ def test_options_of_the_last_version_are_still_read():
         )
         assert (found.width_px, found.height_px, found.background) == (640, 480, None)
     light = {
-        "environments": ["a.hdr"], "by": "path", "samples": None, "depth": 6, "rotation_degrees": -90.0,
-        "clamp": None, "spin": False,
+        "environments": ["a.hdr"], "integrator": "path", "samples": None, "max_bounces": 6,
+        "rotation_degrees": -90.0, "clamp": None, "spin": False,
     }  # fmt: skip
     found = kind_named("relight").resolve({**old, **light})
     assert [path.as_posix() for path in found.environments] == ["a.hdr"]
-    assert (found.by, found.samples_per_pixel, found.rotation_degrees) == ("path", 64, -90)
+    assert (found.integrator, found.samples_per_pixel, found.rotation_degrees) == ("path", 64, -90)
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_settings_reach_the_run(run):
     config = json.loads((run.output / "config.json").read_text())["reconstruction"]
     assert config["preset"] == "fast"
     assert config["test_every"] == 4
-    assert config["train"]["rays"] == 256
+    assert config["train"]["rays_per_batch"] == 256
     assert config["train"]["initial_points"] == 300
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from neighbouring_photographs import write_neighbours
 from octasplat.engine.poses.photographs import photographs_in
 
-PATCH_TOO_LARGE = ("--set", "patch_side=64", "--set", "loss.ssim=0.2", "--max-side", "32")
+PATCH_TOO_LARGE = ("--set", "ssim_patch_side=64", "--set", "loss.ssim=0.2", "--max-side", "32")
 """Settings that the photographs rule out, which is known only when they are open."""
 
 

@@ -46,7 +46,7 @@ def test_small_pictures_are_what_making_large_ones_smaller_gives(run, octasplat,
 def test_views_of_a_run_whose_photographs_moved(run, octasplat, tmp_path):
     moved = tmp_path / "moved"
     moved.symlink_to(run.scene)
-    result = octasplat("render", run.output, "-o", tmp_path / "out", "--scene", moved, "--quiet")
+    result = octasplat("render", run.output, "-o", tmp_path / "out", "--dataset", moved, "--quiet")
     assert result.exit_code == 0, result.output
     assert result.output == ""
 

@@ -74,8 +74,8 @@ def test_photographs_of_another_folder_are_another_relight(run, shiny_run, tmp_p
     rotation = middle.cam_from_world().rotation
     middle.frame.rig_from_world = pycolmap.Rigid3d(rotation, middle.cam_from_world().translation * 1.1)
     model.write_binary(str(moved / "sparse/0"))
-    module, one = request_of("relight", shiny_run, tmp_path / "out", on=run.scene)
-    _, other = request_of("relight", shiny_run, tmp_path / "out", on=moved)
+    module, one = request_of("relight", shiny_run, tmp_path / "out", other_dataset=run.scene)
+    _, other = request_of("relight", shiny_run, tmp_path / "out", other_dataset=moved)
     stopped_after_one(module, one)
     assert not goes_on(module, other)
     assert goes_on(module, one)

@@ -23,9 +23,9 @@ def test_run_to_each_format(run, octasplat, tmp_path):
 
 def test_everything_at_once(run, octasplat, tmp_path):
     result = octasplat(
-        "surface", run.output / "scene.ply", "--scene", run.scene, "-o", tmp_path / "new" / "a.obj", *SMALL,
+        "surface", run.output / "scene.ply", "--dataset", run.scene, "-o", tmp_path / "new" / "a.obj", *SMALL,
         "--bounds", "-1,-1,-0.5,1,1,1", "--components", 1, "--fill-holes", "all", "--max-triangles", 500,
-        "--texture", 128, "--threads", 1,
+        "--texture-size", 128, "--threads", 1,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     mesh = trimesh.load(tmp_path / "new" / "a.obj", force="mesh", process=False)
@@ -37,7 +37,7 @@ def test_everything_at_once(run, octasplat, tmp_path):
 
 
 def test_several_levels_of_detail_are_those_that_come_one_by_one(run, octasplat, tmp_path):
-    options = (*SMALL, "--texture", 64, "--threads", 1)
+    options = (*SMALL, "--texture-size", 64, "--threads", 1)
     result = octasplat(
         "surface", run.output, "-o", tmp_path / "a.glb", *options, "--max-triangles", "0.3k,100"
     )
@@ -74,12 +74,12 @@ def test_file_alone_is_seen_from_all_around(run, octasplat, tmp_path):
     ("options", "complaint"),
     [
         (("-o", "a.stl"), "written as .glb, .ply or .obj"),
-        (("-o", "a.ply", "--texture", 128), "holds no texture"),
+        (("-o", "a.ply", "--texture-size", 128), "holds no texture"),
         (("-o", "a.glb", "--unbounded", "--bounds", "0,0,0,1,1,1"), "contradict"),
         (("-o", "a.glb", "--bounds", "0,0,0,1,1,0"), "x0 < x1"),
         (("-o", "a.glb", "--bounds", "90,90,90,91,91,91"), "--bounds"),
         (("-o", "a.glb", "--max-memory", "0.0001"), "allowed"),
-        (("-o", "a.glb", "--scene", "nowhere"), "nowhere"),
+        (("-o", "a.glb", "--dataset", "nowhere"), "nowhere"),
     ],
 )
 def test_refusals_are_one_sentence(run, octasplat, tmp_path, monkeypatch, options, complaint):

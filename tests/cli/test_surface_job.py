@@ -33,11 +33,11 @@ def results_of(run: Path, attempt: Path, options: dict[str, object], **task: obj
 def test_job_with_photographs_gives_the_bytes_of_the_command(run, octasplat, tmp_path):
     done = octasplat(
         "surface", run.output, "-o", tmp_path / "surface.obj", "--resolution", 48, "--depth-side", 48,
-        "--min-component", 0, "--texture", 64, "--max-triangles", "0.3k,100", "--threads", 1,
+        "--min-component", 0, "--texture-size", 64, "--max-triangles", "0.3k,100", "--threads", 1,
     )  # fmt: skip
     assert done.exit_code == 0, done.output
     options = {
-        "resolution": 48, "depth_side": 48, "min_component": 0, "texture_side": 64,
+        "resolution": 48, "depth_side": 48, "min_component": 0, "texture_size": 64,
         "max_triangles": ["0.3k", 100], "format": "obj",
     }  # fmt: skip
     results = results_of(run.output, tmp_path / "attempt", options, scene=run.scene)
@@ -75,10 +75,21 @@ def test_photographs_of_a_scene_that_was_moved_give_no_colours(run, octasplat, t
 
 
 def test_materials_bring_their_light(shiny_run, octasplat, tmp_path):
-    few = ("--resolution", 32, "--depth-side", 32, "--texture", 64, "--max-triangles", 300, "--threads", 1)
+    few = (
+        "--resolution",
+        32,
+        "--depth-side",
+        32,
+        "--texture-size",
+        64,
+        "--max-triangles",
+        300,
+        "--threads",
+        1,
+    )
     assert octasplat("surface", shiny_run, "--materials", "-o", tmp_path / "a.glb", *few).exit_code == 0
     options = {
-        "materials": True, "resolution": 32, "depth_side": 32, "texture_side": 64, "max_triangles": 300,
+        "materials": True, "resolution": 32, "depth_side": 32, "texture_size": 64, "max_triangles": 300,
     }  # fmt: skip
     results = results_of(shiny_run, tmp_path / "attempt", options)
     assert sorted(path.name for path in results.iterdir()) == ["environment.hdr", "surface.glb"]
@@ -113,11 +124,11 @@ def test_presets_decide_what_is_left_open():
     decided = {name: getattr(room, name) for name in ROOM}
     assert decided == {**ROOM, "resolution": 99, "unseen": "open"}
     lit = SURFACE.resolve({"materials": True, "max_triangles": "5k"})
-    assert lit.texture_side == MATERIAL_DEFAULTS["texture_side"] and dict(lit.levels) == {"5k": 5000}
+    assert lit.texture_size == MATERIAL_DEFAULTS["texture_size"] and dict(lit.levels) == {"5k": 5000}
     plain = SURFACE.revised(room.model_dump(mode="json"), {"room": False})
     assert plain == SURFACE.resolve({"resolution": 99})
     request = SurfaceRequest(source="a.ply", output="b.glb", room=True, max_triangles=("5k", "60000"))
-    assert request.settle and [path.name for path in request.outputs] == ["b_5k.glb", "b_60000.glb"]
+    assert request.refine_vertices and [path.name for path in request.outputs] == ["b_5k.glb", "b_60000.glb"]
 
 
 def test_photographs_are_asked_for_where_colours_are_fitted():
@@ -128,7 +139,7 @@ def test_photographs_are_asked_for_where_colours_are_fitted():
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"format": "ply", "texture_side": 128}, "a PLY holds no texture"),
+        ({"format": "ply", "texture_size": 128}, "a PLY holds no texture"),
         ({"format": "obj", "materials": True}, "materials are written as .glb"),
         ({"up": "z"}, "up: goes with materials"),
         ({"unbounded": True, "bounds": "0,0,0,1,1,1"}, "contradict"),
@@ -143,11 +154,11 @@ def test_what_contradicts_is_refused(options, told):
 
 def test_maps_and_levels_of_a_surface_have_ceilings():
     kind = kind_named("surface")
-    options = kind.resolve({"depth_side": 8000, "texture_side": 4096, "max_triangles": "5k,50k"})
+    options = kind.resolve({"depth_side": 8000, "texture_size": 4096, "max_triangles": "5k,50k"})
     amounts = {(found.path, found.of): found.amount for found in kind.demands(options, [Sizes(400, 300, 10)])}
     assert amounts == {
         ("depth_side", "side_px"): 8000,
-        ("texture_side", "side_px"): 4096,
+        ("texture_size", "side_px"): 4096,
         ("depth_side", "render_pixels"): 10 * 8000 * 6000,
         ("max_triangles", "exports"): 2,
     }

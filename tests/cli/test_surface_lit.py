@@ -11,7 +11,7 @@ from octasplat.engine.gaussians.frames import frames_from_normals, quaternions
 from octasplat.engine.gaussians.model import FlatGaussians
 from octasplat.engine.render.environment_map import write_environment
 
-SMALL = ("--resolution", 32, "--depth-side", 24, "--texture", 64, "--max-triangles", 400, "--threads", 1)
+SMALL = ("--resolution", 32, "--depth-side", 24, "--texture-size", 64, "--max-triangles", 400, "--threads", 1)
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ pytestmark = [
     pytest.mark.skipif(lacking() is not None, reason=str(lacking())),
 ]
 FEW = {
-    "iterations": 60, "rays": 256, "max_gaussians": 400, "initial_points": 300, "probe_rays": 256,
+    "iterations": 60, "rays_per_batch": 256, "max_gaussians": 400, "initial_points": 300, "probe_rays": 256,
 }  # fmt: skip
 TOKEN = "octa_of_this_test"
 

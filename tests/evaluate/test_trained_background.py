@@ -16,13 +16,13 @@ from octasplat.engine.writing import write_json
 )
 def test_the_default_is_that_of_the_training(trained: str, measured: str) -> None:
     config = resolve_config("fast", assignments=[f"background={trained}"])
-    assert config.evaluate_background == measured
+    assert config.evaluation_background == measured
 
 
 def test_another_one_is_taken_where_it_is_asked_for(tmp_path: Path) -> None:
-    asked = {"evaluate_background": "black"}
+    asked = {"evaluation_background": "black"}
     config = resolve_config("fast", settings=asked, assignments=["background=white"])
-    assert config.evaluate_background == "black"
+    assert config.evaluation_background == "black"
     write_json(tmp_path / "config.json", {"reconstruction": config.model_dump(mode="json")})
     assert read_config(tmp_path / "config.json") == config
     assert ReconstructionConfig.model_validate(config.model_dump()) == config
@@ -39,8 +39,8 @@ def test_a_mismatch_is_told_for_photographs_without_alpha(tmp_path: Path) -> Non
         return [event.message for event in events if isinstance(event, Warned)]
 
     assert not any("measured on" in message for message in told())
-    assert any("trained on white and measured on black" in m for m in told(evaluate_background="black"))
+    assert any("trained on white and measured on black" in m for m in told(evaluation_background="black"))
     mismatched = resolve_config(
-        "fast", settings={"evaluate_background": "black"}, assignments=["background=white"]
+        "fast", settings={"evaluation_background": "black"}, assignments=["background=white"]
     )
     assert mismatched.background_mismatch(has_alpha=True) is None

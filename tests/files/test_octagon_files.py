@@ -141,7 +141,9 @@ def test_obj_holds_the_same_octagons(
 
 
 def test_obj_texture_is_the_fall_off_as_grey(make_scene: Make, tmp_path: Path) -> None:
-    _, _, texture = export_scene(make_scene(9), tmp_path / "a.obj", ExportOptions(q=6.0, texture_size=32))
+    _, _, texture = export_scene(
+        make_scene(9), tmp_path / "a.obj", ExportOptions(q=6.0, falloff_texture_size=32)
+    )
     pixels = oiio.ImageBuf(str(texture)).get_pixels(oiio.UINT8)
     assert pixels.shape == (32, 32, 1)
     x = (np.arange(32) + 0.5) / 16 - 1

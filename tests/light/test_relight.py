@@ -38,7 +38,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("by", ["split-sum", "path"])
 def test_white_light_makes_white_metal_as_bright_as_itself(scene, tmp_path, by):
     done = relight(
-        scene / "ball.ply", "--environment", scene / "white.hdr", "-o", tmp_path, "--exr", "--by", by, *SMALL
+        scene / "ball.ply",
+        "--environment",
+        scene / "white.hdr",
+        "-o",
+        tmp_path,
+        "--exr",
+        "--integrator",
+        by,
+        *SMALL,
     )
     assert done.exit_code == 0, done.output
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frame_0000.exr", "frame_0001.exr"]
@@ -78,7 +86,7 @@ def test_a_turned_environment_is_the_map_turned(scene, tmp_path, by, least):
     for name, environment, turn in (("a", "turned.exr", 0), ("b", "sides.exr", 180), ("c", "sides.exr", 0)):
         done = relight(
             scene / "ball.ply", "--environment", scene / environment, "--rotate", turn, "-o", tmp_path / name,
-            "--by", by, *SMALL,
+            "--integrator", by, *SMALL,
         )  # fmt: skip
         assert done.exit_code == 0, done.output
     a, b, c = (read_image(tmp_path / name / "frame_0000.png") for name in "abc")

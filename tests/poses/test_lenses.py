@@ -18,7 +18,13 @@ from octasplat.engine.scene.load import load_scene
 VIEWS = 20
 NOISE_PX = 0.3
 SHIFTS_PX = np.random.default_rng(7).uniform(-12, 12, (VIEWS, 2)).round()
-SETTINGS = ("iterations=1000", "rays=512", "max_gaussians=500", "probe_rays=256", "place_misfits=false")
+SETTINGS = (
+    "iterations=1000",
+    "rays_per_batch=512",
+    "max_gaussians=500",
+    "probe_rays=256",
+    "repair_poses=false",
+)
 
 
 def write_scene(root: Path, shifts_px: np.ndarray) -> Path:
@@ -145,7 +151,9 @@ def test_a_run_frees_them_by_itself_and_goes_on(moved: Path, tmp_path: Path) -> 
     assert len(cameras) == VIEWS
 
     begun.clear()
-    config = resolve_config("fast", settings={"exports": ()}, assignments=[*SETTINGS, "free_lenses=false"])
+    config = resolve_config(
+        "fast", settings={"exports": ()}, assignments=[*SETTINGS, "per_view_principal_point=false"]
+    )
     with pytest.raises(Cancelled):
         reconstruct(
             moved, tmp_path / "given", config, listener=note, should_stop=lambda: begun[-1:] == ["train"]

@@ -20,7 +20,13 @@ pytestmark = pytest.mark.heavy
 SWAPPED = ("view_003.png", "view_010.png")
 INNOCENT = "view_006.png"
 VIEWS = 24
-SETTINGS = ("iterations=1000", "rays=512", "max_gaussians=500", "probe_rays=256", "place_misfits=true")
+SETTINGS = (
+    "iterations=1000",
+    "rays_per_batch=512",
+    "max_gaussians=500",
+    "probe_rays=256",
+    "repair_poses=true",
+)
 
 
 @pytest.fixture(scope="module")
@@ -129,5 +135,5 @@ def test_a_run_finds_them_by_itself(scene: Path, tmp_path: Path) -> None:
     shutil.rmtree(output / "checkpoints")
     assert stages_until("train", scene, output) == ["load", "train"]
     as_given = tmp_path / "given"
-    assert stages_until("train", scene, as_given, "place_misfits=false") == ["load", "train"]
+    assert stages_until("train", scene, as_given, "repair_poses=false") == ["load", "train"]
     assert not (as_given / "poses").exists()

@@ -18,7 +18,7 @@ from octasplat.workers.client.api import Api
 pytestmark = pytest.mark.heavy
 
 FEW = (
-    "--set", "iterations=60", "--set", "train.rays=256", "--set", "train.max_gaussians=400",
+    "--set", "iterations=60", "--set", "train.rays_per_batch=256", "--set", "train.max_gaussians=400",
     "--set", "train.initial_points=300", "--set", "train.probe_rays=256", "--set", "test_every=4",
 )  # fmt: skip
 

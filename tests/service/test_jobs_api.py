@@ -45,6 +45,21 @@ def is_problem(answer: httpx.Response, status: int, code: str) -> bool:
     return answer.json()["status"] == status and answer.json()["detail"].endswith((".", "!"))
 
 
+def test_former_names_of_options_are_read_and_noted_in_the_answer(talk: Callable[..., None]) -> None:
+    async def conversation(http: httpx.AsyncClient, service: Service) -> None:
+        dataset = await committed_dataset(service)
+        former = {"preset": "paper", "train": {"rates": {"quat": 0.5}, "rays": 512}}
+        job = (await http.post("/v1/jobs", json={"dataset_id": dataset, "options": former})).json()
+        new = {"preset": "redisplats", "train": {"lr": {"quat": 0.5}, "rays_per_batch": 512}}
+        same = (await http.post("/v1/jobs", json={"dataset_id": dataset, "options": new})).json()
+        assert job["options"] == same["options"]
+        notes = [note for note in job["notes"] if "rates.quat is called lr.quat now" in note]
+        assert notes and set(job["notes"]) - set(same["notes"]) >= set(notes)
+        assert not [note for note in same["notes"] if "is called" in note]
+
+    talk(conversation)
+
+
 def test_job_is_accepted_with_every_setting(talk: Callable[..., None]) -> None:
     async def conversation(http: httpx.AsyncClient, service: Service) -> None:
         dataset = await committed_dataset(service)
@@ -354,7 +369,7 @@ def test_what_the_service_is(talk: Callable[..., None]) -> None:
         assert {"reconstruct", "evaluate", "export", "render", "toy"} <= set(info["kinds"])
         assert "glb" in [form["name"] for form in info["formats"]] and info["needs_token"] is False
         schema = (await http.get("/v1/options/reconstruct")).json()["options"]
-        assert schema["properties"]["preset"]["enum"] == ["fast", "standard", "high", "paper"]
+        assert schema["properties"]["preset"]["enum"] == ["fast", "standard", "high", "redisplats"]
         assert is_problem(await http.get("/v1/options/nothing"), 404, "not-found")
         await new_job(http, service)
         (cpu,) = (await http.get("/v1/queues")).json()["queues"]

@@ -57,7 +57,7 @@ def ceiling(answer: httpx.Response) -> tuple[str, int]:
     [
         ({"train": {"iterations": 10**20}}, "#/options/train/iterations", 100_000),
         ({"train": {"max_gaussians": 2e9}}, "#/options/train/max_gaussians", 5_000_000),
-        ({"train": {"rays": 10**9}}, "#/options/train/rays", 1 << 20),
+        ({"train": {"rays_per_batch": 10**9}}, "#/options/train/rays_per_batch", 1 << 20),
         ({"train": {"probe_rays": 10**9}}, "#/options/train/probe_rays", 1 << 20),
         ({"max_side": 10**6}, "#/options/max_side", 16_384),
         ({"exports": [f"{n}.glb" for n in range(21)]}, "#/options/exports", 20),
@@ -140,10 +140,10 @@ def test_what_a_job_takes_is_estimated_before_and_when_it_is_made(talk: Callable
         assert "on 2 cores and" in fast["text"] and not fast["finds_poses"]
         for changes, more in (
             ({"train": {"iterations": 4000}}, "cpu_seconds"),
-            ({"train": {"rays": 32_768}}, "cpu_seconds"),
+            ({"train": {"rays_per_batch": 32_768}}, "cpu_seconds"),
             ({"train": {"max_gaussians": 80_000}}, "cpu_seconds"),
             ({"train": {"max_gaussians": 1_000_000}}, "memory_bytes"),
-            ({"train": {"rays": 200_000}}, "memory_bytes"),
+            ({"train": {"rays_per_batch": 200_000}}, "memory_bytes"),
         ):
             other = await estimate({"preset": "fast", **changes}, photographs=PHOTOGRAPHS)
             assert other[more] > 1.2 * fast[more], changes

@@ -57,7 +57,7 @@ def test_options_are_those_of_the_kind(document: dict[str, Any], job: dict[str, 
 def test_defaults_that_a_preset_decides_are_left_out(document: dict[str, Any]) -> None:
     schemas = document["components"]["schemas"]
     options = schemas["ReconstructOptions"]["properties"]
-    assert "default" not in options["train"]["properties"]["rays"]
+    assert "default" not in options["train"]["properties"]["rays_per_batch"]
     assert "default" not in schemas["LearningRates"]["properties"]["quat"]
     assert options["test_every"]["default"] == 8
     assert schemas["McmcConfig"]["properties"]["kind"]["default"] == "mcmc"

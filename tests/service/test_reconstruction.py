@@ -29,9 +29,17 @@ pytestmark = pytest.mark.heavy
 
 ROOT = Path(__file__).parents[2]
 TRAIN = {
-    "iterations": 500, "rays": 512, "sh_degree": 1, "max_gaussians": 500, "initial_points": 400,
-    "fit_iterations": 20, "rebuild_every": 25, "checkpoint_every": 25, "probe_rays": 256, "stop_early": 0,
-}  # fmt: skip
+    "iterations": 500,
+    "rays_per_batch": 512,
+    "sh_degree": 1,
+    "max_gaussians": 500,
+    "initial_points": 400,
+    "densify_from_iter": 20,
+    "rebuild_every": 25,
+    "checkpoint_every": 25,
+    "probe_rays": 256,
+    "early_stopping_db": 0,
+}
 OPTIONS: dict[str, Any] = {"preset": "fast", "train": TRAIN}
 
 

@@ -194,7 +194,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("staged")
     config = GeneratedSceneConfig(views=8, width_px=48, height_px=36, samples_per_side=1, points=500)
     write_generated_scene(root / "scene", config)
-    train = {"iterations": 20, "rays": 512, "max_gaussians": 500, "initial_points": 400, "fit_iterations": 0}
+    train = {
+        "iterations": 20,
+        "rays_per_batch": 512,
+        "max_gaussians": 500,
+        "initial_points": 400,
+        "densify_from_iter": 0,
+    }
     asked = options_of({"preset": "fast", "train": train, "exports": ["mesh.ply"]})
     reconstruct(root / "scene", root / "run", asked.config(), threads=1)
     (root / "things").mkdir()

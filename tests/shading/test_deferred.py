@@ -33,10 +33,18 @@ sys.path.append(str(Path(__file__).parents[1] / "train"))
 from flat_world import FlatWorld, small_config
 
 BARE = {
-    "learn": True, "environment_height": 16, "ambient_rays": 4, "normal_weight": 0.0,
-    "depth_normal_weight": 0.0, "smooth_weight": 0.0, "smooth_gloss_weight": 0.0,
-    "smooth_normal_weight": 0.0, "harmonics_weight": 0.0, "white_weight": 0.0, "even_weight": 0.0,
-}  # fmt: skip
+    "learn": True,
+    "environment_height": 16,
+    "ambient_occlusion_rays": 4,
+    "normal_weight": 0.0,
+    "depth_normal_weight": 0.0,
+    "smooth_weight": 0.0,
+    "smooth_gloss_weight": 0.0,
+    "smooth_normal_weight": 0.0,
+    "harmonics_weight": 0.0,
+    "white_weight": 0.0,
+    "environment_smoothness_weight": 0.0,
+}
 
 
 def wall(normal: tuple[float, float, float], points: np.ndarray, material: list[float]) -> FlatGaussians:
@@ -67,7 +75,9 @@ def floor(side: float, step: float, above: float = 0.0) -> np.ndarray:
 def test_gradients_agree_with_finite_differences(indirect: str) -> None:
     rng = np.random.default_rng(5)
     world = FlatWorld()
-    settings = MaterialSettings(**BARE, indirect=indirect, blur=0.0, ambient=False, widened=0.0)
+    settings = MaterialSettings(
+        **BARE, indirect=indirect, blur=0.0, ambient_occlusion=False, roughness_probe_fraction=0.0
+    )
     gaussians = with_first_materials(world.start(opacity=0.6), settings)
     gaussians.means_world[:, 2] = rng.permutation(np.linspace(-0.4, 0.4, len(gaussians)))
     for values in gaussians.channels.values():
@@ -110,7 +120,9 @@ def test_what_only_a_mirror_shows_has_gradients_by_how_much_of_it_there_is() -> 
     lid = wall((0, 0, 1), floor(0.3, 0.1, above=0.5), [0.5, 0.3, 0.1, 0.0, 1.0])
     lid.opacity_logits[:] = np.random.default_rng(1).uniform(-2, 0, len(lid))
     scene, hung = concatenate([mirror, lid]), slice(len(mirror), None)
-    settings = MaterialSettings(**BARE, blur=0.0, ambient=False, facet_slope=(1e-3, 1e-3), start=0.01)
+    settings = MaterialSettings(
+        **BARE, blur=0.0, ambient_occlusion=False, reflection_ray_slope=(1e-3, 1e-3), ray_bias=0.01
+    )
     model = Deferred(settings, extent_world=1.0)
     model.light.put(np.full((16, 32, 3), 0.5, np.float32))
     x, y = (values.ravel() for values in np.meshgrid(*[np.linspace(-0.2, 0.2, 9)] * 2))
@@ -147,7 +159,10 @@ def test_roughness_learns_from_how_sharply_a_lid_is_mirrored() -> None:
     rough = wall((0, 0, 1), floor(0.8, 0.1), [0.9, 0.9, 0.9, 1.0, 0.35])
     lid = wall((0, 0, 1), floor(0.25, 0.1, above=0.6), [0.4, 0.4, 0.4, 0.0, 1.0])
     scene = concatenate([rough, lid])
-    model = Deferred(MaterialSettings(**BARE, ambient=False, widened=1.0, start=0.01), extent_world=1.0)
+    model = Deferred(
+        MaterialSettings(**BARE, ambient_occlusion=False, roughness_probe_fraction=1.0, ray_bias=0.01),
+        extent_world=1.0,
+    )
     model.light.put(np.full((16, 32, 3), 0.2, np.float32))
     rng = np.random.default_rng(2)
     ways = np.concatenate([rng.uniform(-0.05, 0.05, (3000, 2)), np.full((3000, 1), -1.0)], axis=1)
@@ -210,9 +225,11 @@ def test_rays_that_leave_a_rough_heap_of_gaussians_are_not_stopped_by_it() -> No
     rays = RayBatch(np.array([[-0.3, 0, 0.4]]), down)
     seen = []
     for leaves in (0.0, 0.1):
-        model = Deferred(MaterialSettings(**BARE, start=1e-3, leaves=leaves), extent_world=1.0)
+        model = Deferred(
+            MaterialSettings(**BARE, ray_bias=1e-3, backface_cull_distance=leaves), extent_world=1.0
+        )
         model.light.put(np.full((16, 32, 3), 0.5, np.float32))
-        tracer = CpuTracer(TraceSettings(turned_beyond=0.5), threads=1)
+        tracer = CpuTracer(TraceSettings(flip_normal_cos=0.5), threads=1)
         tracer.build(mirror, model.features(mirror))
         seen.append(model.develop(Sight(rays, tracer.trace(rays), tracer)).layers["visibility"][0, 0])
     assert seen[0] < 0.9
@@ -244,7 +261,7 @@ def test_ambient_visibility_under_a_lid_is_its_form_factor() -> None:
 def test_every_gaussian_has_its_turn_of_ambient_visibility(
     rebuilds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = MaterialSettings(learn=True, ambient_parts=20, secondary_from=0.0)
+    settings = MaterialSettings(learn=True, ambient_occlusion_rebuilds=20, secondary_from=0.0)
     gaussians = with_first_materials(wall((0, 0, 1), floor(2, 0.25), [0.5, 0.5, 0.5, 0, 0.5]), settings)
     looked: list[np.ndarray] = []
 
@@ -272,14 +289,18 @@ def train(
     """Train materials; with ``stop_after``, stop there and go on from the checkpoint with a fresh model."""
     world, events = FlatWorld(), list[Event]()
     materials = {
-        "learn": True, "environment_height": 16, "ambient_rays": 4, "ambient_parts": 2, "recipe": recipe,
-        "propagation": True,
-    }  # fmt: skip
+        "learn": True,
+        "environment_height": 16,
+        "ambient_occlusion_rays": 4,
+        "ambient_occlusion_rebuilds": 2,
+        "recipe": recipe,
+        "normal_propagation": True,
+    }
     config = small_config(
         materials=materials,
         sh_degree=0,
         iterations=72,
-        trace={"turned_beyond": 0.0 if recipe == "seed" else 0.5},
+        trace={"flip_normal_cos": 0.0 if recipe == "ref_gaussian" else 0.5},
     )
     first = with_first_materials(world.start(opacity=0.6), config.materials)
     state = fresh_state(first, config.seed)
@@ -302,7 +323,9 @@ def train(
     return model, state, [event.psnr for event in events if isinstance(event, HeldOutMeasured)]
 
 
-@pytest.mark.parametrize(("recipe", "stop_after"), [("split_sum", 40), ("split_sum", 50), ("seed", 50)])
+@pytest.mark.parametrize(
+    ("recipe", "stop_after"), [("split_sum", 40), ("split_sum", 50), ("ref_gaussian", 50)]
+)
 def test_it_trains_stops_and_goes_on_to_the_same_bytes_on_any_threads(
     tmp_path: Path, recipe: str, stop_after: int
 ) -> None:

@@ -110,7 +110,7 @@ def test_tilted_gaussians_lie_down_on_the_plane(tmp_path: Path) -> None:
     world = FlatWorld()
 
     def off_degrees(weight: float) -> float:
-        config = small_config(loss={"depth_normal": weight}, rays=2048, window_rays=16)
+        config = small_config(loss={"depth_normal": weight}, rays_per_batch=2048, ray_patch_rays=16)
         trainer = Trainer(
             world, config, fresh_state(tilted(world), 0), folder=tmp_path, fingerprint=str(weight),
             listener=lambda _event: None, threads=1,
@@ -124,7 +124,7 @@ def test_tilted_gaussians_lie_down_on_the_plane(tmp_path: Path) -> None:
 
 
 def test_settings_that_leave_no_neighbours_are_refused() -> None:
-    with pytest.raises(ConfigError, match="set window_rays to 64"):
-        resolve_config("fast", assignments=["loss.depth_normal=0.05", "window_rays=1"])
+    with pytest.raises(ConfigError, match="set ray_patch_rays to 64"):
+        resolve_config("fast", assignments=["loss.depth_normal=0.05", "ray_patch_rays=1"])
     resolve_config("fast", assignments=["loss.depth_normal=0.05", "loss.ssim=0.2"])
-    resolve_config("fast", materials=True, assignments=["loss.depth_normal=0.05", "window_rays=1"])
+    resolve_config("fast", materials=True, assignments=["loss.depth_normal=0.05", "ray_patch_rays=1"])

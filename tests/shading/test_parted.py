@@ -35,7 +35,7 @@ def ground() -> FlatGaussians:
 
 
 def model_of(**settings: float | bool) -> Deferred:
-    model = Deferred(MaterialSettings(**(BARE | {"ambient": False} | settings)), extent_world=1.0)
+    model = Deferred(MaterialSettings(**(BARE | {"ambient_occlusion": False} | settings)), extent_world=1.0)
     rng = np.random.default_rng(3)
     model.light.log_radiance[:] = rng.normal(-1, 0.4, model.light.log_radiance.shape)
     return model
@@ -56,7 +56,7 @@ def test_a_sheet_before_a_floor_has_the_colour_of_each_by_its_share() -> None:
     both = traced(concatenate([ground(), veil()]), model)[1]
     np.testing.assert_allclose(model.develop(both).rgb_srgb, expected, atol=2e-3)
     # Shaded as one surface, the two would be a third.
-    merged = model_of(visibility=False, parted=0.0)
+    merged = model_of(visibility=False, depth_split=0.0)
     assert np.abs(merged.develop(both).rgb_srgb - expected).max() > 0.02
 
 
@@ -80,7 +80,7 @@ def test_parts_add_up_to_the_rays_and_single_surfaces_stay_whole() -> None:
 
 @pytest.mark.parametrize("visibility", [False, True])
 def test_gradients_of_both_surfaces_agree_with_finite_differences(visibility: bool) -> None:
-    model = model_of(visibility=visibility, indirect="none", blur=0.0, normal_clip=0.0)
+    model = model_of(visibility=visibility, indirect="none", blur=0.0, normal_gradient_clip=0.0)
     scene = concatenate([ground(), veil()])
     by_rgb = np.random.default_rng(4).normal(size=(3, 3)).astype(np.float32)
 

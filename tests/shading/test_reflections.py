@@ -135,7 +135,9 @@ def test_a_path_goes_from_mirror_to_mirror() -> None:
     radiance[8:] = 0.1  # the lower half
     shown = {}
     for surfaces in (1, 2, 3):
-        settings = MaterialSettings(**BARE, reflections=surfaces, facet_slope=(1e-3, 1e-3), start=0.01)
+        settings = MaterialSettings(
+            **BARE, max_bounces=surfaces, reflection_ray_slope=(1e-3, 1e-3), ray_bias=0.01
+        )
         model = Deferred(settings, extent_world=1.0)
         model.light.put(radiance)
         tracer = CpuTracer(threads=1)

@@ -43,7 +43,7 @@ def surface(tracer, tmp_path_factory) -> ExtractedSurface:
 
 @pytest.fixture(scope="module")
 def textured(tracer, tmp_path_factory) -> TriangleMesh:
-    return extracted(tracer, tmp_path_factory.mktemp("scratch"), triangles=2000, texture_side=256).mesh
+    return extracted(tracer, tmp_path_factory.mktemp("scratch"), triangles=2000, texture_size=256).mesh
 
 
 def test_ball_comes_out_closed_round_and_in_its_colours(surface):

@@ -95,7 +95,7 @@ def test_reconstruction_comes_near_the_truth(tmp_path):
     config = resolve_config(
         "fast",
         settings={"test_every": 0, "exports": ()},
-        assignments=["iterations=700", "rays=4096", "max_gaussians=12000", "initial_points=4000"],
+        assignments=["iterations=700", "rays_per_batch=4096", "max_gaussians=12000", "initial_points=4000"],
     )
     run = reconstruct(tmp_path / "scene", tmp_path / "run", config)
     gaussians, _ = read_gaussian_ply(run / SCENE)
@@ -103,7 +103,9 @@ def test_reconstruction_comes_near_the_truth(tmp_path):
     tracer.build(gaussians)
     options = ExtractionOptions(resolution=256)
     median, expected = (
-        extract_levels(tracer, cameras, options.model_copy(update={"depth": depth}), scratch=tmp_path)[0].mesh
+        extract_levels(tracer, cameras, options.model_copy(update={"depth_mode": depth}), scratch=tmp_path)[
+            0
+        ].mesh
         for depth in ("median", "expected")
     )
     result = scored(median, cameras, 0.02)

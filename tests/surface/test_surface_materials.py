@@ -34,7 +34,7 @@ def surface(ball, tmp_path_factory) -> TriangleMesh:
     )
     tracer = CpuTracer(threads=1)
     tracer.build(scene, material_features(scene))
-    options = ExtractionOptions(resolution=64, depth_side=96, texture_side=SIDE)
+    options = ExtractionOptions(resolution=64, depth_side=96, texture_size=SIDE)
     (extracted,) = extract_levels(
         tracer, cameras_on_sphere(30, 3.0, 96), options, (1500,),
         scratch=tmp_path_factory.mktemp("scratch"), light_frame=environment_frame(np.array(UP)),

@@ -31,7 +31,7 @@ def test_the_khronos_validator_finds_nothing_wrong(
         scene = scene.with_channels(
             {name: np.full((count, k), 0.5, np.float32) for name, k in MATERIAL_WIDTHS.items()}
         )
-    export_scene(scene, tmp_path / "scene.glb", ExportOptions(texture_size=64, **settings))
+    export_scene(scene, tmp_path / "scene.glb", ExportOptions(falloff_texture_size=64, **settings))
     report = validate_glb(tmp_path / "scene.glb")
     issues = report["issues"]
     assert (issues["numErrors"], issues["numWarnings"], issues["numInfos"], issues["numHints"]) == (

@@ -63,7 +63,7 @@ def surface(tmp_path_factory: pytest.TempPathFactory) -> TriangleMesh:
     scene = egg()
     tracer = CpuTracer(threads=2)
     tracer.build(scene, material_features(scene))
-    options = ExtractionOptions(resolution=64, depth_side=128, texture_side=256)
+    options = ExtractionOptions(resolution=64, depth_side=128, texture_size=256)
     (extracted,) = extract_levels(
         tracer, cameras_around(scene, 128, 40), options, (3000,),
         scratch=tmp_path_factory.mktemp("scratch"), light_frame=FRAME,

@@ -18,7 +18,7 @@ def wall_seen_at(cosines: list[float], turned_beyond: float) -> np.ndarray:
     gaussians = facing_z(means, opacities=0.8)
     gaussians.quats_wxyz = f32(quaternions(frames_from_normals(tilted)))
     rays = RayBatch(f32(means - [0, 0, 1]), f32(np.tile([[0, 0, 1]], (len(cosines), 1))))
-    return make_tracer(gaussians, turned_beyond=turned_beyond).trace(rays).normal_world / 0.8
+    return make_tracer(gaussians, flip_normal_cos=turned_beyond).trace(rays).normal_world / 0.8
 
 
 def test_normals_beyond_a_cosine_are_turned() -> None:
@@ -34,7 +34,7 @@ def test_around_an_outline_sided_normals_blend_to_the_outline_s() -> None:
     gaussians = facing_z([[0, 0, 1.0], [0, 0, 1.5]], opacities=[0.5, 0.9])
     gaussians.quats_wxyz = f32(quaternions(frames_from_normals(near)))
     ray = RayBatch(f32([[0, 0, 0]]), f32([[0, 0, 1]]))
-    kept = make_tracer(gaussians, turned_beyond=0.5).trace(ray).normal_world
+    kept = make_tracer(gaussians, flip_normal_cos=0.5).trace(ray).normal_world
     turned = make_tracer(gaussians).trace(ray).normal_world
     assert unit(kept)[0, 0] > 0.999
     assert abs(turned[0, 0]) < 0.1

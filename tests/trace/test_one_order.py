@@ -67,7 +67,7 @@ def contradictions(lists: list[list[int]], gaussians: int) -> int:
 
 
 def assert_like_twin_in_order(flat: FlatGaussians, rays: RayBatch, ranks: np.ndarray | None) -> None:
-    tracer = make_tracer(flat, order="packet")
+    tracer = make_tracer(flat, sort="packet")
     seen = tracer.trace(rays, record=True)
     given = given_by(np.random.default_rng(5), len(rays))
     parameters = ReferenceParameters.of(flat)
@@ -87,14 +87,14 @@ def assert_like_twin_in_order(flat: FlatGaussians, rays: RayBatch, ranks: np.nda
 
 def test_layers_are_exact(rng: np.random.Generator) -> None:
     flat, rays = layers(rng, 300)
-    seen = make_tracer(flat, order="packet").trace(rays, record=True)
+    seen = make_tracer(flat, sort="packet").trace(rays, record=True)
     assert in_packets(seen) and seen.hit_counts.mean() > 10
     assert_like_twin_in_order(flat, rays, None)
 
 
 def test_octagons_that_cross_are_like_the_twin_in_one_order(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 600, degree=1), tile_rays(rng, 3)
-    one, each = (make_tracer(cloud, order=way).trace(rays, record=True) for way in ("packet", "ray"))
+    one, each = (make_tracer(cloud, sort=way).trace(rays, record=True) for way in ("packet", "ray"))
     assert isinstance(one.hits, CpuRecording)
     for first, last in one.hits.packets:
         assert contradictions(hit_lists(one)[first:last], len(cloud)) == 0
@@ -104,7 +104,7 @@ def test_octagons_that_cross_are_like_the_twin_in_one_order(rng: np.random.Gener
 
 def test_a_narrow_packet_keeps_the_order_of_its_rays(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 1000), tile_rays(rng, 4, width=1e-5)
-    one, each = (make_tracer(cloud, order=order).trace(rays, record=True) for order in ("packet", "ray"))
+    one, each = (make_tracer(cloud, sort=order).trace(rays, record=True) for order in ("packet", "ray"))
     assert hit_lists(one) == hit_lists(each)
     for name in SEEN:
         np.testing.assert_allclose(getattr(one, name), getattr(each, name), atol=2e-5, err_msg=name)
@@ -115,7 +115,7 @@ def test_few_rays_and_limits(rng: np.random.Generator) -> None:
     some = RayBatch(rays.origins_world[:37], rays.directions_world[:37], f32(2.5), f32(3.4))
     for options in ({}, {"max_hits": 3}, {"transmittance_min": 0.3}, {"alpha_max": 0.3}):
         one, each = (
-            make_tracer(flat, order=way, **options).trace(some, record=True) for way in ("packet", "ray")
+            make_tracer(flat, sort=way, **options).trace(some, record=True) for way in ("packet", "ray")
         )
         assert hit_lists(one) == hit_lists(each), options
         assert one.hit_counts.max() > 0
@@ -126,7 +126,7 @@ def test_what_was_clamped_has_no_gradient(rng: np.random.Generator) -> None:
     flat, rays = layers(rng, 100)
     found = []
     for way in ("packet", "ray"):
-        tracer = make_tracer(flat, order=way, alpha_max=0.2)
+        tracer = make_tracer(flat, sort=way, alpha_max=0.2)
         seen = tracer.trace(rays, record=True)
         assert seen.hits is not None
         found.append(tracer.backward(seen.hits, given_by(np.random.default_rng(1), len(rays))))
@@ -139,7 +139,7 @@ def test_same_bits_on_any_number_of_threads_and_again(rng: np.random.Generator) 
     given = given_by(rng, len(rays))
     results, gradients = [], []
     for threads in (1, 2):
-        tracer = make_tracer(cloud, order="packet", threads=threads)
+        tracer = make_tracer(cloud, sort="packet", threads=threads)
         for _ in range(2):  # the first time, there is no room for what is met
             seen = tracer.trace(rays, record=True)
             assert seen.hits is not None
@@ -148,16 +148,16 @@ def test_same_bits_on_any_number_of_threads_and_again(rng: np.random.Generator) 
     for k in range(1, 4):
         same_bits(results[0], results[k])
         same_bits(gradients[0], gradients[k])
-    same_bits(results[0], dataclasses.replace(make_tracer(cloud, order="packet").trace(rays), hits=None))
+    same_bits(results[0], dataclasses.replace(make_tracer(cloud, sort="packet").trace(rays), hits=None))
 
 
 def test_recordings_live_side_by_side(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 1000), tile_rays(rng, 8)
-    tracer = make_tracer(cloud, order="packet")
+    tracer = make_tracer(cloud, sort="packet")
     given = given_by(rng, 4 * 64)
     first, second = (tracer.trace(rays[part], record=True) for part in (slice(0, 256), slice(256, 512)))
     first.transmittance[:] = 0.0  # a recording does not hang on what its results become
-    alone = make_tracer(cloud, order="packet")
+    alone = make_tracer(cloud, sort="packet")
     again = alone.trace(rays[:256], record=True)
     assert first.hits is not None and again.hits is not None and second.hits is not None
     same_bits(tracer.backward(first.hits, given), alone.backward(again.hits, given))
@@ -165,7 +165,7 @@ def test_recordings_live_side_by_side(rng: np.random.Generator) -> None:
 
 def test_what_hardly_weighs_is_left_out(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 1000), tile_rays(rng, 4)
-    tracer = make_tracer(cloud, order="packet")
+    tracer = make_tracer(cloud, sort="packet")
     seen = tracer.trace(rays, record=True)
     assert seen.hits is not None
     given = given_by(rng, len(rays))
@@ -181,17 +181,17 @@ def test_features_and_second_phases_go_by_ray(
     cloud, rays = make_cloud(rng, 500), tile_rays(rng, 2)
     features = f32(rng.normal(size=(500, 2))) if second_phase_min is None else None
     one, each = (
-        make_tracer(cloud, features, order=way, second_phase_min=second_phase_min).trace(rays)
+        make_tracer(cloud, features, sort=way, second_phase_min=second_phase_min).trace(rays)
         for way in ("packet", "ray")
     )
     same_bits(one, each)
 
 
 def test_gradients_by_depths_are_refused(rng: np.random.Generator) -> None:
-    tracer, rays = make_tracer(make_cloud(rng, 100), order="packet"), tile_rays(rng, 1)
+    tracer, rays = make_tracer(make_cloud(rng, 100), sort="packet"), tile_rays(rng, 1)
     seen = tracer.trace(rays, record=True)
     assert seen.hits is not None
-    with pytest.raises(ValueError, match="order='ray'"):
+    with pytest.raises(ValueError, match="sort='ray'"):
         tracer.backward(seen.hits, random_gradients(rng, len(rays)))
 
 
@@ -203,7 +203,7 @@ def test_rays_alone_beside_packets(rng: np.random.Generator) -> None:
         np.concatenate([np.broadcast_to(tile.origins_world, (64, 3)), lone.origins_world]),
         np.concatenate([tile.directions_world, lone.directions_world]),
     )
-    tracer = CpuTracer(make_tracer(cloud, order="packet").settings)
+    tracer = CpuTracer(make_tracer(cloud, sort="packet").settings)
     tracer.build(cloud)
     seen = tracer.trace(both, record=True)
     given = given_by(rng, len(both))

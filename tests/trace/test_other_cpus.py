@@ -26,7 +26,7 @@ from flat_world import FlatWorld, small_config
 from octasplat.engine.train.state import fresh_state
 from octasplat.engine.train.trainer import Trainer
 world = FlatWorld()
-config = small_config(iterations=60, sh_every=30, loss={"ssim": 0.2})
+config = small_config(iterations=60, sh_degree_interval=30, loss={"ssim": 0.2})
 with tempfile.TemporaryDirectory() as folder:
     trained = Trainer(
         world, config, fresh_state(world.start(), 0),

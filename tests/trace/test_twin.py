@@ -50,7 +50,7 @@ def test_viewers_that_stand_anywhere(rng: np.random.Generator, degree: int) -> N
 
 def test_normals_that_keep_their_side(rng: np.random.Generator) -> None:
     cloud, rays = make_cloud(rng, 1000), rays_inwards(rng, 250)
-    ours, _ = assert_like_twin(cloud, rays, turned_beyond=0.4)
+    ours, _ = assert_like_twin(cloud, rays, flip_normal_cos=0.4)
     all_turned = make_tracer(cloud).trace(rays)
     assert np.abs(ours.normal_world - all_turned.normal_world).max() > 0.1
     assert np.array_equal(ours.rgb_srgb, all_turned.rgb_srgb)
@@ -61,11 +61,11 @@ def test_rays_that_leave_a_surface(rng: np.random.Generator) -> None:
     leaves = rng.choice([0.0, 0.3, np.inf], 120)
     rays = RayBatch(inwards.origins_world, inwards.directions_world, t_leaves=leaves)
     cloud = make_cloud(rng, 1000)
-    ours, _ = assert_like_twin(cloud, rays, turned_beyond=0.5)
+    ours, _ = assert_like_twin(cloud, rays, flip_normal_cos=0.5)
     before = make_tracer(cloud).trace(inwards)
     assert np.array_equal(ours.hit_counts[leaves == 0], before.hit_counts[leaves == 0])
     assert ours.hit_counts[leaves > 1].mean() < 0.7 * before.hit_counts[leaves > 1].mean()
-    left = make_tracer(cloud, turned_beyond=0.5).transmittance(rays)
+    left = make_tracer(cloud, flip_normal_cos=0.5).transmittance(rays)
     np.testing.assert_allclose(left, np.where(ours.transmittance < 1e-3, 0, ours.transmittance), atol=1e-5)
     without_sides, _ = assert_like_twin(cloud, rays)
     assert np.array_equal(without_sides.hit_counts, before.hit_counts)

@@ -95,13 +95,13 @@ def small_config(**changes: object) -> TrainConfig:
     """A run of seconds in which everything happens: growth, a higher degree, checkpoints."""
     values: dict[str, object] = {
         "iterations": 120,
-        "rays": 1024,
-        "patch_fraction": 0.5,
-        "patch_side": 16,
+        "rays_per_batch": 1024,
+        "ssim_patch_fraction": 0.5,
+        "ssim_patch_side": 16,
         "sh_degree": 1,
-        "sh_every": 60,
+        "sh_degree_interval": 60,
         "max_gaussians": 400,
-        "fit_iterations": 10,
+        "densify_from_iter": 10,
         "densify": McmcConfig(start=20, interval=20, growth=0.1),
         "rebuild_every": 10,
         "checkpoint_every": 20,

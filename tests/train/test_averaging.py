@@ -57,8 +57,8 @@ def test_a_checkpoint_keeps_it(tmp_path: Path) -> None:
 
 
 def test_which_states_count() -> None:
-    schedule = Schedule(TrainConfig(average_after=0.5), 100)
+    schedule = Schedule(TrainConfig(weight_averaging_start=0.5), 100)
     assert [k for k in range(1, 101) if schedule.averages(k)] == list(range(60, 101, AVERAGE_EVERY))
-    assert not any(Schedule(TrainConfig(average_after=1), 100).averages(k) for k in range(1, 101))
+    assert not any(Schedule(TrainConfig(weight_averaging_start=1), 100).averages(k) for k in range(1, 101))
     assert [k for k in range(1, 101) if schedule.is_late(k)] == list(range(51, 101))
     assert Schedule(TrainConfig(), 17).averages(17)  # the last one always

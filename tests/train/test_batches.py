@@ -108,11 +108,15 @@ def test_patch_as_large_as_the_view() -> None:
 
 @pytest.mark.parametrize(("ssim", "fraction"), [(0.0, 0.25), (0.2, 0.6), (0.2, 1.0)])
 @pytest.mark.parametrize("rays", [256, 1000, 1024])
-@pytest.mark.parametrize("window_rays", [1, 64])
+@pytest.mark.parametrize("ray_patch_rays", [1, 64])
 def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, window_rays: int) -> None:
     world = FlatWorld(side_px=40)
     config = small_config(
-        rays=rays, window_rays=window_rays, window_side=24, patch_fraction=fraction, loss={"ssim": ssim}
+        rays_per_batch=rays,
+        ray_patch_rays=window_rays,
+        ray_patch_side=24,
+        ssim_patch_fraction=fraction,
+        loss={"ssim": ssim},
     )
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
     assert len(batch.rgb_srgb) == len(batch.rays) == len(batch.alpha) == len(batch.weight) == rays
@@ -121,10 +125,12 @@ def test_batch_has_its_rays(ssim: float, fraction: float, rays: int, window_rays
 
 
 def test_ssim_is_refused_where_it_would_be_ignored() -> None:
-    with pytest.raises(ConfigError, match="only 12 pixels wide or high; lower patch_side"):
+    with pytest.raises(ConfigError, match="only 12 pixels wide or high; lower ssim_patch_side"):
         BatchSource(FlatWorld(side_px=12), small_config(loss={"ssim": 0.2}))
-    with pytest.raises(ConfigError, match="raise rays or patch_fraction"):
-        BatchSource(FlatWorld(), small_config(rays=256, patch_fraction=0.3, loss={"ssim": 0.2}))
+    with pytest.raises(ConfigError, match="raise rays_per_batch or ssim_patch_fraction"):
+        BatchSource(
+            FlatWorld(), small_config(rays_per_batch=256, ssim_patch_fraction=0.3, loss={"ssim": 0.2})
+        )
 
 
 @pytest.mark.parametrize(("background", "has_alpha"), [("white", False), ("auto", False), ("auto", True)])

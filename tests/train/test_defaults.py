@@ -55,18 +55,18 @@ def test_windows_follow_the_gaussians_or_the_views(
     longest_px: int, each_px: float, side_px: int, own_order_px: int
 ) -> None:
     assert window_side_px(TrainConfig(), longest_px, each_px) == side_px
-    assert window_side_px(TrainConfig(one_order=0), longest_px, each_px) == own_order_px
+    assert window_side_px(TrainConfig(shared_sort_until=0), longest_px, each_px) == own_order_px
     assert window_side_px(with_materials(TrainConfig()), longest_px, each_px) == own_order_px
-    assert window_side_px(TrainConfig(window_side=20), longest_px, each_px) == 20
+    assert window_side_px(TrainConfig(ray_patch_side=20), longest_px, each_px) == 20
 
 
 def test_what_is_learnt_says_whether_windows_have_one_order() -> None:
-    assert TrainConfig().trace.order == "ray"
+    assert TrainConfig().trace.sort == "ray"
     for config in (
-        TrainConfig(one_order=0),
+        TrainConfig(shared_sort_until=0),
         with_materials(TrainConfig()),
         TrainConfig(loss=LossWeights(depth_normal=0.05)),
-        preset("paper"),
+        preset("redisplats"),
     ):
         assert not in_one_order(config)
         assert not Schedule.of(config, 10**6).in_one_order(0)
@@ -83,9 +83,9 @@ def test_large_scenes_train_longer(pixels: int, count: int) -> None:
     assert iteration_count(TrainConfig(), pixels) == count
     assert iteration_count(TrainConfig(iterations=7), pixels) == 7
     assert iteration_count(preset("fast"), pixels) == 2500
-    assert iteration_count(preset("paper"), pixels) == 10_000
+    assert iteration_count(preset("redisplats"), pixels) == 10_000
     assert 2.5 * count < iteration_count(preset("high"), pixels) <= 3.5 * count
-    assert iteration_count(TrainConfig(one_order=0), pixels) == max(5000, round(3 / 7 * count, -3))
+    assert iteration_count(TrainConfig(shared_sort_until=0), pixels) == max(5000, round(3 / 7 * count, -3))
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_the_trainer_knows_its_iterations(tmp_path: Path, wanted: int, count: in
 
 
 def test_more_rays_an_iteration_want_fewer_iterations() -> None:
-    assert iteration_count(TrainConfig(rays=32_768), 70_000_000) == 15_000
+    assert iteration_count(TrainConfig(rays_per_batch=32_768), 70_000_000) == 15_000
 
 
 @pytest.mark.parametrize(("gaussians", "iterations"), [(499_999, 25), (500_000, 50), (1_000_000, 75)])

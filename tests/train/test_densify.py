@@ -155,7 +155,7 @@ def test_those_that_hardly_weigh_go_where_the_error_is() -> None:
     before = make([0.5] * 40)
     weights, errors = np.full(40, 10.0), np.zeros(40)
     weights[[3, 20]], weights[11], errors[[7, 15, 30]] = 0.0, 0.4, (1000.0, 3.0, 0.5)
-    densifier = mcmc(40, idle_weight=0.05, idle_share=1.0)
+    densifier = mcmc(40, relocate_low_weight_below=0.05, relocate_low_weight_fraction=1.0)
     densifier.observe(40, *weighing(weights, errors))
     after, adam = apply(densifier, before.copy())
     assert len(after) == 40
@@ -176,7 +176,7 @@ def test_more_error_draws_more_of_them() -> None:
     for seed in range(200):
         weights, errors = np.full(40, 10.0), np.ones(40)
         weights[3], errors[7], errors[15] = 0.0, 30.0, 15.0
-        densifier = mcmc(40, idle_weight=0.05, idle_share=1.0)
+        densifier = mcmc(40, relocate_low_weight_below=0.05, relocate_low_weight_fraction=1.0)
         densifier.observe(40, *weighing(weights, errors))
         before = make([0.5] * 40)
         after, _ = apply(densifier, before.copy(), seed)
@@ -193,7 +193,7 @@ def test_only_a_share_of_them_goes_at_a_time(share: float, moved: list[int]) -> 
     weights, errors = np.full(40, 10.0), np.zeros(40)
     weights[3], weights[11], errors[[7, 8]] = 0.1, 0.2, 3.0
     weights[20] = 0.0
-    densifier = mcmc(40, idle_weight=0.05, idle_share=share)
+    densifier = mcmc(40, relocate_low_weight_below=0.05, relocate_low_weight_fraction=share)
     densifier.observe(40, *weighing(weights, errors))
     after, _ = apply(densifier, before.copy())
     changed = np.flatnonzero((after.means_world != before.means_world).any(axis=1))
@@ -204,7 +204,7 @@ def test_nobody_is_idle_while_there_may_be_more() -> None:
     before = make([0.5] * 40)
     weights = np.full(40, 10.0)
     weights[3] = 0.0
-    densifier = mcmc(100, idle_weight=0.05, idle_share=1.0, growth=0.1)
+    densifier = mcmc(100, relocate_low_weight_below=0.05, relocate_low_weight_fraction=1.0, growth=0.1)
     densifier.observe(40, *weighing(weights, np.ones(40)))
     after, _ = apply(densifier, before.copy())
     assert len(after) == 44
@@ -212,7 +212,7 @@ def test_nobody_is_idle_while_there_may_be_more() -> None:
 
 
 def test_rounds_begin_where_there_may_be_no_more() -> None:
-    config = McmcConfig(start=20, interval=10, stop_fraction=0.85, idle_rounds=4)
+    config = McmcConfig(start=20, interval=10, stop_fraction=0.85, relocate_low_weight_rounds=4)
     densifier = make_densifier(config, iterations=200, max_gaussians=50)
     densifier.observe(40, *seen(40, 0.0))
     assert [k for k in range(1, 201) if densifier.due(k)] == list(range(20, 171, 10))

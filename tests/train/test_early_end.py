@@ -48,8 +48,8 @@ def test_a_short_end_is_an_end_all_the_same() -> None:
     assert whole.may_densify(510) and not short.may_densify(510)
     assert [k for k in range(1, 701) if short.averages(k)] == list(range(600, 701, 10))
     assert short.ends(700) and short.measures(700) and not short.ends(699)
-    assert Schedule(TrainConfig(average_after=0.1), 1000).hastened(500).averages(510)
-    assert not Schedule(TrainConfig(average_after=0.1), 1000).hastened(500).averages(500)
+    assert Schedule(TrainConfig(weight_averaging_start=0.1), 1000).hastened(500).averages(510)
+    assert not Schedule(TrainConfig(weight_averaging_start=0.1), 1000).hastened(500).averages(500)
 
 
 class NoisyWorld(FlatWorld):
@@ -64,7 +64,12 @@ class NoisyWorld(FlatWorld):
 
 
 def config_of(**changes: object) -> TrainConfig:
-    values: dict[str, object] = {"iterations": 200, "stop_early": 0.2, "rays": 512, "patch_fraction": 0.0}
+    values: dict[str, object] = {
+        "iterations": 200,
+        "early_stopping_db": 0.2,
+        "rays_per_batch": 512,
+        "ssim_patch_fraction": 0.0,
+    }
     return small_config(**{**values, **changes})
 
 
@@ -108,7 +113,7 @@ def test_nothing_more_to_learn_ends_it(short_run: tuple[FlatGaussians, list[Even
 def test_the_mean_of_its_last_states_is_exported(
     short_run: tuple[FlatGaussians, list[Event], Trainer], tmp_path: Path
 ) -> None:
-    single, _, trainer = trained(tmp_path, config_of(average_after=1.0))
+    single, _, trainer = trained(tmp_path, config_of(weight_averaging_start=1.0))
     assert trainer.state.iteration == short_run[2].state.iteration
     assert content(single) != content(short_run[0])
 
@@ -132,7 +137,7 @@ def test_stopped_and_resumed_it_ends_at_the_same_bytes(
 def test_without_it_all_iterations_are_done(
     short_run: tuple[FlatGaussians, list[Event], Trainer], tmp_path: Path
 ) -> None:
-    _, events, trainer = trained(tmp_path, config_of(stop_early=0.0))
+    _, events, trainer = trained(tmp_path, config_of(early_stopping_db=0.0))
     assert trainer.state.iteration == 200 and trainer.state.hastened_after is None
     assert not any(isinstance(event, Warned) for event in events)
     decided = short_run[2].state.hastened_after

@@ -154,7 +154,7 @@ def test_known_gains_and_offsets_are_found() -> None:
 
 
 def test_uneven_photographs_are_explained_by_their_exposure(tmp_path: Path) -> None:
-    config = small_config(iterations=240, exposure=True, rates={"exposure": 0.02})
+    config = small_config(iterations=240, exposure=True, lr={"exposure": 0.02})
     trainer, events = run(tmp_path / "learnt", config)
     _, plain = run(tmp_path / "plain", small_config(iterations=240))
     assert last_psnr(events) > last_psnr(plain) + 2
@@ -278,7 +278,7 @@ class AutomaticWorld(UnevenWorld):
 def test_held_out_photographs_of_an_automatic_camera_are_met(tmp_path: Path) -> None:
     world = AutomaticWorld()
     assert world.log_gains.std() > 0.08
-    config = small_config(iterations=400, exposure=True, rates={"exposure": 0.02})
+    config = small_config(iterations=400, exposure=True, lr={"exposure": 0.02})
     trainer = Trainer(
         world, config, fresh_state(world.start(), config.seed), folder=tmp_path, fingerprint="test",
         listener=lambda _event: None, threads=1,

@@ -93,7 +93,7 @@ def train(
 ) -> tuple[Trainer, UnderTheSky]:
     """Train on the disc under the sky; with ``stop_after``, stop there and go on from the checkpoint."""
     world = UnderTheSky()
-    config = small_config(background="learnt", background_height=16, rates={"background": 0.05}, **changes)
+    config = small_config(background="learnt", background_height=16, lr={"background": 0.05}, **changes)
     state = fresh_state(world.start(), config.seed)
 
     def trainer(state: TrainState, last: float) -> Trainer:

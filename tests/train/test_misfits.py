@@ -19,7 +19,7 @@ from octasplat.engine.train.misfits import ViewFits, misfits
 
 SPOILED = ["view_010.png", "view_025.png"]
 SETTINGS = (
-    "iterations=300", "rays=2048", "max_gaussians=1000", "checkpoint_every=50", "probe_rays=512",
+    "iterations=300", "rays_per_batch=2048", "max_gaussians=1000", "checkpoint_every=50", "probe_rays=512",
 )  # fmt: skip
 
 
@@ -63,12 +63,12 @@ def test_exactly_those_of_wrong_poses_are_named_and_left_out(scene: Path, tmp_pa
     assert sorted(with_all["misfits"]) == SPOILED
     assert with_all["left_out"] == [] and len(with_all["views"]) == 28
     assert any("do not fit the others" in text and all(n in text for n in SPOILED) for text in told)
-    ways = ("place_misfits", "--poses auto", "leave_out_misfits")
+    ways = ("repair_poses", "--poses auto", "exclude_outlier_views")
     assert any(all(way in text for way in ways) for text in told)
     assert with_all["worst"] in SPOILED
     assert f"dB: {with_all['worst']}" in (tmp_path / "all" / "report.html").read_text()
 
-    told = run(scene, tmp_path / "without", "leave_out_misfits=true")
+    told = run(scene, tmp_path / "without", "exclude_outlier_views=true")
     without, better = measured(tmp_path / "without")
     assert without["left_out"] == SPOILED and len(without["views"]) == 26
     left = [text for text in told if text.startswith("From iteration ")]
@@ -80,8 +80,8 @@ def test_exactly_those_of_wrong_poses_are_named_and_left_out(scene: Path, tmp_pa
         return any(isinstance(event, CheckpointWritten) and event.iteration == 100 for event in events)
 
     with pytest.raises(Cancelled):
-        run(scene, tmp_path / "stopped", "leave_out_misfits=true", should_stop=stop_behind_it)
-    run(scene, tmp_path / "stopped", "leave_out_misfits=true")
+        run(scene, tmp_path / "stopped", "exclude_outlier_views=true", should_stop=stop_behind_it)
+    run(scene, tmp_path / "stopped", "exclude_outlier_views=true")
     for name in ("scene.ply", "renders/view_008.png"):
         assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "without" / name).read_bytes()
 

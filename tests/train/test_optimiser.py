@@ -44,9 +44,9 @@ def gradients(of: FlatGaussians, ids: np.ndarray, rng: np.random.Generator) -> G
 def test_like_torch_when_all_are_hit() -> None:
     rng = np.random.default_rng(1)
     ours, extent = gaussians(50), 2.0
-    rates = LearningRates(mean=1e-3, mean_final=1e-3, mean_of="extent", quat=2e-3, log_scale=3e-3,
-                          axes="world", opacity=4e-2, colour=5e-3, sh_rest_ratio=0.1, decay=1.0)  # fmt: skip
-    colour = rates.colour / SH_C0
+    rates = LearningRates(mean=1e-3, mean_final=1e-3, mean_unit="extent", quat=2e-3, log_scale=3e-3,
+                          axes="world", opacity=4e-2, color=5e-3, sh_rest_ratio=0.1, decay=1.0)  # fmt: skip
+    colour = rates.color / SH_C0
     leaves = {name: torch.tensor(getattr(ours, name), dtype=torch.float64) for name in NAMES}
     leaves["sh0"], leaves["sh_rest"] = leaves["sh"][:, :1].clone(), leaves.pop("sh")[:, 1:].clone()
     steps = {"means_world": rates.mean * extent, "quats_wxyz": rates.quat, "log_scales": rates.log_scale,
@@ -180,7 +180,7 @@ def test_first_step_is_the_rate_whatever_the_gradient() -> None:
 
 @pytest.mark.parametrize("unit", ["size", "extent"])
 def test_rate_of_the_means_falls_exponentially(unit: Literal["size", "extent"]) -> None:
-    rates = LearningRates(mean_of=unit)
+    rates = LearningRates(mean_unit=unit)
     for progress in (0.0, 0.5, 1.0):
         ours = gaussians(5)
         adam, frames = Adam.fresh(ours), ours.rotations
@@ -264,10 +264,10 @@ def test_channels_are_stepped_by_their_logits_as_torch_does() -> None:
 
 
 def test_long_trainings_take_smaller_steps_of_means_and_turns() -> None:
-    rates = LearningRates(mean=0.1, mean_final=0.03, quat=0.02, calm_after=1000)
+    rates = LearningRates(mean=0.1, mean_final=0.03, quat=0.02, scale_after=1000)
     assert rates.calmed(1000) == rates
     four_times = rates.calmed(4000)
     assert (four_times.mean, four_times.quat) == pytest.approx((0.05, 0.01))
     assert four_times.model_copy(update={"mean": 0.1, "quat": 0.02}) == rates
     assert rates.calmed(100_000).mean == 0.03  # which they fall to in any case
-    assert rates.model_copy(update={"calm_after": 0}).calmed(100_000).quat == 0.02
+    assert rates.model_copy(update={"scale_after": 0}).calmed(100_000).quat == 0.02

@@ -125,8 +125,12 @@ def last_psnr(events: list[Event]) -> float:
 
 def test_wrong_poses_come_right_and_new_views_with_them(tmp_path: Path) -> None:
     longer = {
-        "iterations": 300, "rays": 2048, "max_gaussians": 1500, "checkpoint_every": 100, "rebuild_every": 20,
-    }  # fmt: skip
+        "iterations": 300,
+        "rays_per_batch": 2048,
+        "max_gaussians": 1500,
+        "checkpoint_every": 100,
+        "rebuild_every": 20,
+    }
     _, plain = train(tmp_path / "plain", **longer)
     trainer, events = train(tmp_path / "refined", refine_poses=True, **longer)
     assert trainer.poses is not None

@@ -34,11 +34,17 @@ def held_out_psnr(folder: Path, config: TrainConfig) -> tuple[list[float], Train
 
 
 def test_the_paper_preset_learns_and_densifies(tmp_path: Path) -> None:
-    paper = preset("paper")
+    paper = preset("redisplats")
     values = paper.model_dump()
-    values |= {"iterations": 160, "rays": 1024, "patch_side": 16, "fit_iterations": 40, "probe_rays": 512}
+    values |= {
+        "iterations": 160,
+        "rays_per_batch": 1024,
+        "ssim_patch_side": 16,
+        "densify_from_iter": 40,
+        "probe_rays": 512,
+    }
     values["densify"] |= {"start": 50, "interval": 25, "stop_fraction": 0.9, "step_threshold": 1e-5}
-    values["rates"] |= {"colour": 0.03, "opacity": 0.2}  # as 10,000 iterations would have time for
+    values["lr"] |= {"color": 0.03, "opacity": 0.2}  # as 10,000 iterations would have time for
     config = TrainConfig.model_validate(values)
     assert config.trace.second_phase_min is not None and config.loss.ssim > 0 and config.loss.l1 == 0
     psnr, trainer = held_out_psnr(tmp_path, config)
@@ -48,7 +54,9 @@ def test_the_paper_preset_learns_and_densifies(tmp_path: Path) -> None:
 
 def test_the_gradient_of_ssim_reaches_the_gaussians() -> None:
     world = FlatWorld()
-    config = small_config(patch_fraction=1.0, patch_side=32, loss={"l1": 0.0, "l2": 0.0, "ssim": 1.0})
+    config = small_config(
+        ssim_patch_fraction=1.0, ssim_patch_side=32, loss={"l1": 0.0, "l2": 0.0, "ssim": 1.0}
+    )
     batch = BatchSource(world, config).draw(np.random.default_rng(0))
     gaussians = world.start(opacity=0.6)
     rng = np.random.default_rng(2)
@@ -83,7 +91,7 @@ def test_the_gradient_of_ssim_reaches_the_gaussians() -> None:
 
 def test_ssim_alone_trains(tmp_path: Path) -> None:
     config = small_config(
-        iterations=80, rays=2048, patch_fraction=1.0, loss={"l1": 0.0, "l2": 0.0, "ssim": 1.0}
+        iterations=80, rays_per_batch=2048, ssim_patch_fraction=1.0, loss={"l1": 0.0, "l2": 0.0, "ssim": 1.0}
     )
     psnr, _ = held_out_psnr(tmp_path, config)
     assert psnr[-1] > psnr[0] + 5
@@ -115,9 +123,13 @@ def test_gaussians_that_hardly_weigh_keep_still() -> None:
     tracer.build(state.gaussians)
     densifier = make_densifier(config.densify, iterations=1, max_gaussians=len(before))
     iterate(
-        state, batch, Machinery(tracer, PLAIN, densifier), config.model_copy(update={"least_weight": least}),
-        progress=0.0, extent=world.extent,
-    )  # fmt: skip
+        state,
+        batch,
+        Machinery(tracer, PLAIN, densifier),
+        config.model_copy(update={"min_blend_weight": least}),
+        progress=0.0,
+        extent=world.extent,
+    )
     assert 0 < len(heavy) < len(weights.ids)
     assert np.flatnonzero(state.adam.steps).tolist() == heavy.tolist()
     changed = (state.gaussians.sh != before).any(axis=(1, 2))
@@ -139,7 +151,7 @@ def test_fewer_than_three_training_views(three_views: Path, tmp_path: Path, trai
     config = resolve_config(
         "fast",
         settings={"held_out": tuple(names[training_views:]), "exports": ()},
-        assignments=["iterations=200", "rays=1024", "max_gaussians=1500", "probe_rays=512"],
+        assignments=["iterations=200", "rays_per_batch=1024", "max_gaussians=1500", "probe_rays=512"],
     )
     progress: list[float] = []
 
@@ -154,16 +166,16 @@ def test_fewer_than_three_training_views(three_views: Path, tmp_path: Path, trai
 
 
 def test_settings_that_the_photographs_rule_out_leave_no_output(three_views: Path, tmp_path: Path) -> None:
-    config = resolve_config("fast", assignments=["loss.ssim=0.2", "patch_side=49"])
+    config = resolve_config("fast", assignments=["loss.ssim=0.2", "ssim_patch_side=49"])
     with pytest.raises(ConfigError, match="only 48 pixels"):
         reconstruct(three_views, tmp_path / "run", config, threads=1)
     assert not (tmp_path / "run" / "config.json").exists()
 
 
-@pytest.mark.parametrize("window_rays", [2, 63])
+@pytest.mark.parametrize("ray_patch_rays", [2, 63])
 def test_windows_are_square(window_rays: int) -> None:
     with pytest.raises(ConfigError, match="square number"):
-        resolve_config("fast", assignments=[f"window_rays={window_rays}"])
+        resolve_config("fast", assignments=[f"ray_patch_rays={ray_patch_rays}"])
 
 
 def psnr_of(scene: Path, output: Path, *assignments: str, max_side: int | None = None) -> float:
@@ -177,7 +189,7 @@ def psnr_of(scene: Path, output: Path, *assignments: str, max_side: int | None =
 def test_the_generated_scene_is_learnt_as_well_as_ever(tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     write_generated_scene(scene, GeneratedSceneConfig(views=24, width_px=128, height_px=96))
-    psnr = psnr_of(scene, tmp_path / "run", "iterations=200", "rays=8192", "max_gaussians=10000")
+    psnr = psnr_of(scene, tmp_path / "run", "iterations=200", "rays_per_batch=8192", "max_gaussians=10000")
     assert psnr > 20.5  # 21.0 when this was written
 
 
@@ -189,5 +201,5 @@ def test_a_photographed_scene_is_learnt_as_well_as_ever(scenes_root: Path, tmp_p
 
 
 def test_the_order_of_a_trace_is_no_setting() -> None:
-    with pytest.raises(ConfigError, match=r"trace\.order.*one_order"):
-        resolve_config("fast", assignments=["trace.order=packet"])
+    with pytest.raises(ConfigError, match=r"trace\.sort.*shared_sort_until"):
+        resolve_config("fast", assignments=["trace.sort=packet"])

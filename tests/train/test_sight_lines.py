@@ -97,9 +97,14 @@ def test_training_takes_a_veil_away_only_where_lines_of_sight_say_so(tmp_path: P
         veil = world.start(count=60, painted=True, opacity=0.3)
         veil.means_world[:, 2] = -0.6
         config = TrainConfig(
-            iterations=60, rays=1024, rebuild_every=20, fit_iterations=1000, lift_pixels=False,
-            sight_line_share=0.25, loss=LossWeights(blocked=weight),
-        )  # fmt: skip
+            iterations=60,
+            rays_per_batch=1024,
+            rebuild_every=20,
+            densify_from_iter=1000,
+            plane_sweep_init=False,
+            visibility_ray_fraction=0.25,
+            loss=LossWeights(free_space=weight),
+        )
         state = fresh_state(concatenate([start, veil]), seed=0)
         trainer = Trainer(
             world, config, state, folder=tmp_path / str(weight), fingerprint="", listener=lambda event: None
@@ -115,7 +120,7 @@ def test_training_takes_a_veil_away_only_where_lines_of_sight_say_so(tmp_path: P
 
 def test_batches_have_lines_where_they_count_and_none_of_views_left_out() -> None:
     world, rng = SeenWorld(), np.random.default_rng(0)
-    assert BatchSource(world, TrainConfig(rays=1024)).draw(rng).sight_lines is None
+    assert BatchSource(world, TrainConfig(rays_per_batch=1024)).draw(rng).sight_lines is None
     assert BatchSource(FlatWorld(), _counting(0.1)).draw(rng).sight_lines is None  # shows no points
     assert BatchSource(SeenWorld(points=0), _counting(0.1)).draw(rng).sight_lines is None
     source = BatchSource(world, _counting(0.1))
@@ -129,4 +134,4 @@ def test_batches_have_lines_where_they_count_and_none_of_views_left_out() -> Non
 
 
 def _counting(share: float) -> TrainConfig:
-    return TrainConfig(rays=1024, sight_line_share=share, loss=LossWeights(blocked=0.05))
+    return TrainConfig(rays_per_batch=1024, visibility_ray_fraction=share, loss=LossWeights(free_space=0.05))

@@ -26,7 +26,8 @@ def start() -> FlatGaussians:
 def train(folder: Path, tracer: str, iterations: int) -> tuple[TrainState, list[Event]]:
     world, events = FlatWorld(), list[Event]()
     config = small_config(
-        iterations=iterations, rays=64, probe_rays=256, trace={"tracer": tracer}, one_order=0, sh_every=20,
+        iterations=iterations, rays_per_batch=64, probe_rays=256, trace={"tracer": tracer},
+        shared_sort_until=0, sh_degree_interval=20,
         densify={"kind": "mcmc", "start": 20, "interval": 20, "growth": 0.1},
     )  # fmt: skip
     trainer = Trainer(
@@ -70,8 +71,8 @@ def test_the_slow_twin_learns_a_generated_scene(tmp_path: Path) -> None:
     ends = {}
     for tracer in ("reference", "cpu"):
         config = small_config(
-            iterations=50, rays=64, probe_rays=256, trace={"tracer": tracer}, max_gaussians=100,
-            checkpoint_every=50, initial_points=100, lift_pixels=False,
+            iterations=50, rays_per_batch=64, probe_rays=256, trace={"tracer": tracer}, max_gaussians=100,
+            checkpoint_every=50, initial_points=100, plane_sweep_init=False,
         )  # fmt: skip
         events: list[Event] = []
         state = fresh_state(initial_gaussians(dataset, config), config.seed)

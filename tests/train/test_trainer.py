@@ -71,7 +71,7 @@ def test_events_tell_of_the_progress(whole_run: tuple[FlatGaussians, list[Event]
 
 
 def test_nothing_is_added_while_the_first_gaussians_are_fitted(tmp_path: Path) -> None:
-    _, events = train(tmp_path, small_config(fit_iterations=75))
+    _, events = train(tmp_path, small_config(densify_from_iter=75))
     counts = {e.iteration: e.gaussians for e in events if isinstance(e, TrainingProgress)}
     assert counts[70] == counts[10] < counts[90]
 
@@ -125,11 +125,11 @@ def test_stopped_and_resumed_gives_the_same_bits(tmp_path: Path, strategy: McmcC
 
 
 def test_windows_have_one_order_for_the_first_part_alone(tmp_path: Path) -> None:
-    world, config, orders = FlatWorld(), small_config(one_order=0.5), dict[int, str]()
+    world, config, orders = FlatWorld(), small_config(shared_sort_until=0.5), dict[int, str]()
     Trainer(
         world, config, fresh_state(world.start(), config.seed), folder=tmp_path, fingerprint="test",
         listener=lambda _event: None, threads=1,
-        onlooker=lambda iteration, tracer: orders.update({iteration: tracer.settings.order}),
+        onlooker=lambda iteration, tracer: orders.update({iteration: tracer.settings.sort}),
     ).run()  # fmt: skip
     assert {order for iteration, order in orders.items() if iteration <= 60} == {"packet"}
     assert {order for iteration, order in orders.items() if iteration > 60} == {"ray"}
@@ -162,7 +162,7 @@ def test_parameters_that_are_no_numbers_fail_in_words(tmp_path: Path) -> None:
 
 
 def test_learning_rates_that_scatter_the_scene_fail_in_words(tmp_path: Path) -> None:
-    config = small_config(rates={"mean": 1e6, "mean_final": 1e6})
+    config = small_config(lr={"mean": 1e6, "mean_final": 1e6})
     with pytest.raises(TrainingFailure, match="nothing is exported"):
         train(tmp_path, config)
 

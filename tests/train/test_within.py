@@ -39,7 +39,7 @@ def test_what_was_chosen_is_written_down_and_kept(tmp_path: Path) -> None:
     config = resolve_config(
         "fast",
         settings={"exports": (), "minutes": 0.1},
-        assignments=["rays=256", "probe_rays=256", "checkpoint_every=25"],
+        assignments=["rays_per_batch=256", "probe_rays=256", "checkpoint_every=25"],
     )
     events: list[Event] = []
 

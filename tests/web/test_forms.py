@@ -39,18 +39,21 @@ def test_defaults_follow_the_preset() -> None:
     assert shown == {
         name: str(kind.resolve({"preset": name}).model_dump()["train"]["iterations"]) for name in PRESETS
     }
-    assert json.loads(fields["train.densify.kind"].defaults)["paper"] == "paper"
+    assert json.loads(fields["train.densify.kind"].defaults)["redisplats"] == "redisplats"
     assert fields["test_every"].defaults == "" and fields["test_every"].default == "8"
 
 
 def test_limits_choices_and_words() -> None:
     fields = fields_of(options_form(kind_named("reconstruct")))
     assert fields["test_every"].low == 0 and fields["test_every"].control == "whole"
-    assert fields["train.patch_fraction"].high == 1 and fields["train.patch_fraction"].control == "number"
+    assert (
+        fields["train.ssim_patch_fraction"].high == 1
+        and fields["train.ssim_patch_fraction"].control == "number"
+    )
     assert [choice.value for choice in fields["poses"].choices] == ["given", "auto", "missing"]
     assert fields["held_out"].control == "list"
     assert "hold out" in fields["held_out"].help.lower()
-    assert fields["train.rays"].help == TrainConfig.model_fields["rays"].description
+    assert fields["train.rays_per_batch"].help == TrainConfig.model_fields["rays_per_batch"].description
     assert fields["train.densify.growth"].help.startswith("Only for mcmc")
     assert not fields["train.densify.start"].help.startswith("Only for")
 
@@ -87,12 +90,12 @@ def test_basic_fields_are_open_others_folded() -> None:
     assert {"train.iterations", "train.background", "materials"} <= {f.path for f in form.first}
     assert {f.group for f in form.first} == {"basic"}
     assert {f.group for section in form.more for f in section.fields} == {"advanced"}
-    assert "train.lift_unseen" in {f.path for f in form.experimental}
+    assert "train.plane_sweep_unseen" in {f.path for f in form.experimental}
 
 
 def test_fields_have_units() -> None:
     fields = fields_of(options_form(kind_named("reconstruct")))
-    assert fields["max_side"].unit == "px" and fields["train.stop_early"].unit == "dB"
+    assert fields["max_side"].unit == "px" and fields["train.early_stopping_db"].unit == "dB"
 
 
 def test_values_of_several_types_are_chosen_where_all_are_known() -> None:

@@ -17,10 +17,30 @@ from octasplat.workers.cli.main import cli
 pytestmark = [pytest.mark.tools, pytest.mark.heavy]
 
 RUN = (
-    "--preset", "fast", "--iterations", "30", "--rays", "256", "--max-gaussians", "300", "--threads", "1",
-    "--set", "initial_points=200", "--set", "probe_rays=256", "--test-every", "4", "--exports", "",
-    "--materials", "--set", "materials.environment_height=16", "--set", "materials.ambient_rays=4",
-)  # fmt: skip
+    "--preset",
+    "fast",
+    "--iterations",
+    "30",
+    "--rays-per-batch",
+    "256",
+    "--max-gaussians",
+    "300",
+    "--threads",
+    "1",
+    "--set",
+    "initial_points=200",
+    "--set",
+    "probe_rays=256",
+    "--test-every",
+    "4",
+    "--exports",
+    "",
+    "--materials",
+    "--set",
+    "materials.environment_height=16",
+    "--set",
+    "materials.ambient_occlusion_rays=4",
+)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +92,7 @@ def test_behind_the_views_in_another_light_and_of_other_stuff(
     assert found["hidden"] and found["refused"] == "Choose a file of light: HDR or EXR."
     relit, film, changed = (service.ask("GET", f"/v1/jobs/{found[k]}") for k in ("first", "second", "third"))
     assert relit["kind"] == film["kind"] == "relight" and relit["source_id"] == film["source_id"] == job
-    wanted = {"environments": ["a_map.hdr"], "rotation_degrees": 90, "mode": "views", "by": "path"}
+    wanted = {"environments": ["a_map.hdr"], "rotation_degrees": 90, "mode": "views", "integrator": "path"}
     assert wanted.items() <= relit["options"].items() and relit["options"]["samples"] == 64
     assert film["files_id"] == relit["files_id"] and found["maps"] == ["A file of yours", "a_map.hdr (light)"]
     assert film["options"]["spin"] and film["options"]["mode"] == "turntable"

@@ -24,10 +24,10 @@ VIEWS = 8
 OPTIONS = {
     "train.iterations": 600,
     "train.max_gaussians": 1500,
-    "train.rays": 1024,
+    "train.rays_per_batch": 1024,
     "train.initial_points": 600,
     "train.probe_rays": 256,
-    "train.patch_side": 16,
+    "train.ssim_patch_side": 16,
     "train.checkpoint_every": 50,
     "test_every": 4,
 }
@@ -109,9 +109,9 @@ def test_the_form_asks_for_what_was_filled_in(flow: Flow) -> None:
     options = job["options"]
     assert job["label"] == "a still life"
     assert options["preset"] == "fast" and options["poses"] == "given" and options["test_every"] == 4
-    assert options["train"]["iterations"] == 600 and options["train"]["rays"] == 1024
+    assert options["train"]["iterations"] == 600 and options["train"]["rays_per_batch"] == 1024
     # Of the preset, as the field was left empty.
-    assert options["train"]["sh_every"] == preset("fast").sh_every
+    assert options["train"]["sh_degree_interval"] == preset("fast").sh_degree_interval
     assert flow.facts["iterationsHint"] == str(preset("fast").iterations)  # the hint follows the preset
     assert flow.facts["namelessOnNew"] == []
 

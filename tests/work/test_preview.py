@@ -52,8 +52,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def config() -> ReconstructionConfig:
     train = {
-        "iterations": 60, "rays": 256, "sh_degree": 1, "max_gaussians": 500, "initial_points": 300,
-        "rebuild_every": 20, "checkpoint_every": 1000, "fit_iterations": 10, "probe_rays": 256,
+        "iterations": 60, "rays_per_batch": 256, "sh_degree": 1, "max_gaussians": 500, "initial_points": 300,
+        "rebuild_every": 20, "checkpoint_every": 1000, "densify_from_iter": 10, "probe_rays": 256,
         "densify": {"interval": 10, "start": 10},
     }  # fmt: skip
     return options_of({"preset": "fast", "train": train, "exports": ["mesh.ply"]}).config()

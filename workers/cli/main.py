@@ -5,9 +5,12 @@ Everything heavy is imported by the commands when they run, so that ``--help`` a
 
 import errno
 import os
+import sys
 import traceback
+import warnings
+from functools import cache
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import click
 
@@ -136,6 +139,28 @@ def cli() -> None:
     """
 
 
+@cache
+def _echo_once(text: str) -> None:
+    """Print a line on stderr, unless it was printed before."""
+    click.echo(text, err=True)
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Show a warning that is meant for users as one sentence, another as Python does."""
+    if issubclass(category, FutureWarning):
+        _echo_once(f"Warning: {message}")
+    else:
+        (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
+
+
 def main() -> None:
-    """Entry point of ``octasplat``."""
+    """Run the command line; warnings for users are one sentence."""
+    warnings.showwarning = _show_warning
     cli(prog_name="octasplat")

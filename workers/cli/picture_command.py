@@ -8,7 +8,7 @@ from octasplat.engine.operations.base import Operation
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.request_options import request_of, request_options, run_operation
 
-_CAMERAS = ("views", "photographs", "on", "path_file", "camera")
+_CAMERAS = ("views", "photographs", "other_dataset", "path_file", "camera")
 """Fields of requests that say which cameras there are."""
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -22,6 +22,7 @@ from octasplat.engine.operations.base import (
     never,
 )
 from octasplat.engine.operations.written_files import remember_written
+from octasplat.engine.renamed_settings import former_names, tell_renamed
 from octasplat.workers.cli.options import quiet_option, threads_option
 from octasplat.workers.cli.progress import show_progress
 from octasplat.workers.cli.signals import Stopped, orderly_termination, stop_on_signals
@@ -42,7 +43,13 @@ def request_options(model: type[BaseModel], *, leave_out: Sequence[str] = ()) ->
     """
     listed = sorted(model.model_fields.items(), key=lambda field: not field[1].is_required())
     fields = {name: info for name, info in listed if name not in leave_out}
-    decorators = [_decorator(name, info) for name, info in fields.items() if not _spelling(info).hidden]
+    values = former_names(model).values
+    decorators = [
+        _decorator(name, info, former_values=values.get(name))
+        for name, info in fields.items()
+        if not _spelling(info).hidden
+    ]
+    decorators += [_former_option(flag, fields[name]) for flag, name in _former_flags(model, fields).items()]
 
     def decorate(command: Command) -> Command:
         for decorator in reversed(decorators):
@@ -92,7 +99,7 @@ def request_of(model: type[Any], given: dict[str, Any]) -> Any:
     """
     values = {
         name: value
-        for name, value in given.items()
+        for name, value in _by_new_flags(model, given).items()
         if value is not None and not (value == () and _is_repeated(model.model_fields[name]))
     }
     try:
@@ -142,7 +149,57 @@ def option_name(model: type[BaseModel], path: str) -> str:
     return f"{flag} {part}" if part and not part.isdigit() else flag
 
 
-def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
+def _former_flags(model: type[BaseModel], fields: Mapping[str, FieldInfo]) -> dict[str, str]:
+    """Return the field of each flag that the last version had, of those fields that have an option."""
+    names = former_names(model)
+    spelt = {f"--{old.replace('_', '-')}": new for old, new in names.fields.items()} | dict(names.flags)
+    taken = {flag for name, info in fields.items() for flag in _flags(name, info)}
+    return {
+        flag: name
+        for flag, name in spelt.items()
+        if flag not in taken and name in fields and not _spelling(fields[name]).hidden
+    }
+
+
+def _former_option(flag: str, info: FieldInfo) -> Callable[[Command], Command]:
+    """Return the decorator of a hidden option: the field's by its former flag."""
+    return _decorator(_former_parameter(flag), info, (flag,), hidden=True)
+
+
+def _former_parameter(flag: str) -> str:
+    """Return the name under which a command gets what a former flag was given."""
+    return f"former{flag.replace('-', '_')}"
+
+
+def _by_new_flags(model: type[BaseModel], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the user gave by field, also what was given by former flags, which is told."""
+    values = dict(given)
+    for flag, name in _former_flags(model, model.model_fields).items():
+        value = values.pop(_former_parameter(flag), None)
+        if value is None or value == ():
+            continue
+        tell_renamed({flag: option_name(model, name)})
+        values[name] = value
+    return values
+
+
+def _decorator(
+    name: str,
+    info: FieldInfo,
+    former: tuple[str, ...] = (),
+    *,
+    hidden: bool = False,
+    former_values: Mapping[str, str] | None = None,
+) -> Callable[[Command], Command]:
+    """Return the decorator of a field's argument or option.
+
+    Args:
+        name: of the parameter.
+        info: the field.
+        former: flags to take instead of the field's own.
+        hidden: whether the help leaves the option out, which need not be given then.
+        former_values: values that the last version had, which are taken, too.
+    """
     inner, optional = _without_none(info.annotation)
     if (place := _mark(info, Positional)) is not None:
         many = _is_sequence(inner)
@@ -162,17 +219,18 @@ def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
     spelling = _spelling(info)
     settings: dict[str, Any] = {
         "help": _help(info, optional),
-        "required": info.is_required(),
+        "required": info.is_required() and not hidden,
         "metavar": spelling.metavar or _metavar(inner),
         "default": None,
+        "hidden": hidden,
     }
-    flags = _flags(name, info)
+    flags = former or _flags(name, info)
     if _reads_text(info):
         if spelling.repeated:
             return click.option(*flags, name, multiple=True, **settings)
         return click.option(*flags, name, type=str, **settings)
     if inner is bool:
-        return click.option(*flags, name, is_flag=True, help=settings["help"], default=None)
+        return click.option(*flags, name, is_flag=True, help=settings["help"], default=None, hidden=hidden)
     if _is_sequence(inner):
         item = get_args(inner)[0]
         settings["multiple"] = True
@@ -184,7 +242,10 @@ def _decorator(name: str, info: FieldInfo) -> Callable[[Command], Command]:
         if len(set(parts)) == 1:
             return click.option(*flags, name, nargs=len(parts), type=_type(parts[0], None), **settings)
         return click.option(*flags, name, type=tuple(map(_plain_type, parts)), **settings)
-    return click.option(*flags, name, type=_type(inner, info), **settings)
+    kind = _type(inner, info)
+    if former_values and isinstance(kind, _Choice):
+        kind.also_take(former_values)
+    return click.option(*flags, name, type=kind, **settings)
 
 
 def _reads_text(info: FieldInfo) -> bool:
@@ -245,10 +306,17 @@ class _Choice(click.Choice[Any]):
 
     def __init__(self, values: Sequence[Any]) -> None:
         self._values = {str(value): value for value in values}
+        self._former: frozenset[str] = frozenset()
         super().__init__(list(self._values))
+
+    def also_take(self, former: Iterable[str]) -> None:
+        """Take words of the last version, which the model reads, without offering them."""
+        self._former = frozenset(former)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the value that a word stands for."""
+        if value in self._former:
+            return value
         return self._values[super().convert(str(value), param, ctx)]
 
 

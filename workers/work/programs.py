@@ -65,7 +65,7 @@ def _reconstruct(task: Task) -> None:
             threads=task.threads,
             listener=stopping(broadcast([task.listener, publish_finished]), task.should_stop),
             should_stop=task.should_stop,
-            watch=Previews(task.run, config.evaluate_background, task.listener),
+            watch=Previews(task.run, config.evaluation_background, task.listener),
         )
     finally:
         _publish_run(task)

@@ -82,7 +82,7 @@ class Limits(NamedTuple):
             2.0 if eps2 is None else eps2,
             settings.alpha_max,
             settings.max_hits,
-            settings.turned_beyond,
+            settings.flip_normal_cos,
         )
 
 

@@ -168,7 +168,7 @@ class CpuTracer:
         assert self._gaussians is not None
         use_threads(self.threads)
         if isinstance(hits.kept, OneOrderHits) and gradients.with_geometry:
-            raise ValueError("depths and normals have no gradients in one order: trace with order='ray'")
+            raise ValueError("depths and normals have no gradients in one order: trace with sort='ray'")
         given = output_gradients(gradients, len(hits.rays), self._features.shape[1])
         parameters = Parameters.of(self._gaussians)
         if len(hits.alone) == 0:
@@ -182,7 +182,7 @@ class CpuTracer:
     @property
     def _in_one_order(self) -> bool:
         one_phase = self.settings.second_phase_min is None
-        return self.settings.order == "packet" and one_phase and self._features.shape[1] == 0
+        return self.settings.sort == "packet" and one_phase and self._features.shape[1] == 0
 
     @property
     def _scene(self) -> Scene:

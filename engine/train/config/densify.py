@@ -1,9 +1,10 @@
 """How Gaussians are added, moved and removed while training."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.settings import Settings
 
@@ -11,10 +12,12 @@ from octasplat.engine.settings import Settings
 class McmcConfig(Settings):
     """Relocation of the dead and growth up to a cap, see :mod:`octasplat.engine.train.densify.mcmc`."""
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DENSIFY
+
     kind: Annotated[Literal["mcmc"], ADVANCED] = Field(
         "mcmc",
         description="Strategy that adds, moves and removes Gaussians: mcmc relocates and grows up to the "
-        "cap, paper clones and splits. Another kind begins from its own defaults.",
+        "cap, redisplats clones and splits. Another kind begins from its own defaults.",
     )
     start: Annotated[int, Unit("iterations"), ADVANCED] = Field(
         100, ge=0, description="First iteration at which Gaussians are relocated and added."
@@ -52,19 +55,19 @@ class McmcConfig(Settings):
         description="Exponent of the error by which growth chooses its places: 0 chooses by opacity alone, 1 "
         "by the error seen through a Gaussian.",
     )
-    idle_weight: Annotated[float, Unit("share of the mean"), ADVANCED] = Field(
+    relocate_low_weight_below: Annotated[float, Unit("share of the mean"), ADVANCED] = Field(
         0.05,
         ge=0,
         description="Where there are as many as there may be, those whose weight on the rays is below this "
         "share of the mean are moved, too, all of them to where the error is seen; 0 moves the dead alone.",
     )
-    idle_share: Annotated[float, Unit("share"), ADVANCED] = Field(
+    relocate_low_weight_fraction: Annotated[float, Unit("share"), ADVANCED] = Field(
         0.05,
         ge=0,
         le=1,
         description="Most of all Gaussians that are moved for a low weight at a time.",
     )
-    idle_rounds: Annotated[int, Unit("rounds"), ADVANCED] = Field(
+    relocate_low_weight_rounds: Annotated[int, Unit("rounds"), ADVANCED] = Field(
         16,
         ge=1,
         description="About how often in a training those of low weight are moved; rounded to whole "
@@ -78,10 +81,12 @@ class PaperConfig(Settings):
     See :mod:`octasplat.engine.train.densify.paper`.
     """
 
-    kind: Annotated[Literal["paper"], ADVANCED] = Field(
-        "paper",
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DENSIFY
+
+    kind: Annotated[Literal["redisplats"], ADVANCED] = Field(
+        "redisplats",
         description="Strategy that adds, moves and removes Gaussians: mcmc relocates and grows up to the "
-        "cap, paper clones and splits. Another kind begins from its own defaults.",
+        "cap, redisplats clones and splits. Another kind begins from its own defaults.",
     )
     start: Annotated[int, Unit("iterations"), ADVANCED] = Field(
         400, ge=0, description="First iteration at which Gaussians are cloned, split and pruned."

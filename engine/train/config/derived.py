@@ -20,14 +20,14 @@ def iteration_count(config: TrainConfig, training_pixels: int, shown: float = 1.
     share of the pixels shows anything (see :mod:`octasplat.engine.train.shown`), the rays of the others teach
     little and cost little, and it takes as many more; not with materials.
     """
-    each = config.rays_a_pixel
+    each = config.rays_per_pixel
     if in_one_order(config):
         least = max(LEAST_THOUSANDS, each)
     else:
         if not config.materials.learn:  # which have a number of their own
             each = max(1, round(OWN_ORDER * each))
         least = LEAST_THOUSANDS * max(1, each // 3)
-    wanted = max(round(each * training_pixels / config.rays / 1000), least)
+    wanted = max(round(each * training_pixels / config.rays_per_batch / 1000), least)
     if not config.materials.learn:
         wanted = round(wanted / shown)
     return config.iterations or min(wanted, 10 * each // 3) * 1000
@@ -42,7 +42,7 @@ def most_gaussians(config: TrainConfig, training_pixels: int, shown: float = 1.0
     if config.max_gaussians:
         return config.max_gaussians
     training_pixels = round(training_pixels * shown)
-    wanted = max(training_pixels // config.pixels_a_gaussian, min(training_pixels // 10, 10_000), 1)
+    wanted = max(training_pixels // config.pixels_per_gaussian, min(training_pixels // 10, 10_000), 1)
     return min(wanted, config.max_gaussians_auto)
 
 
@@ -52,17 +52,17 @@ def in_one_order(config: TrainConfig) -> bool:
     Gradients by depths and normals, and a second phase, want each ray's own.
     """
     by_geometry = config.materials.learn or config.loss.depth_normal > 0
-    return config.one_order > 0 and not by_geometry and config.trace.second_phase_min is None
+    return config.shared_sort_until > 0 and not by_geometry and config.trace.second_phase_min is None
 
 
 def window_side_px(config: TrainConfig, longest_side_px: int, pixels_a_gaussian: float) -> int:
-    """``config.window_side``, or where that is 0 what suits the Gaussians or the views.
+    """``config.ray_patch_side``, or where that is 0 what suits the Gaussians or the views.
 
     A window is to cover a small angle, so that its rays meet the same Gaussians: what these cost once for all
     rays is most of what rays in one order cost. But rays that are too close learn the same.
     """
-    if config.window_side:
-        return config.window_side
+    if config.ray_patch_side:
+        return config.ray_patch_side
     widest = max(1, round(longest_side_px / 15))
     if not in_one_order(config):
         return widest

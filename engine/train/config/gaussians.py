@@ -11,7 +11,7 @@ from octasplat.engine.settings import Settings
 class GaussianSettings(Settings):
     """The first Gaussians, their colours, and their number."""
 
-    fit_iterations: Annotated[int, Unit("iterations"), ADVANCED] = Field(
+    densify_from_iter: Annotated[int, Unit("iterations"), ADVANCED] = Field(
         100, ge=0, description="Iterations of fitting the first Gaussians before anything is added."
     )
     sh_degree: Annotated[int, Unit("degree of the harmonics"), BASIC] = Field(
@@ -21,7 +21,7 @@ class GaussianSettings(Settings):
         description="Degree of the spherical harmonics: how much colours may change with the direction of "
         "view, 0 not at all. Lower it for smaller files and for matt scenes.",
     )
-    sh_every: Annotated[int, Unit("iterations"), ADVANCED] = Field(
+    sh_degree_interval: Annotated[int, Unit("iterations"), ADVANCED] = Field(
         100, ge=1, description="Iterations between raising the degree of the harmonics by one."
     )
     max_gaussians: Annotated[int, Unit("Gaussians"), BASIC] = Field(
@@ -30,7 +30,7 @@ class GaussianSettings(Settings):
         description="Most Gaussians; more show finer detail, take longer and make larger files. 0: one for "
         "each 30 pixels of the training views or, of up to 10,000, for each 10.",
     )
-    pixels_a_gaussian: Annotated[int, Unit("px per Gaussian"), ADVANCED] = Field(
+    pixels_per_gaussian: Annotated[int, Unit("px per Gaussian"), ADVANCED] = Field(
         30,
         ge=10,
         description="Pixels of the training views for each Gaussian, where max_gaussians is 0. Fewer than 30 "
@@ -48,18 +48,18 @@ class GaussianSettings(Settings):
         description="Most points to begin from; Gaussians that are added later overlap more with those that "
         "are there.",
     )
-    plane_points: Annotated[int, Unit("points"), ADVANCED] = Field(
+    normal_neighbors: Annotated[int, Unit("points"), ADVANCED] = Field(
         8,
         ge=3,
         description="Points around one whose plane gives its first normal. More make smoother first normals "
         "and round corners off.",
     )
-    lift_pixels: Annotated[bool, ADVANCED] = Field(
+    plane_sweep_init: Annotated[bool, ADVANCED] = Field(
         True,
         description="Where the sparse model has fewer points, lift pixels of the photographs to their depth. "
         "Turn it off for scenes that reflect, whose reflections would be lifted behind the surface.",
     )
-    lift_unseen: Annotated[bool, EXPERIMENTAL] = Field(
+    plane_sweep_unseen: Annotated[bool, EXPERIMENTAL] = Field(
         False,
         description="Lift pixels that no neighbouring photographs show, too: where photographs are few, "
         "detail instead of smears, not always at the right place.",

@@ -1,9 +1,10 @@
 """Weights of the terms of the loss."""
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.settings import Settings
 
@@ -18,6 +19,8 @@ class LossWeights(Settings):
     Particle Scenes" (https://arxiv.org/abs/2407.07090), is l1 = 0.8, ssim = 0.2; the authors of REdiSplats
     (https://arxiv.org/abs/2503.12284) use 0.8 MSE + 0.2 (1 - SSIM)/2: l2 = 0.8, ssim = 0.1.
     """
+
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.LOSS
 
     l1: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.8,
@@ -34,8 +37,8 @@ class LossWeights(Settings):
     ssim: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.0,
         ge=0,
-        description="Weight of 1 - SSIM; more than 0 makes patch_fraction of the rays whole patches, which "
-        "is slower. Use it to repeat published recipes.",
+        description="Weight of 1 - SSIM; more than 0 makes ssim_patch_fraction of the rays whole patches, "
+        "which is slower. Use it to repeat published recipes.",
     )
     opacity: Annotated[float, Unit("weight"), EXPERIMENTAL] = Field(
         0.0,
@@ -49,7 +52,7 @@ class LossWeights(Settings):
         description="Weight of the mean in-plane scale of the Gaussians that were hit, of the extent, which "
         "shrinks them. Try it where large ones blur the scene.",
     )
-    blocked: Annotated[float, Unit("weight"), ADVANCED] = Field(
+    free_space: Annotated[float, Unit("weight"), ADVANCED] = Field(
         0.0,
         ge=0,
         description="Weight of what hides the sparse points from views that show them: free space along "

@@ -37,17 +37,17 @@ class PhotographSettings(Settings):
         description="Learn a gain and an offset for each channel of each training view; auto does so where "
         "the photographs show that the exposure changes.",
     )
-    leave_out_misfits: Annotated[bool, BASIC] = Field(
+    exclude_outlier_views: Annotated[bool, BASIC] = Field(
         False,
         description="Train without the views that do not fit the others, as it becomes clear which. Use it "
         "where a few photographs show something else or have wrong poses.",
     )
-    place_misfits: Annotated[bool, ADVANCED] = Field(
+    repair_poses: Annotated[bool, ADVANCED] = Field(
         True,
         description="Look for photographs of a given model that stand in the wrong place, and place them "
         "anew before the training; not before one of less than 1,000 iterations or 10 minutes.",
     )
-    free_lenses: Annotated[bool, ADVANCED] = Field(
+    per_view_principal_point: Annotated[bool, ADVANCED] = Field(
         True,
         description="Let each photograph of a model have a principal point of its own, where the sparse "
         "points show that the lens moved, as stabilised ones do; not before a training of less than 1,000 "
@@ -58,16 +58,16 @@ class PhotographSettings(Settings):
         description="Learn a small correction of the pose of each training view; not with materials. Use it "
         "where poses come from a tracker rather than from COLMAP.",
     )
-    sight_line_share: Annotated[float, Unit("share of rays"), ADVANCED] = Field(
+    visibility_ray_fraction: Annotated[float, Unit("share of rays"), ADVANCED] = Field(
         0.02,
         gt=0,
         le=1,
-        description="Lines of sight of sparse points beside each batch, of its rays, where loss.blocked is "
-        "more than 0.",
+        description="Lines of sight of sparse points beside each batch, of its rays, where loss.free_space "
+        "is more than 0.",
     )
 
     former_settings: ClassVar = {
         "background_even": FormerSetting(BACKGROUND_SMOOTHNESS, after="background_height"),
-        "misfits_after": FormerSetting(MISFITS_AFTER, after="free_lenses"),
-        "sight_line_margin": FormerSetting(SIGHT_LINE_MARGIN, after="sight_line_share"),
+        "misfits_after": FormerSetting(MISFITS_AFTER, after="per_view_principal_point"),
+        "sight_line_margin": FormerSetting(SIGHT_LINE_MARGIN, after="visibility_ray_fraction"),
     }

@@ -26,34 +26,34 @@ def with_materials(config: TrainConfig) -> TrainConfig:
         "log_scale": 0.02,
         "opacity": 0.1,
         "sh_rest_ratio": 0.05,
-        "calm_after": 0,
+        "scale_after": 0,
     }
     return config.model_copy(
         update={
             # Rays may begin so near to a surface as they pass it, which normals with a side allow.
             "materials": config.materials.model_copy(
-                update={"learn": True, "start": 1e-3, "leaves": 1e-2, "parted": 8.0}
+                update={"learn": True, "ray_bias": 1e-3, "backface_cull_distance": 1e-2, "depth_split": 8.0}
             ),
-            "rates": config.rates.model_copy(update=rates),
+            "lr": config.lr.model_copy(update=rates),
             # Gaps under things that stand on a mirror would be filled with what looks like the reflection.
-            "loss": config.loss.model_copy(update={"blocked": 0.05}),
-            "lift_pixels": False,
-            "plane_points": 10,
+            "loss": config.loss.model_copy(update={"free_space": 0.05}),
+            "plane_sweep_init": False,
+            "normal_neighbors": 10,
             "sh_degree": min(config.sh_degree, 1),
-            "sh_every": 400,
-            "rays": 8192,
+            "sh_degree_interval": 400,
+            "rays_per_batch": 8192,
             "iterations": config.iterations * 14 // 25,  # which take longer by ray, and longer with light
-            "rays_a_pixel": 8,
-            "pixels_a_gaussian": 50,
-            "step_back_db": 0.3,
-            "average_after": 0.8,
-            "least_weight": 0.0,
-            "near_share": 0.0,
-            "one_order": 0.0,
-            "stop_early": 0.0,
-            "densify": McmcConfig(copies="area", stop_fraction=0.4, idle_weight=0.0),
+            "rays_per_pixel": 8,
+            "pixels_per_gaussian": 50,
+            "best_checkpoint_margin_db": 0.3,
+            "weight_averaging_start": 0.8,
+            "min_blend_weight": 0.0,
+            "camera_clearance": 0.0,
+            "shared_sort_until": 0.0,
+            "early_stopping_db": 0.0,
+            "densify": McmcConfig(copies="area", stop_fraction=0.4, relocate_low_weight_below=0.0),
             "initial_opacity": 0.8,
-            "trace": config.trace.model_copy(update={"turned_beyond": TURNED_BEYOND}),
+            "trace": config.trace.model_copy(update={"flip_normal_cos": TURNED_BEYOND}),
             "max_gaussians_auto": min(config.max_gaussians_auto * 4 // 5, 80_000),
         }
     )
@@ -70,35 +70,35 @@ def preset(name: str) -> TrainConfig:
     if name == "standard":
         return TrainConfig()
     if name == "high":
-        return TrainConfig(rays_a_pixel=21, max_gaussians_auto=600_000)
-    if name == "paper":
+        return TrainConfig(rays_per_pixel=21, max_gaussians_auto=600_000)
+    if name == "redisplats":
         return TrainConfig(
             iterations=10_000,
             sh_degree=0,
-            rays=8192,
-            least_weight=0.0,
-            near_share=0.0,
-            one_order=0.0,
-            stop_early=0.0,
-            place_misfits=False,
-            free_lenses=False,
-            window_rays=1,
-            pixels_a_gaussian=50,
+            rays_per_batch=8192,
+            min_blend_weight=0.0,
+            camera_clearance=0.0,
+            shared_sort_until=0.0,
+            early_stopping_db=0.0,
+            repair_poses=False,
+            per_view_principal_point=False,
+            ray_patch_rays=1,
+            pixels_per_gaussian=50,
             max_gaussians_auto=350_000,
             initial_points=30_000,
-            lift_pixels=False,
+            plane_sweep_init=False,
             initial_opacity=0.1,
-            rates=LearningRates(
+            lr=LearningRates(
                 mean=5e-4,
                 mean_final=3e-6,
-                mean_of="extent",
+                mean_unit="extent",
                 axes="world",
                 quat=0.01,
                 log_scale=5e-3,
                 opacity=0.05,
-                colour=1.4e-3,
+                color=1.4e-3,
                 decay=0.1,
-                calm_after=0,
+                scale_after=0,
             ),
             loss=LossWeights(l1=0.0, l2=0.8, ssim=0.1),
             trace=TraceSettings(q=CHI2_3_99, transmittance_min=0.01, second_phase_min=0.01),

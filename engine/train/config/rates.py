@@ -1,10 +1,11 @@
 """Sizes of the steps of the optimiser."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.gaussians.materials import ALBEDO, METALLIC, ROUGHNESS
 from octasplat.engine.settings import Settings
@@ -16,19 +17,21 @@ class LearningRates(Settings):
     The mean's falls to ``mean_final``; all others fall to the fraction ``decay``.
     """
 
-    mean: Annotated[float, Unit("mean_of"), ADVANCED] = Field(
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.LEARNING_RATES
+
+    mean: Annotated[float, Unit("mean_unit"), ADVANCED] = Field(
         0.14,
         gt=0,
-        description="First step of the means, in the unit that mean_of says. Lower it where training loses "
+        description="First step of the means, in the unit that mean_unit says. Lower it where training loses "
         "detail that it had, raise it where Gaussians begin far from the surface.",
     )
-    mean_final: Annotated[float, Unit("mean_of"), ADVANCED] = Field(
+    mean_final: Annotated[float, Unit("mean_unit"), ADVANCED] = Field(
         1e-2,
         gt=0,
         description="Last step of the means, in the same unit. Lower it for sharper detail in long "
         "trainings.",
     )
-    mean_of: Annotated[Literal["size", "extent"], ADVANCED] = Field(
+    mean_unit: Annotated[Literal["size", "extent"], ADVANCED] = Field(
         "size",
         description="Unit of mean and mean_final: the Gaussian's own size, or the scene's extent as in 3DGS. "
         "Change it only together with both.",
@@ -56,7 +59,7 @@ class LearningRates(Settings):
         description="First step of the opacity logits; 0 keeps opacities. Lower it where surfaces become "
         "transparent early.",
     )
-    colour: Annotated[float, Unit("display colour"), ADVANCED] = Field(
+    color: Annotated[float, Unit("display colour"), ADVANCED] = Field(
         1e-2,
         ge=0,
         description="First step of the display colour; the constant harmonic gets it over C0. Raise it in "
@@ -93,7 +96,7 @@ class LearningRates(Settings):
         description="Fraction of their first size to which all steps but the mean's fall until the end; 1 "
         "keeps them. Lower it where the last iterations still fluctuate.",
     )
-    calm_after: Annotated[int, Unit("iterations"), ADVANCED] = Field(
+    scale_after: Annotated[int, Unit("iterations"), ADVANCED] = Field(
         7000,
         ge=0,
         description="In trainings of more iterations mean and quat are smaller, by the root of how many "
@@ -102,9 +105,9 @@ class LearningRates(Settings):
 
     def calmed(self, iterations: int) -> "LearningRates":
         """Return the rates for a training of so many iterations: with more time, small steps go farther."""
-        if self.calm_after == 0 or iterations <= self.calm_after:
+        if self.scale_after == 0 or iterations <= self.scale_after:
             return self
-        share = math.sqrt(self.calm_after / iterations)
+        share = math.sqrt(self.scale_after / iterations)
         mean = min(self.mean, max(share * self.mean, self.mean_final))
         return self.model_copy(update={"mean": mean, "quat": share * self.quat})
 

@@ -4,10 +4,11 @@ Lengths marked "of the extent" are relative to the scene's robust extent (from t
 preset serves a coin and a street.
 """
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.fields import ADVANCED, EXPERIMENTAL, Unit
 from octasplat.engine.shading.material_settings import MaterialSettings
 from octasplat.engine.trace.protocol import TraceSettings
@@ -26,20 +27,22 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
     (https://arxiv.org/abs/2503.12284), where one of several ways is named after it.
     """
 
-    average_after: Annotated[float, Unit("share of iterations"), ADVANCED] = Field(
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.TRAIN
+
+    weight_averaging_start: Annotated[float, Unit("share of iterations"), ADVANCED] = Field(
         0.85,
         ge=0,
         le=1,
         description="Share of the iterations after which states are averaged; the mean is exported. 1 "
         "exports the last state.",
     )
-    least_weight: Annotated[float, Unit("sum of weights"), ADVANCED] = Field(
+    min_blend_weight: Annotated[float, Unit("sum of weights"), ADVANCED] = Field(
         0.03,
         ge=0,
         description="Gaussians whose weights on the rays of an iteration add up to less keep still in it, "
         "which saves time. 0 moves all.",
     )
-    one_order: Annotated[float, Unit("share of iterations"), ADVANCED] = Field(
+    shared_sort_until: Annotated[float, Unit("share of iterations"), ADVANCED] = Field(
         0.8,
         ge=0,
         le=1,
@@ -47,7 +50,7 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
         "several times as fast and a little wrong; not with materials or loss.depth_normal. 0 gives each ray "
         "its own order throughout.",
     )
-    rates: LearningRates = Field(LearningRates(), description="Sizes of the steps of the optimiser.")
+    lr: LearningRates = Field(LearningRates(), description="Sizes of the steps of the optimiser.")
     loss: LossWeights = Field(LossWeights(), description="Weights of the terms of the loss.")
     trace: TraceSettings = Field(TraceSettings(), description="How rays are traced.")
     materials: MaterialSettings = Field(
@@ -59,7 +62,7 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
         description="Nearest distance at which a Gaussian is seen, of the extent. Lower it for cameras that "
         "come very close to something.",
     )
-    near_share: Annotated[float, Unit("share"), ADVANCED] = Field(
+    camera_clearance: Annotated[float, Unit("share"), ADVANCED] = Field(
         0.3,
         ge=0,
         lt=1,
@@ -96,7 +99,7 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
     probe_rays: Annotated[int, Unit("rays"), ADVANCED] = Field(
         16_384, ge=256, description="Fixed training rays that choose the best checkpoint."
     )
-    step_back_db: Annotated[float, Unit("dB"), ADVANCED] = Field(
+    best_checkpoint_margin_db: Annotated[float, Unit("dB"), ADVANCED] = Field(
         3.0,
         gt=0,
         description="The best state is exported where the last one's probe is so much worse. Lower it where "
@@ -108,10 +111,14 @@ class TrainConfig(PhotographSettings, GaussianSettings, RaySettings):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "TrainConfig":
-        if self.loss.depth_normal > 0 and not self.materials.learn and self.window_rays == 1:
-            raise ValueError("loss.depth_normal compares neighbouring rays of windows: set window_rays to 64")
-        if self.trace.order != "ray":
-            raise ValueError("trace.order is the training's own; one_order says for which share it is packet")
+        if self.loss.depth_normal > 0 and not self.materials.learn and self.ray_patch_rays == 1:
+            raise ValueError(
+                "loss.depth_normal compares neighbouring rays of windows: set ray_patch_rays to 64"
+            )
+        if self.trace.sort != "ray":
+            raise ValueError(
+                "trace.sort is the training's own; shared_sort_until says for which share it is packet"
+            )
         if self.background == "learnt" and self.materials.learn:
             raise ValueError(
                 "background=learnt is for scenes without materials, which learn the light around them: leave "

@@ -48,18 +48,21 @@ class Mcmc:
 
     A chosen Gaussian and its copies share its opacity and shrink, or keep its opacity and share its area;
     copies are scattered inside it. The count grows by a fixed fraction each time and never passes the cap.
-    Once it is there, those that hardly weigh on any ray are moved with the dead (``idle_weight``), in rounds,
-    to where the error is seen, and share the area there: smaller ones are what is missing.
+    Once it is there, those that hardly weigh on any ray are moved with the dead
+    (``relocate_low_weight_below``), in rounds, to where the error is seen, and share the area there: smaller
+    ones are what is missing.
 
     Not done: the paper's noise on the means; the copies are scattered instead.
     """
 
     def __init__(self, config: McmcConfig, *, iterations: int, max_gaussians: int) -> None:
         self._config = config
-        self.wants_errors = config.error_power > 0 or config.idle_weight > 0
+        self.wants_errors = config.error_power > 0 or config.relocate_low_weight_below > 0
         self._stop = int(config.stop_fraction * iterations)
         self._cap = max_gaussians
-        self._round = config.interval * max(1, round(iterations / config.idle_rounds / config.interval))
+        self._round = config.interval * max(
+            1, round(iterations / config.relocate_low_weight_rounds / config.interval)
+        )
         self._errors: Float32[np.ndarray, " n"]
         self._weights: Float32[np.ndarray, " n"]
         self._begin(0)
@@ -173,10 +176,10 @@ class Mcmc:
 
     def _moves_idle(self, count: int) -> bool:
         """Whether that many are all that there may be, and the idle are moved then."""
-        return self._config.idle_weight > 0 and count >= self._cap
+        return self._config.relocate_low_weight_below > 0 and count >= self._cap
 
     def _idle(self, weights: Float32[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
         """Those of least weight."""
-        most = int(self._config.idle_share * len(weights))
+        most = int(self._config.relocate_low_weight_fraction * len(weights))
         least = np.argsort(weights, kind="stable")[:most]
-        return least[weights[least] < self._config.idle_weight * weights.mean()]
+        return least[weights[least] < self._config.relocate_low_weight_below * weights.mean()]

@@ -75,7 +75,7 @@ class Propagating:
         if self._inner.due(iteration):
             gaussians, adam = self._inner.apply(gaussians, adam, rng, extent=extent)
         if self._propagates(iteration) and len(gaussians) > NEIGHBOURS:
-            if self._recipe == "seed":
+            if self._recipe == "ref_gaussian":
                 self._spread(gaussians, rng, progress=iteration / self._total)
             else:
                 propagate_normals(gaussians)

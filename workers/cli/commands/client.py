@@ -14,6 +14,7 @@ import click
 
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions
+from octasplat.engine.renamed_settings import tell_renamed
 from octasplat.workers.cli.options import export_names, exports_option, quiet_option
 from octasplat.workers.cli.request_options import request_of, request_options
 
@@ -40,7 +41,7 @@ def set_option(command: F) -> F:
         "assignments",
         multiple=True,
         metavar="NAME=VALUE",
-        help="Any setting, e.g. test_every=10 or rates.quat=0.02; may be repeated.",
+        help="Any setting, e.g. test_every=10 or lr.quat=0.02; may be repeated.",
     )(command)
 
 
@@ -126,11 +127,12 @@ def submit(
     help="Relight: an HDR or EXR image, which is sent; several have their turns.",
 )
 @click.option(
-    "--on",
+    "--other-dataset",
     type=click.Path(path_type=Path),
-    metavar="SCENE",
+    metavar="DATASET",
     help="Evaluate: measure all photographs of this folder, ZIP file or dataset in the same world instead.",
 )
+@click.option("--on", "former_on", type=click.Path(path_type=Path), hidden=True)
 @set_option
 @click.option("--wait", is_flag=True, help="Show the progress and save the results at the end.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="With --wait: folder for the results.")
@@ -140,10 +142,19 @@ def submit(
 @server_option
 @quiet_option
 def derive(
-    kind: str, job_id: str | None, stage: Path | None, path_file: Path | None,
-    environments: tuple[Path, ...], on: Path | None, wait: bool, output: Path | None, server: str | None,
-    quiet: bool, **given: Any,
-) -> None:  # fmt: skip
+    kind: str,
+    job_id: str | None,
+    stage: Path | None,
+    path_file: Path | None,
+    environments: tuple[Path, ...],
+    other_dataset: Path | None,
+    former_on: Path | None,
+    wait: bool,
+    output: Path | None,
+    server: str | None,
+    quiet: bool,
+    **given: Any,
+) -> None:
     """Queue a job of a KIND such as render, crop or edit on the results of JOB, or one on files alone.
 
     'last' is the newest job; octasplat verbs lists the kinds. For example:
@@ -161,11 +172,13 @@ def derive(
     )
 
     _check_output(output, wait=wait)
+    if former_on is not None:
+        tell_renamed({"--on": "--other-dataset"})
     files = [_file_given(text) for text in given["files"]]
     with connected(server) as api:
         source = None if job_id is None else _job(api, job_id)["id"]
         what = Derivation(
-            source, kind, _assigned({}, given["assignments"]), scene=on,
+            source, kind, _assigned({}, given["assignments"]), scene=other_dataset or former_on,
             label=given["label"], queue=given["queue"], priority=given["priority"],
         )  # fmt: skip
         what = with_named_files(what, files)

@@ -48,7 +48,7 @@ def list_settings(everything: bool, group: str | None, markdown: bool, as_json: 
 @click.argument("name", metavar="NAME")
 @_json_option
 def explain(name: str, as_json: bool) -> None:
-    """Explain the setting NAME, such as rates.mean: what it does, its unit, range and defaults."""
+    """Explain the setting NAME, such as lr.mean: what it does, its unit, range and defaults."""
     from octasplat.engine.settings_catalog import setting_named, value_text
 
     entry = setting_named(name)

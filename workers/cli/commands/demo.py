@@ -1,11 +1,12 @@
 """``octasplat demo``: the whole way on a scene that octasplat makes itself."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import click
 from pydantic import Field
 
+from octasplat.engine import renamed_settings
 from octasplat.engine.fields import Output, Spelling, Unit
 from octasplat.engine.operations.base import Request
 from octasplat.engine.train.preset_names import PresetName
@@ -20,8 +21,12 @@ class DemoRequest(Request):
     The same command goes on where it was interrupted.
     """
 
+    former_names: ClassVar[renamed_settings.FormerNames] = renamed_settings.DEMO
+
     output: Output = Field(Path("octasplat-demo"), description="Folder for the scene and the result.")
-    scene_only: bool = Field(False, description="Only write the scene, right into the output folder.")
+    dataset_only: bool = Field(
+        False, description="Only write the photographs and their poses, right into the output folder."
+    )
     preset: PresetName = Field("fast", description="Settings of the reconstruction.")
     views: Annotated[int | None, Spelling(metavar="N")] = Field(None, description="Number of photographs.")
     width_px: Annotated[int | None, Unit("px"), Spelling(("--width",), metavar="PX")] = Field(
@@ -46,9 +51,9 @@ def demo(open_report: bool | None, threads: int, quiet: bool, **given: Any) -> N
     request: DemoRequest = request_of(DemoRequest, given)
     output = request.output
     size = {"views": request.views, "width_px": request.width_px, "height_px": request.height_px}
-    if request.scene_only:
+    if request.dataset_only:
         make_scene(output, size, quiet=quiet)
-        click.echo(f"The scene is in {output}; reconstruct it with: octasplat reconstruct {output} -o OUT")
+        click.echo(f"The dataset is in {output}; reconstruct it with: octasplat reconstruct {output} -o OUT")
         return
     make_scene(output / "scene", size, quiet=quiet)
     report = reconstruct_scene(

@@ -88,10 +88,10 @@ class Reconstruct(OperationKind):
         return (
             Demand("train.iterations", "iterations", iterations),
             Demand("train.max_gaussians", "gaussians", gaussians),
-            Demand("train.rays", "rays", train.rays),
+            Demand("train.rays_per_batch", "rays", train.rays_per_batch),
             Demand("train.probe_rays", "rays", train.probe_rays),
-            Demand("train.window_rays", "rays", train.window_rays),
-            Demand("train.patch_side", "rays", train.patch_side**2),
+            Demand("train.ray_patch_rays", "rays", train.ray_patch_rays),
+            Demand("train.ssim_patch_side", "rays", train.ssim_patch_side**2),
             Demand("max_side", "side_px", options.max_side or 0),
             Demand("exports", "exports", len(options.exports)),
             Demand("max_side", "workspace_bytes", reconstruction_bytes(options, sizes)),

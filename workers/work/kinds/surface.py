@@ -30,7 +30,7 @@ class SurfaceJobOptions(SurfaceOptions):
     def _fits(self) -> "SurfaceJobOptions":
         try:
             check_surface_path(
-                Path(f"surface.{self.format}"), textured=self.texture_side is not None, lit=self.materials
+                Path(f"surface.{self.format}"), textured=self.texture_size is not None, lit=self.materials
             )
         except ConfigError as error:
             raise ValueError(str(error).removesuffix(".")) from None
@@ -60,9 +60,9 @@ class Surface(OperationKind):
     def stages(self, options: SurfaceJobOptions) -> tuple[str, ...]:
         """Return the stages; colours that are fitted to photographs need not be seen in the scene first."""
         asked = {
-            "settling": options.settle,
+            "settling": options.refine_vertices,
             "decimating": bool(options.max_triangles),
-            "unwrapping": options.texture_side is not None,
+            "unwrapping": options.texture_size is not None,
             "colouring": options.materials or not options.fit,
             "fitting": options.fit and not options.materials,
         }
@@ -77,7 +77,7 @@ class Surface(OperationKind):
         )
         return (
             Demand("depth_side", "side_px", side_px),
-            Demand("texture_side", "side_px", options.texture_side or 0),
+            Demand("texture_size", "side_px", options.texture_size or 0),
             Demand("depth_side", "render_pixels", pixels),
             Demand("max_triangles", "exports", max(1, len(options.levels))),
         )

@@ -30,8 +30,8 @@ async function light() {
 
 /** The options that the form asks for. */
 function asked() {
-    const { rotation_degrees, spin, by, samples, background } = fieldValues(form);
-    return { rotation_degrees, spin, by, ...(by === "path" ? { samples: Number(samples) } : {}), ...(background ? { background } : {}) };
+    const { rotation_degrees, spin, integrator, samples, background } = fieldValues(form);
+    return { rotation_degrees, spin, integrator, ...(integrator === "path" ? { samples: Number(samples) } : {}), ...(background ? { background } : {}) };
 }
 
 async function queueRelight(options, more = {}) {
@@ -41,9 +41,9 @@ async function queueRelight(options, more = {}) {
 }
 
 function preview() {
-    const view = form.elements.view.value, { by } = fieldValues(form), samples = PREVIEW.samples[by];
+    const view = form.elements.view.value, { integrator } = fieldValues(form), samples = PREVIEW.samples[integrator];
     const options = { mode: "views", photographs: [view], format: "png", max_side: PREVIEW.side, samples };
-    const about = by === "path" ? `${samples} paths a pixel; more have less grain.` : `${samples} ray a pixel; a render has smoother edges.`;
+    const about = integrator === "path" ? `${samples} paths a pixel; more have less grain.` : `${samples} ray a pixel; a render has smoother edges.`;
     trials.show(() => queueRelight(options, { priority: Number(priority), label: "preview of another light" }), view, "in another light", about);
 }
 
