@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 from pydantic import BaseModel
 
+import octasplat as osp
 from octasplat.engine.config import ReconstructionConfig, former_setting_names, read_config, resolve_config
 from octasplat.engine.errors import ConfigError
 from octasplat.engine.operations.reconstruct import ReconstructOptions, ReconstructRequest, run_config
@@ -68,6 +69,13 @@ def test_former_names_in_python_mean_the_same_and_are_told() -> None:
     assert "train.rays is called" not in told and "more have new names" in told
     with pytest.warns(RenamedSettingWarning, match=r"rates\.quat is called lr\.quat now"):
         assert resolve_config(assignments=["rates.quat=0.5"]) == resolve_config(assignments=["lr.quat=0.5"])
+
+
+def test_former_option_of_a_python_verb_is_read_and_told() -> None:
+    refused = "a.png: an environment is an HDR or EXR image"
+    with collected_notices() as notices, pytest.raises(ConfigError, match=refused):
+        osp.relight("run", "out", environments=["a.png"], by="path")  # type: ignore[call-arg]
+    assert notices == ["by is called integrator now; former names are read in this version only."]
 
 
 def test_former_names_of_a_command_mean_the_same_and_are_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ from octasplat.engine.nearest_names import nearest_name
 from octasplat.engine.operations.base import build
 from octasplat.engine.operations.registry import operation
 from octasplat.engine.operations.written_files import remember_written
+from octasplat.engine.renamed_settings import with_new_names
 from octasplat.notebook import default_listener
 
 P = ParamSpec("P")
@@ -29,6 +30,8 @@ class UnknownOption(ConfigError, TypeError):
 def names_checked(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function, which refuses an option that it does not have and offers the nearest name.
 
+    Names of the last version are read, see :mod:`octasplat.engine.renamed_settings`.
+
     Raises:
         UnknownOption: when it is called with one.
     """
@@ -36,6 +39,11 @@ def names_checked(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def call(*values: P.args, **options: P.kwargs) -> R:
+        former = [name for name in options if name not in names]
+        if former and function.__module__ == "octasplat.verbs":
+            request = operation(function.__name__.rstrip("_").replace("_", "-")).request
+            renamed = with_new_names((request,), {name: options.pop(name) for name in former})
+            options.update(renamed)
         for name in options:
             if name not in names:
                 nearest = nearest_name(name, names)
